@@ -127,7 +127,8 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
 
     Args:
         noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
-            sampler draws no noise in its steps, ``noise.steps`` is not looked at.
+            sampler draws no noise in its steps, ``noise.steps`` is not looked at; of those of a longer loop the first
+            K are taken.
         streams: B of the observation.
         spec: of the policy.
 
@@ -144,7 +145,10 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
     if noise.steps is None:
         remedy = f"Give [K, B, T, D] = {shape}, or noise=None to have all of it drawn."
         raise ObservationError(f"noise.steps is missing: the sampler draws noise in its steps. {remedy}")
-    return Noise(initial, _noise(noise.steps, "noise.steps", "[K, B, T, D]", shape, spec.left_out))
+    steps = noise.steps
+    if isinstance(steps, np.ndarray) and steps.ndim and len(steps) > shape[0]:
+        steps = steps[: shape[0]]  # that of a longer loop, so that plans of several loops can have the same
+    return Noise(initial, _noise(steps, "noise.steps", "[K, B, T, D]", shape, spec.left_out))
 
 
 def _noise(value: Any, what: str, axes: str, shape: tuple[int, ...], left_out: int) -> FloatArray:

@@ -31,9 +31,9 @@ class PolicyInfo:
         action: which part of the denoised sample is action, and which of it is executed.
         sample: ``(T, D)``, the shape of one stream's noise and of what is predicted.
         original_sample: the same of the original, which may predict more steps; noise of this shape fits as well.
-        stochastic: whether its loop draws noise in its steps, so that ``Noise.steps`` is needed; of a plan that begins with
-            the chunk of the call before the whole loop.
-        noise_steps: K of ``Noise.steps``, of the same loop.
+        stochastic: whether its loop draws noise in its steps, so that ``Noise.steps`` is needed; of a plan that begins
+            with the chunk of the call before the whole loop.
+        noise_steps: K of ``Noise.steps``, of the same loop; of more, the first K are taken.
         identity: sha256 of what the artifact computes.
         model_identity: the same without plans, corrections and pruner: what calibration leaves as it is.
         plans: names that ``predict_action(plan=...)`` takes.

@@ -10,6 +10,7 @@ import numpy as np
 
 from ttscompile.artifact.view import View
 from ttscompile.core.lattice import BoolArray, Source
+from ttscompile.core.plan import Plan
 
 HEAD = ("pruner.base", "pruner.mask", "pruner.step", "pruner.block")
 """Constants of a pruner whose logits are ``base + mask + (code * step) @ block`` with a code of -1..1."""
@@ -53,9 +54,14 @@ def readable_rollout(view: View) -> BoolArray:
 
 def reading_earlier_calls(view: View) -> set[str]:
     """Names of the plans that can read what an earlier call of the episode computed."""
-    reading = {name for name, schedule in view.schedules.items() if (schedule == Source.ROLLOUT).any()}
-    pruned = {name for name, plan in view.plans.items() if plan.pruned}
-    return reading | pruned if pruned and sources_of_pruner(view)[..., Source.ROLLOUT].any() else reading
+    return {name for name, plan in view.plans.items() if reads_earlier_calls(view, plan)}
+
+
+def reads_earlier_calls(view: View, plan: Plan) -> bool:
+    """Whether the cells of a plan can read what an earlier call of the episode computed; ``view`` is the plan's."""
+    if plan.cells is None:
+        return bool(sources_of_pruner(view)[..., Source.ROLLOUT].any())
+    return bool((plan.cells == Source.ROLLOUT).any())
 
 
 def sources_of_pruner(view: View) -> BoolArray:

@@ -12,9 +12,9 @@ NOT_RUN = {
     "python examples/evaluation/warm_start.py": "takes minutes; tests/examples has it in short",
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
-    "ttscompile serve": "has no end; tests/server/test_serve.py, test_locked.py and tests/fleet start it",
-    "ttscompile calibrate compiled/ --trajectories calls.npz --learn tokens": "of an encoder with tokens: tests/calibration",
-    "ttscompile calibrate compiled/ --trajectories calls.npz --learn schedule,start": "ends with 1 after so short a search",
+    "ttscompile serve": "has no end; tests/server and tests/fleet start it",
+    "ttscompile calibrate compiled/ --trajectories calls.npz --learn tokens": "needs tokens: tests/calibration",
+    "ttscompile calibrate compiled/ --trajectories calls.npz --learn schedule,start": "a short search ends with 1",
     "ttscompile calibrate compiled/ --trajectories calls.npz --target-sparsity 0.875 --learn": "the same",
     "curl": "needs a server; tests/server/test_metrics.py and tests/fleet ask the same of one",
     "python examples/serve": "needs a server; the same tests run it against one",
@@ -26,7 +26,7 @@ NOT_RUN = {
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
     "python examples/vla/drive.py": "of a LeRobot policy: tests/examples/test_vla_drive.py runs it",
     "ttscompile calibrate compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
-    "ttscompile compare compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
+    "python examples/benchmark/strategies.py compiled/ -t calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""
@@ -34,12 +34,10 @@ NOT_RUN = {
 SHORTER = {
     "convert": "--steps 5",
     "calibrate": "--target-sparsity 0.8 --max-minutes 0.001",
-    "compare": "--sparsities 0.8 --intervals 1 --calls 4 --learned-calls 8",
+    "strategies.py": "--sparsities 0.8 --intervals 1 --calls 4 --learned-calls 8",
     "verify": "--calls 4",
-    "bench": "--runs 1",
+    "bench": "--calls 1",
     "oracle.py": "--computed-steps 2 --schedules 2 --calls 4 --draws 2",
-    "push": "--runs 1",
-    "realtime": "--runs 1",
     "record.py": "--episodes 2 --threads 1",
     "evaluate.py": "--episodes 1 --threads 1",
 }

@@ -28,6 +28,7 @@ def policy_stream(name: str) -> tuple[int, ...]:
     return (4, {"bare observation": 2, "U-Net": 4}.get(name, 16))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_from_a_module_to_both_runtimes(name: str, compiled_module: Callable[[str], tuple[nn.Module, Path]]) -> None:
     module, folder = compiled_module(name)

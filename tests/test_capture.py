@@ -49,6 +49,7 @@ def test_the_users_module_is_not_touched() -> None:
     assert module.training and module.linear.weight.dtype is torch.float64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("then", "message"),
     [
@@ -94,6 +95,7 @@ def test_a_constant_made_of_the_number_of_streams_is_refused() -> None:
         capture(Denoiser(lambda y, t, o: y * torch.tensor(float(y.shape[0]))), toy_spec())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("small", [1, 2])
 def test_a_branch_at_a_small_batch_is_refused(small: int) -> None:
     with pytest.raises(CaptureError, match=f"computes for a batch of {small} something else than for more"):

@@ -33,6 +33,7 @@ class Stacks(nn.Module):
         return y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stack", STACKS, ids=lambda stack: stack.__name__)
 def test_it_is_a_cat_and_computes_the_same_in_onnxruntime(stack: Callable[[list[Tensor]], Tensor]) -> None:
     module = Stacks(stack)

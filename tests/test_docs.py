@@ -73,7 +73,7 @@ def folder(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory)
         recording.create_array(name, data=rng.uniform(100, 400, shape).astype(np.float32))
     recording.create_array("meta/episode_ends", data=np.array([20, 40]))
     point = {"series": "interval", "name": "0.8", "distance": 20.0, "latency_ms": 3.0}
-    (place / "comparison.json").write_text(json.dumps({"points": [point]}))
+    (place / "comparison.json").write_text(json.dumps({"comparison": {"points": [point]}}))
     for words in (
         ["convert", "policy.ckpt", "-o", "compiled"],
         ["calibrate", "compiled", "--trajectories", "calls.npz"],
@@ -151,6 +151,7 @@ def elsewhere(command: Any) -> bool:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", FOLLOWED, ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_page_can_be_followed(page: Path, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: Any) -> None:
     if page == TUTORIAL:  # makes everything itself, from the policy of the example
@@ -306,6 +307,7 @@ def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.
         near_misses(graph)
 
 
+@pytest.mark.slow
 def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its module, its row and its test as they stand in the guide."""
     module, row, its_test = guide("family")
@@ -324,6 +326,7 @@ def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch
         refused(tmp_path, changes, message)
 
 
+@pytest.mark.slow
 def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The module, its row and its test as they stand in the guide."""
     written, row, its_test = guide("strategy")
@@ -336,6 +339,7 @@ def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monk
         test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
 
 
+@pytest.mark.slow
 def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its module, how it is opened, its row and its test as they stand in the guide."""
     module, opening, row, its_test = guide("runtime")
@@ -351,6 +355,7 @@ def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pyte
     test.test_the_pruners_plan_and_reuse_over_calls(tmp_path / "pruned")
 
 
+@pytest.mark.slow
 def test_the_site_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}

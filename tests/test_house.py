@@ -53,7 +53,18 @@ MAY_IMPORT = {
 
 RIVALS_READ = {
     f"ttscompile.calibration.{name}"
-    for name in ("calls", "execute", "fit_correction", "progress", "pruner.head", "spacing", "targets", "task", "tts")
+    for name in (
+        "calls",
+        "execute",
+        "fit_correction",
+        "progress",
+        "pruner.head",
+        "spacing",
+        "targets",
+        "task",
+        "trials",
+        "tts",
+    )
 }
 """What rivals know of calibration: what a strategy is given, and what it may compare."""
 

@@ -25,6 +25,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return release.build(tmp_path_factory.mktemp("release"), isolated=False)
 
 
+@pytest.mark.slow
 def test_sdist_and_wheel_are_whole_and_pass_the_check_of_the_index(built: tuple[Path, Path]) -> None:
     assert release.missing_or_more(built[1]) == set()
     release.check(built)
@@ -34,6 +35,7 @@ def test_sdist_and_wheel_are_whole_and_pass_the_check_of_the_index(built: tuple[
     assert not any(name.startswith(("tests", "examples", "build")) for name in names)
 
 
+@pytest.mark.slow
 def test_the_wheel_runs_an_artifact(built: tuple[Path, Path], tmp_path: Path) -> None:
     """With the packages of this environment, and none of the tree; ``make release`` takes an empty one."""
     artifact = written_artifact(toy_program(), tmp_path / "artifact").path

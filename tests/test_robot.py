@@ -84,6 +84,7 @@ def test_a_robot_without_torch_acts_as_the_full_environment_does(robot: Path, co
     assert seconds < 2.0
 
 
+@pytest.mark.slow
 def test_loading_imports_nothing_of_the_compilers_where_it_is_installed(compiled_pusht: Path, call: Path) -> None:
     modules = act(sys.executable, compiled_pusht, call)["modules"]
     assert not set(COMPILERS_ONLY) & set(modules)

@@ -88,6 +88,7 @@ def defects(module: nn.Module) -> dict[str, nn.Module]:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_defects_of_an_action_head_are_far_outside(name: str) -> None:
     """The tolerance of ``test_a_head_computes_what_the_original_computes`` against what it has to find."""

@@ -5,8 +5,8 @@
 Every row is a way to spend the same number of computed cells a call, mean over the calls: evenly spaced or searched
 steps, switches, gates trained for all calls, and a head trained to decide for each observation, with one direction of
 reuse or with all. Each is measured with and without a correction of the sampler, on windows of consecutive calls of
-episodes that nothing was learned from, against the dense policy with the same noise. ``oracle.py`` says what
-choosing among schedules could gain.
+episodes that nothing was learned from, against the same loop with every block computed and the same noise.
+``oracle.py`` says what choosing among schedules could gain.
 """
 
 from __future__ import annotations
@@ -50,9 +50,12 @@ from ttscompile.calibration.task import Found, Search, Task
 from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
-from ttscompile.core.lattice import PlanArray, Source
+from ttscompile.core.lattice import PlanArray, Source, dense_plan
 from ttscompile.rivals.switched import Switched
 from ttscompile.runtimes.plans import pruner_plan
+
+WITH_OTHER_NOISE = 64
+"""Held-out calls that are answered again, with other noise."""
 
 RESAMPLED = 2000
 """Samples of the bootstrap over episodes."""
@@ -74,7 +77,7 @@ class Row:
         decided: how a plan comes about.
         reads: what cells read that are not computed.
         corrected: whether a correction was kept.
-        error: mean absolute difference of the executed actions from those of the dense policy.
+        error: mean absolute difference of the executed actions from those with every block computed.
         interval: 95 % interval of the error, over episodes.
         other_noise: the error as a share of what other noise changes.
         cells: computed, mean over the calls.
@@ -221,27 +224,22 @@ def measured(
 def keep(found: Found, directory: Path) -> None:
     """Have the artifact in ``directory`` execute what was found, with its correction, as the plan ``found``.
 
-    Of a head the mean of its plans is beside it, as ``calibrate`` leaves it.
+    Of a head the mean of its plans is beside it, as the plan ``mean``.
     """
     artifact = load_artifact(directory)
-    base = base_of(artifact)
-    mean = replace(base, cells=found.schedule, correction=found.correction)
-    plans = {**artifact.plans, "found": mean}
+    base, plans = base_of(artifact), {n: p for n, p in artifact.plans.items() if n not in ("found", "mean")}
+    plans["found"] = replace(base, cells=found.schedule, correction=found.correction)
     if found.pruner is not None:
-        own = replace(base, cells=None, correction=found.pruner_correction)
-        plans |= {"found": own, "mean": replace(mean, correction=None)}
-    record = {"strategy": "ablation", **found.notes}
-    update_plans(directory, plans, "found", record, pruner_weights=found.pruner, pruner_loop=base.loop)
-
-
-OTHER = 32
-"""Judged calls at most that are answered a second time, with other noise."""
+        plans["mean"] = replace(base, cells=found.schedule)
+        plans["found"] = replace(base, cells=None, correction=found.pruner_correction)
+    notes = {"strategy": "ablation", **found.notes}
+    update_plans(directory, plans, "found", notes, pruner_weights=found.pruner, pruner_loop=base.loop)
 
 
 def other_noise(executor: Executor, calls: Calls, seed: int) -> float:
-    """How far two dense answers to one observation are apart, in the units of the actions."""
+    """How far two answers to one observation are apart with every block computed, in the units of the actions."""
     spec = executor.view.manifest.spec
-    some = executor.select(calls, np.arange(min(OTHER, calls.count)))
+    some = executor.select(calls, np.arange(min(WITH_OTHER_NOISE, calls.count)))
     initial, noise = draw_noise(spec, some.count, (seed, 5))
     paths = torch.cat(list(dense_rounds(executor, replace(some, initial=initial, noise=noise, path=None))))
     return float(Actions(spec).errors(paths[:, -1], some.targets, units=True).mean())
@@ -257,7 +255,7 @@ def drawn(
     stage: int,
     pinned: bool,
 ) -> Calls:
-    """Windows of consecutive calls, with what the dense policy answers."""
+    """Windows of consecutive calls, with what is answered if every block is computed."""
     spec = executor.view.manifest.spec
     chosen = sample_windows(episodes, numbers, most, window, seed, REPEATS if stage == 0 else 1)
     calls = prepare_calls(executor.model, spec, episodes, chosen, (seed, 9, stage), window, pinned)
@@ -324,10 +322,8 @@ def main(
 ) -> None:
     """Measure all rows on the artifact in DIRECTORY."""
     artifact = load_artifact(directory)
-    executor, progress = Executor(view_of(artifact, base_of(artifact).exact)), Console(stderr=True)
-    manifest = executor.view.manifest
-    spec, flops = manifest.spec, manifest.flops
-    even = uniform_of(manifest.steps, len(manifest.blocks), round(computed_steps * executor.model.blocks))
+    spec, progress = artifact.manifest.spec, Console(stderr=True)
+    executor = Executor(view_of(artifact, base_of(artifact).exact))
     budget = round(computed_steps * executor.model.blocks)
     episodes = load_episodes(spec, trajectories, None)
     split = split_episodes(len(episodes), FRACTION, seed)
@@ -338,6 +334,7 @@ def main(
     ]
     task = Task.of(executor, sets[0], budget, seed)
     judge = Judge(executor, task.actions, sets[1], other_noise(executor, sets[1], seed))
+    even = uniform_of(executor.model.steps, executor.model.blocks, budget)
     rows = [judge.row("even steps", "TIMESTEP", even, None, 0.0)]
     if "refreshed" in ways:
         rows += refreshed(task, judge, even)
@@ -346,6 +343,8 @@ def main(
     for decided, reads, maker in rows_of(directions, ways, updates):
         rows += measured(task, judge, decided, reads, maker, minutes, kept)
         progress.print(rows[-2], rows[-1], sep="\n")
+    flops = executor.view.manifest.flops
+    share = flops.pruner / flops.call(dense_plan(executor.model.steps, executor.model.blocks), False)
     if path is not None:
         told: Mapping[str, Any] = {
             "computed_steps": computed_steps,
@@ -353,12 +352,12 @@ def main(
             "calls": [one.count for one in sets],
             "window": window,
             "pinned": pinned,
-            "pruner_share": flops.pruner / flops.dense,
+            "pruner_share": share,
             "rows": [asdict(row) for row in rows],
         }
         path.write_text(json.dumps(told, indent=2))
     show(rows, f"{budget} of {executor.model.steps * executor.model.blocks} cells, windows of {window} calls")
-    print(f"A head costs {flops.pruner / flops.dense:.4%} of the FLOPs of a dense call.")
+    print(f"A head costs {share:.4%} of the FLOPs of a call that computes every block.")
 
 
 if __name__ == "__main__":

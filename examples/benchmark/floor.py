@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.cli.timing import Contestant, Measurement
+from ttscompile.artifact.view import View, view_of
 from ttscompile.core.lattice import PlanArray, plan_flops
 from ttscompile.ir.pieces import block_name
+from ttscompile.report.timing import Contestant, Measurement
 from ttscompile.runtimes.instructions import instructions_of
 from ttscompile.runtimes.onnxruntime.idle_steps import WORTH
-from ttscompile.runtimes.onnxruntime.sessions import Bound, open_sessions
+from ttscompile.runtimes.onnxruntime.sessions import Bound, Sessions
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 from ttscompile.runtimes.random_calls import random_calls
 
@@ -28,12 +29,19 @@ SEQUENCES = 5
 """How often the blocks are gone through in one timed run: about the cells of a 95 % plan of 100 steps."""
 
 
-def blocks_contestant(directory: Path, threads: int) -> Contestant:
-    """All blocks in order, ``SEQUENCES`` times over; ``flops`` of its measurement are theirs alone."""
-    artifact = load_artifact(directory)
-    manifest = artifact.manifest
-    sessions = open_sessions(artifact, threads)
-    bound = [_bind(artifact, sessions[block_name(b)], b) for b in range(len(manifest.blocks))] * SEQUENCES
+def blocks_contestant(directory: Path, threads: int, plan: str | None = None) -> Contestant:
+    """All blocks in order, ``SEQUENCES`` times over; ``flops`` of its measurement are theirs alone.
+
+    Args:
+        directory: the artifact.
+        threads: of arithmetic.
+        plan: in whose precision, and with whose weights; None for the artifact's default.
+    """
+    view = view_of(load_artifact(directory), plan)
+    manifest = view.manifest
+    with view.reading():
+        sessions = Sessions(threads).of(view)
+    bound = [_bind(view, sessions[block_name(b)], b) for b in range(len(manifest.blocks))] * SEQUENCES
 
     def call(*_: object) -> None:
         for one in bound:
@@ -43,17 +51,25 @@ def blocks_contestant(directory: Path, threads: int) -> Contestant:
     return Contestant(FLOOR, "", call, lambda: None, manifest.spec, total)
 
 
-def tails_contestant(directory: Path, threads: int, plan: PlanArray) -> Contestant:
-    """Tail, sampler and the next step's stem of all K steps of a plan, with no block and no sum between them."""
-    artifact = load_artifact(directory)
-    manifest = artifact.manifest
-    work = Workspace(manifest, open_sessions(artifact, threads, blocks=False), artifact.tables, 1)
+def tails_contestant(directory: Path, threads: int, cells: PlanArray, plan: str | None = None) -> Contestant:
+    """Tail, sampler and the next step's stem of all K steps of a plan, with no block and no sum between them.
+
+    Args:
+        directory: the artifact.
+        threads: of arithmetic.
+        cells: of the plan, int8 ``[K, blocks]``.
+        plan: its name; None for the artifact's default.
+    """
+    view = view_of(load_artifact(directory), plan)
+    manifest = view.manifest
+    with view.reading():
+        work = Workspace(view, Sessions(threads).of(view, blocks=False), 1)
     ((obs, noise),) = random_calls(manifest.spec, 1, seed=0)
     for key, spec in manifest.spec.observations.items():
         obs[key] = spec.normalized(obs[key])
     work.start(obs, noise, None)
 
-    lowered = instructions_of(plan, manifest.groups)
+    lowered = instructions_of(cells, manifest.groups)
 
     def call(*_: object) -> None:
         k = 0
@@ -81,9 +97,9 @@ def floor_ms(plan: PlanArray, artifact: Artifact, blocks: Measurement) -> float:
     return plan_flops(plan, artifact.manifest.flops.blocks) / rate
 
 
-def _bind(artifact: Artifact, session: object, b: int) -> Bound:
+def _bind(view: View, session: object, b: int) -> Bound:
     """A block tied to arrays of random numbers: zeros would have attention and normalisation work on special cases."""
-    manifest = artifact.manifest
+    manifest = view.manifest
     piece, kind = manifest.pieces[block_name(b)], manifest.blocks[b].type
     assert piece.stream is not None
     rng = np.random.default_rng(b)

@@ -37,7 +37,7 @@ from torch import Tensor, nn
 import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.write import update_plans
 from ttscompile.frontends.clip import TextConfig, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
@@ -54,7 +54,7 @@ TO, STEPS, HORIZON, EXECUTED, ACTIONS, STATE, WORDS = 2, 40, 32, 24, 14, 14, 77
 CAMERAS = ("front", "wrist")
 CONTROL_HZ = 10.0
 POLICY_HZ = {"resnet": 10.0, "clip": 2.0, "smolvla": 10.0}
-PLAN = "two_steps"
+PLAN, REUSING = "two_steps", "two_steps_some_tokens"
 
 
 class Clip(nn.Module):
@@ -87,7 +87,7 @@ class ResNets(nn.Module):
 
 
 def compiled(name: str, folder: Path) -> None:
-    """Compile a policy of this name, with a plan that computes two steps."""
+    """Compile a policy of this name, with a plan of two computed steps, and where it can be one that reuses tokens."""
     if name == "smolvla":
         import large_smolvla
 
@@ -95,10 +95,13 @@ def compiled(name: str, folder: Path) -> None:
         program = ttscompile.convert(folder.parent / "smolvla-checkpoint", folder, precision="int8")
     else:
         program = ttscompile.compile_denoiser(*network(name), folder)
-    steps = program.spec.sampler.steps
-    plan = np.full((steps, len(program.blocks)), ttscompile.Source.TIMESTEP, np.int8)
-    plan[0] = plan[steps // 2] = ttscompile.Source.COMPUTE
-    update_calibration(folder, None, {PLAN: plan}, PLAN, {})
+    steps, artifact = program.spec.sampler.steps, load_artifact(folder)
+    cells = np.full((steps, len(program.blocks)), ttscompile.Source.TIMESTEP, np.int8)
+    cells[0] = cells[steps // 2] = ttscompile.Source.COMPUTE
+    plans = {**artifact.plans, PLAN: replace(artifact.default, cells=cells)}
+    if artifact.manifest.tokens:
+        plans[REUSING] = replace(plans[PLAN], tokens=REUSE)
+    update_plans(folder, plans, PLAN, {})
 
 
 def network(name: str) -> tuple[nn.Module, PolicySpec]:
@@ -185,7 +188,7 @@ class _Timed:
     def __init__(self, policy: CompiledPolicy, forgetful: bool) -> None:
         self._policy, self._forgetful = policy, forgetful
         self.info, self.reset = replace(policy.info, frames=0) if forgetful else policy.info, policy.reset
-        self.prepare_frame = policy.prepare_frame
+        self.prepare_frame, self.follow = policy.prepare_frame, policy.follow
         self.took: list[float] = []
 
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
@@ -242,7 +245,7 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> None:
     if alone:
         print("\nTokens are reused, and an arm moves in front of both cameras.")
         del policy  # half of the memory
-        reusing = open_policy(artifact.at_precision("int8").with_reuse(REUSE), seed=0)
+        reusing = open_policy(artifact, seed=0, plan=REUSING)
         drive(reusing, spec, hz, seconds, lambda: arms(spec, 1))
 
 

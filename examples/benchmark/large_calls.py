@@ -10,9 +10,8 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +20,18 @@ from moving import REUSE, arm, picture
 from rate import rates, run_all
 
 import ttscompile
-from ttscompile import Noise, PolicySpec
+from ttscompile import Noise, Plan, PolicySpec
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.core.plan import TokenReuse
 from ttscompile.ir.flops import graph_flops
-from ttscompile.runtimes.info import PolicyInfo
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.runtimes.report import CallReport
+
+PRECISIONS = ("fp32", "int8")
+COMPARED = 3
+"""Random observations that precisions are compared on: a dense call of a large policy takes seconds."""
 
 
 class Arithmetic:
@@ -96,7 +100,9 @@ def compare(
 ) -> None:
     """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in int8.
 
-    Seconds are the processor's: all calls are on one thread, and the machine may be busy.
+    Seconds are the processor's: all calls are on one thread, and the machine may be busy. Then it is told how far dense
+    actions in int8 are from those in fp32, with equal noise on some random observations, and how far other noise moves
+    these.
 
     Args:
         folder: with the artifact.
@@ -107,44 +113,64 @@ def compare(
         rounds: that are counted.
     """
     torch.set_num_threads(1)
-    record = load_artifact(folder / "compiled").manifest.precision
-    assert record is not None
-    policies = {name: ttscompile.load(folder / "compiled", plan=f"full@{name}") for name in ("fp32", "int8")}
-    info = policies["fp32"].info
+    artifact = load_artifact(folder / "compiled")
+    policy = open_policy(artifact, plan="dense")
     obs, noise = call(spec)
-    plans = plans_of(info, computed)
-    times = Times(Arithmetic(load_artifact(folder / "compiled")))
+    times = Times(Arithmetic(artifact))
     for _ in range(rounds + 1):  # the first does not count
         times.next_round()
         expected, split = eager()
-        for precision, policy in policies.items():
-            for name, plan in plans.items():
+        for precision in PRECISIONS:
+            for name, plan in plans_of(artifact, precision, computed).items():
                 policy.forget_frames()  # every call sees the same observation
                 found = timed(policy, obs, noise, plan, times, precision, f"{name}, {precision}")
                 if (name, precision) == ("dense", "fp32"):
-                    exact, error = found, float(np.abs(found - expected).max())
+                    error = float(np.abs(found - expected).max())
                     assert policy.last_report is not None
                     times.add(f"eager: {parts}", precision, split, policy.last_report)
-                elif name == "dense":
-                    apart = float(np.abs(found - exact).max())
     times.tell(1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"{error:8.1e}  the dense call from eager; {peak:.2f} GiB at most, all of them loaded")
-    print(f"{record.told}: a dense call up to {apart:.2g} from fp32")
+    tell_precision(artifact, policy)
 
 
-def plans_of(info: PolicyInfo, computed: int) -> dict[str, Any]:
-    """The dense plan, and one of whole steps, evenly spaced."""
-    few = np.full((info.K, len(info.blocks)), ttscompile.Source.TIMESTEP, np.int8)
-    few[np.arange(computed) * info.K // computed] = ttscompile.Source.COMPUTE
-    return {"dense": 0 * few, f"{computed} of {info.K} steps": few}
+def tell_precision(artifact: Artifact, policy: CompiledPolicy) -> None:
+    """Print how far int8 moves dense actions, all parts together and each alone, and how far other noise does."""
+    record, exact = artifact.manifest.precision, artifact.plans["dense"]
+    assert record is not None
+    lower = dict.fromkeys(record.kept, record.name)
+    parts = {f"{part} alone": {part: record.name} for part in record.kept} if len(record.kept) > 1 else {}
+    plans = {name: replace(exact, precision=own) for name, own in {"dense actions": lower, **parts}.items()}
+    calls = random_calls(artifact.manifest.spec, COMPARED, seed=8)
+    moved: dict[str, list[float]] = {name: [] for name in (*plans, "other noise")}
+    for number, (obs, noise) in enumerate(calls):
+
+        def actions(plan: Plan, noise: Noise, obs: Mapping[str, np.ndarray] = obs) -> np.ndarray:
+            policy.reset()
+            return np.asarray(policy.predict_action(obs, noise=noise, plan=plan)["action"])
+
+        expected = actions(exact, noise)
+        made = {name: actions(plan, noise) for name, plan in plans.items()}
+        made["other noise"] = actions(exact, calls[number - 1][1])
+        for name, found in made.items():
+            moved[name].append(float(np.abs(found - expected).mean()))
+    told = (f"{name} {statistics.mean(values):.2g}" for name, values in moved.items())
+    print(f"{record.told}, from fp32 on average: {'; '.join(told)}")
+
+
+def plans_of(artifact: Artifact, precision: str, computed: int, tokens: TokenReuse | None = None) -> dict[str, Plan]:
+    """The dense plan in a precision, and one of whole steps, evenly spaced."""
+    dense, steps = replace(artifact.plan(f"dense@{precision}"), tokens=tokens), artifact.manifest.steps
+    few = np.full((steps, len(artifact.manifest.blocks)), ttscompile.Source.TIMESTEP, np.int8)
+    few[np.arange(computed) * steps // computed] = ttscompile.Source.COMPUTE
+    return {"dense": dense, f"{computed} of {steps} steps": replace(dense, cells=few)}
 
 
 def timed(
     policy: CompiledPolicy,
     obs: Mapping[str, np.ndarray],
     noise: Noise,
-    plan: Any,
+    plan: Plan,
     times: Times,
     precision: str,
     name: str,
@@ -169,9 +195,10 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
         computed: how many steps the sparse plan computes.
         rounds: that are counted, of a frame for each plan.
     """
-    artifact = load_artifact(folder / "compiled").at_precision("int8")
-    whole, some = (open_policy(each, seed=0) for each in (artifact, artifact.with_reuse(REUSE)))
-    plans, times, rng = plans_of(whole.info, computed), Times(Arithmetic(artifact)), np.random.default_rng(1)
+    artifact = load_artifact(folder / "compiled")
+    plans, reused = plans_of(artifact, "int8", computed), plans_of(artifact, "int8", computed, REUSE)
+    whole, some = (open_policy(artifact, seed=0, plan=each["dense"]) for each in (plans, reused))
+    times, rng = Times(Arithmetic(artifact)), np.random.default_rng(1)
     obs, noise = call(spec)
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
     cameras = [key for key, value in obs.items() if value.ndim == 5]  # [1, frames, 3, H, W]
@@ -185,7 +212,7 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
             angles = [place + 0.05 * max(number - age, 0) for age in ages]
             obs[key] = np.stack([arm(background, angle) for angle in angles])[None]
         expected = timed(whole, obs, noise, plan, times, "int8", f"{name}, int8, new frames, all tokens")
-        found = timed(some, obs, noise, plan, times, "int8", f"{name}, int8, new frames, some tokens")
+        found = timed(some, obs, noise, reused[name], times, "int8", f"{name}, int8, new frames, some tokens")
         if number >= 2 * len(plans):  # the first is whole, and those that follow may be the first of their size
             assert some.last_report is not None
             frames = some.last_report.frames

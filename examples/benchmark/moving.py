@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.artifact.tokens import ReuseRecord
+from ttscompile.core.plan import TokenReuse
 
 Array = npt.NDArray[np.float32]
 
-REUSE = ReuseRecord(threshold=0.02, refresh=10**6, computed=1.0, error=0.0, other_noise=0.0, calls=1)
+REUSE = TokenReuse(threshold=0.02, refresh=10**6)
 """Tokens of patches that differ by more than 0.02 are computed; no frame is refreshed for its age."""
 
 

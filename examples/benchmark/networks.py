@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ from torch import nn
 
 import ttscompile
 from ttscompile import Source
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import PlanArray, uniform_plan
 from ttscompile.core.spec import ORIGINAL, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
@@ -133,5 +134,7 @@ def compile_with_plans(network: Network, directory: Path, sparsities: Sequence[f
 
 
 def store_plans(directory: Path, plans: Mapping[str, PlanArray]) -> None:
-    """Give an artifact these schedules, the last of them as the default."""
-    update_calibration(directory, None, plans, list(plans)[-1], {"strategy": "benchmark"})
+    """Give an artifact plans with these cells, in its default's loop and precision; the last of them is the default."""
+    artifact = load_artifact(directory)
+    made = {name: replace(artifact.default, cells=cells) for name, cells in plans.items()}
+    update_plans(directory, {**artifact.plans, **made}, list(plans)[-1], {"strategy": "benchmark"})

@@ -2,10 +2,11 @@
 
     python examples/benchmark/requirements.py build/pusht/compiled
 
-One process times, call by call in turn and at every thread count: eager PyTorch, dense onnxruntime, the artifact's
-plan, its blocks back to back (the floor, see ``floor.py``), its tails back to back, and the same network and plan with
-four times as many steps. Then tests/runtimes/soak.py makes thousands of calls in a process of its own, pinned to the
-core that does least at the moment. Exit status 1: a requirement was measured and is not met.
+One process times, call by call in turn and at every thread count: eager PyTorch, onnxruntime with every block
+computed, the artifact's plan, its blocks back to back (the floor, see ``floor.py``), its tails back to back, and the
+same network and plan with four times as many steps. All but the last run the loop of the plan. Then
+tests/runtimes/soak.py makes thousands of calls in a process of its own, pinned to the core that does least at the
+moment. Exit status 1: a requirement was measured and is not met.
 """
 
 from __future__ import annotations
@@ -32,11 +33,14 @@ from rounds import DENSE, EAGER, Effort, eager_contestant, measure_in_passes, ro
 
 import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.cli.contestants import original_policy
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
-from ttscompile.cli.timing import Contestant, Measurement, original_policy, plan_contestant
-from ttscompile.core.lattice import PlanArray
+from ttscompile.core.lattice import PlanArray, dense_plan
+from ttscompile.core.plan import ORIGINAL
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.runtimes.random_calls import random_calls
+from ttscompile.report.timing import Contestant, Measurement, plan_contestant
+from ttscompile.runtimes.random_calls import Observation, random_calls
 
 OURS, LONGER = "compiled", "compiled, longer loop"
 GROWTH = 4
@@ -93,7 +97,7 @@ class Subject:
     Attributes:
         directory: the artifact.
         artifact: loaded.
-        network: that it was made from.
+        network: that it was made from, with the loop of the plan.
         plan_name: the plan.
         plan: int8 ``[K, blocks]``, as a call executed it.
     """
@@ -121,37 +125,49 @@ def subject_of(directory: Path, network: Network, plan_name: str | None) -> Subj
     """The same for a network in memory."""
     artifact = load_artifact(directory)
     name = plan_name or artifact.manifest.default_plan
-    policy = ttscompile.load(directory)
-    for obs, noise in random_calls(artifact.manifest.spec, 2, seed=0):  # the first one of an episode may be repaired
+    policy, spec = ttscompile.load(directory, plan=name), view_of(artifact, name).manifest.spec
+    for obs, noise in random_calls(spec, 2, seed=0):  # the first one of an episode may be repaired
         policy.predict_action(obs, noise=noise, plan=name)
     report = policy.last_report
     assert report is not None
-    return Subject(directory, artifact, replace(network, spec=artifact.manifest.spec), name, report.plan[0])
+    return Subject(directory, artifact, replace(network, spec=spec), name, report.plan[0])
 
 
 def time_calls(
     of: Subject, settings: Settings, announce: Callable[[str, int], Callable[[], None]]
 ) -> dict[int, dict[str, Measurement]]:
     """All contestants at all thread counts: by number of threads, by label."""
-    spec, dense_flops = of.network.spec, of.artifact.manifest.flops.dense
-    eager = eager_contestant(of.network, dense_flops)
+    spec, manifest = of.network.spec, of.artifact.manifest
+    eager = eager_contestant(of.network, manifest.flops.dense / manifest.steps * spec.sampler.steps)
     with TemporaryDirectory() as folder:
         announce(f"compiling with {GROWTH} times the steps", 1)
         longer = _compile_longer(of, Path(folder))
         by_threads: dict[int, list[Contestant]] = {}
         for threads in sorted({1, *settings.threads}):
-            policies = [ttscompile.load(of.directory, threads=threads) for _ in range(2)]  # their caches are their own
+            policy = ttscompile.load(of.directory, threads=threads, plan=of.plan_name)
             by_threads[threads] = [
                 eager,
-                plan_contestant(DENSE, policies[0], "dense", spec),
-                plan_contestant(OURS, policies[1], of.plan_name, spec),
-                blocks_contestant(of.directory, threads),
-                tails_contestant(of.directory, threads, of.plan),
+                _in_full(of, threads),
+                plan_contestant(OURS, policy, of.plan_name, spec),
+                blocks_contestant(of.directory, threads, of.plan_name),
+                tails_contestant(of.directory, threads, of.plan, of.plan_name),
             ]
         by_threads[1].append(longer)
         on_round = announce("timing", rounds_of(by_threads, settings.effort))
         measured = measure_in_passes(by_threads, settings.effort, on_round)
     return {threads: {m.label: m for m in measurements} for threads, measurements in measured.items()}
+
+
+def _in_full(of: Subject, threads: int) -> Contestant:
+    """The loop of the plan in its precision, with every block computed; with a policy, and caches, of its own."""
+    cells = dense_plan(*of.plan.shape)
+    whole = replace(of.artifact.plan(of.plan_name), cells=cells, correction=None, weights=ORIGINAL)
+    policy = ttscompile.load(of.directory, threads=threads, plan=whole)
+
+    def call(obs: Observation, noise: ttscompile.Noise) -> object:
+        return policy.predict_action(obs, noise=noise)
+
+    return Contestant(DENSE, "dense", call, lambda: policy.last_report, of.network.spec, 0.0)
 
 
 def _compile_longer(of: Subject, directory: Path) -> Contestant:
@@ -267,7 +283,7 @@ def profile(of: Subject, one: Mapping[str, Measurement]) -> dict[str, float]:
     parts = {
         "computed cells (the floor)": floor_ms(of.plan, of.artifact, one[FLOOR]),
         f"{len(of.plan)} tails, sampler steps and stems": one[TAILS].median_ms,
-        "prologue": one[OURS].prologue_ms or 0.0,
+        "prologue": one[OURS].parts_ms["prologue"],
     }
     return parts | {"rest": one[OURS].median_ms - sum(parts.values())}
 

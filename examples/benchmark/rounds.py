@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from networks import Network
 
-from ttscompile.cli.timing import WARM_UP, Contestant, Measurement, measure, network_contestant
+from ttscompile.cli.contestants import network_contestant
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.frontends.eager import eager_policy
+from ttscompile.report.timing import WARM_UP, Contestant, Measurement, measure
 from ttscompile.runtimes.random_calls import random_calls
 
 EAGER, TORCH_COMPILE, DENSE = "eager PyTorch", "torch.compile", "dense onnxruntime"

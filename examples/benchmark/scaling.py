@@ -3,10 +3,10 @@
     pip install 'ttscompile[compile,ray]'
     python examples/benchmark/scaling.py compiled/ --cores 1,2
 
-It answers dense calls with observations that are drawn, and compares the schedules of one crowded family, each with a
-correction of its own. Every number of cores takes its turn in every round; what counts is the ratio of the medians.
-The start of Ray and of its processes is not counted; that each opens the artifact is. The answers must be the same
-bits, or this ends with status 1.
+It answers calls with every block computed, of the loop that a calibration begins with and with observations that are
+drawn; and it compares the schedules of one crowded family, each with a correction of its own. Every number of cores
+takes its turn in every round; what counts is the ratio of the medians. The start of Ray and of its processes is not
+counted; that each opens the artifact is. The answers must be the same bits, or this ends with status 1.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
+from ttscompile.calibration.trials import base_of
 from ttscompile.pool import RayPool
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.trajectories.episodes import Episode
@@ -47,7 +48,8 @@ def drawn_calls(executor: Executor, count: int) -> Calls:
 def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) -> None:
     """Time dense calls and candidates of the artifact DIRECTORY on clusters of some of this machine's cores."""
     torch.set_num_threads(1)
-    executor = Executor(view_of(load_artifact(directory), "dense"))
+    artifact = load_artifact(directory)
+    executor = Executor(view_of(artifact, base_of(artifact).exact))
     drawn = drawn_calls(executor, calls)
     counts = [int(each) for each in cores.split(",")]
     seconds: dict[int, list[tuple[float, float]]] = {count: [] for count in counts}

@@ -37,9 +37,9 @@ from rounds import (
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results_console, run, table
-from ttscompile.cli.timing import Contestant, Measurement, plan_contestant
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.report.timing import Contestant, Measurement, plan_contestant
 
 COMPILED = "compiled"
 

@@ -25,17 +25,17 @@ from typing import Any, ClassVar
 import click
 import numpy as np
 import torch
-from large_calls import plans_of
+from large_calls import PRECISIONS, plans_of
 from large_smolvla import CAMERAS, STATE, call
 from moving import REUSE, arm, picture
 from torch.nn import functional
 
-from ttscompile import Noise
+from ttscompile import Noise, Plan
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 
-SIDE, PRECISIONS = 512, ("fp32", "int8")
+SIDE = 512
 FLOATS = 1
 """Of vla.cpp's interface (``vla.h``): pixels are floats from 0 to 1."""
 
@@ -135,7 +135,7 @@ def squared(picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(padded[0].permute(1, 2, 0).numpy())
 
 
-def timed(policy: CompiledPolicy, obs: Mapping[str, np.ndarray], noise: Noise, plan: Any) -> tuple[list[float], Any]:
+def timed(policy: CompiledPolicy, obs: Mapping[str, np.ndarray], noise: Noise, plan: Plan) -> tuple[list[float], Any]:
     """Seconds of a call of ours, of the clock: before the loop, and in it; and the actions ``[T, D]``."""
     start = time.perf_counter()
     actions = policy.predict_action(obs, noise=noise, plan=plan)["action_pred"][0]
@@ -171,12 +171,10 @@ def main(folder: Path, library: Path, model: Path, threads: int, rounds: int) ->
     for key in obs:
         if key.endswith("mask"):
             obs[key] = np.ones_like(obs[key])
-    policies = {
-        name: open_policy(artifact.with_reuse(None), "onnxruntime", threads, precision=name) for name in PRECISIONS
-    }
-    reusing = open_policy(artifact.at_precision("int8").with_reuse(REUSE), "onnxruntime", threads)
-    plans = plans_of(reusing.info, 2)
-    few = list(plans)[-1]
+    plans = {name: plans_of(artifact, name, 2) for name in PRECISIONS}
+    policies = {name: open_policy(artifact, threads=threads, plan=own["dense"]) for name, own in plans.items()}
+    few, reused = list(plans_of(artifact, "int8", 2, REUSE).items())[-1]
+    reusing = open_policy(artifact, threads=threads, plan=reused)
     still = {key: picture(obs[key].shape[-1], rng) for key in CAMERAS}
     times: dict[str, list[list[float]]] = {}
     off: dict[str, list[float]] = {}
@@ -187,11 +185,11 @@ def main(folder: Path, library: Path, model: Path, threads: int, rounds: int) ->
         found = {"vla.cpp": rival.predict(pictures, obs, noise)}
         times.setdefault("vla.cpp: pictures, the rest", []).append(rival.parts())
         for precision, policy in policies.items():
-            for name, plan in plans.items():
+            for name, plan in plans[precision].items():
                 policy.forget_frames()
                 seconds, found[f"{name}, {precision}"] = timed(policy, obs, noise, plan)
                 times.setdefault(f"{name}, {precision}: before the loop, loop", []).append(seconds)
-        seconds, _ = timed(reusing, obs, noise, plans[few])
+        seconds, _ = timed(reusing, obs, noise, reused)
         times.setdefault(f"{few}, int8, tokens reused: before the loop, loop", []).append(seconds)
         exact = found["dense, fp32"]
         for name in ("vla.cpp", "dense, int8"):

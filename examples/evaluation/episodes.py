@@ -25,9 +25,9 @@ PLAIN, WINDOWS = "plain", "windows/"
 class Episodes:
     """Episodes of one variant in one environment, a file each.
 
-    The key is the environment and what the variant computes: for the plans that a conversion makes weights, samplers and
-    normalisers, which calibration does not touch; for any other plan, and where tokens are reused, the artifact's whole
-    identity; and the runtime, whose sums are ordered differently.
+    The key is the environment and what the variant computes: for the plans that a conversion makes weights, samplers
+    and normalisers, which calibration does not touch; for any other plan, and where tokens are reused, the artifact's
+    whole identity; and the runtime, whose sums are ordered differently.
 
     Args:
         root: folder of all variants.

@@ -28,19 +28,20 @@ from rich.table import Table
 
 import ttscompile
 from ttscompile import Source
-from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.cli.output import print_identity
+from ttscompile.core.plan import DENSE, FULL
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Timer, Times
 from ttscompile.runtimes.info import PolicyInfo
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
 from environments.pusht import FloatArray, PushT
-from variants import NoiseShape, Plan, Policy, noise_shape, results_console, run, seeded_noise
+from variants import NoiseShape, Plan, Policy, full_plan, noise_shape, results_console, run, seeded_noise
 
 CHECKPOINT = Path(__file__).with_name("pusht_dpt_ema_fp16.ckpt")
 WARM_UP = 3
-"""Calls before the first that counts; the first of them is dense, so that every cache is written."""
+"""Calls before the first that counts; the first of them computes all, so that every cache is written."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Contestant:
     Attributes:
         label: for the table.
         policy: of its own; no caches are shared.
-        plan: as in ``predict_action``; None for the default.
+        plan: as in ``predict_action``; None for the one that the policy was loaded with.
         dense_flops: FLOPs of a call without a report, which computes everything.
         noise: sizes of the random numbers of a call. Contestants with another sampler share the initial noise.
     """
@@ -150,7 +151,9 @@ def measure(
         for i in timer.round():
             contestant = contestants[i]
             noise = seeded_noise(contestant.noise, [0], call)
-            plan = "dense" if call == 0 and contestant.plan is not None else contestant.plan
+            plan = contestant.plan
+            if call == 0 and isinstance(plan, np.ndarray):
+                plan = np.zeros_like(plan)
             timer.time(i, partial(contestant.policy.predict_action, {"obs": window}, noise=noise, plan=plan))
             if timer.counted:
                 reports[i].append(getattr(contestant.policy, "last_report", None))
@@ -209,29 +212,29 @@ def speed_table(measurements: Sequence[Measurement], threads: int) -> Table:
 def contestants_for(
     artifact: Path, checkpoint: Path, threads: int, given: npt.NDArray[np.int8] | None
 ) -> tuple[list[Contestant], PolicyInfo]:
-    """Eager, dense, a given plan if there is one, and the artifact's own plan; each with a policy of its own.
+    """Eager, all computed, a given plan if there is one, and the artifact's own; each with a policy of its own.
 
     Args:
         artifact: what ``ttscompile.convert`` made of the checkpoint, with the checkpoint's own sampler or another.
         checkpoint: for the eager policy, which keeps the checkpoint's own sampler.
         threads: of each.
-        given: int8 ``[K, blocks]``, legal for warm calls.
+        given: int8 ``[K, blocks]`` of the loop that was converted to, legal for warm calls.
 
     Returns:
-        The contestants, and what the artifact says about itself.
+        The contestants, and what the artifact says about itself and the plan that computes all.
     """
-    info = ttscompile.load(artifact, threads=threads).info
-    plans: list[tuple[str, Plan | None]] = [("dense onnxruntime", "dense")]
+    full, default = full_plan(artifact), read_manifest(artifact).default_plan
+    plans: list[tuple[str, str, Plan | None]] = [("dense onnxruntime", full, None)]
     if given is not None:
-        plans.append((f"given plan, {np.mean(given != Source.COMPUTE):.0%} reused", given))
-    if info.default_plan != "dense":
-        plans.append(("compiled", None))
-    original, noise = EagerPolicy(checkpoint, threads), noise_shape(info)
-    flops = info.dense_flops * original.noise.steps / info.K  # an evaluation costs the same, whatever the sampler
-    eager = Contestant("eager PyTorch", original, None, flops, original.noise)
+        plans.append((f"given plan, {np.mean(given != Source.COMPUTE):.0%} reused", full, given))
+    if default not in (DENSE, FULL):
+        plans.append(("compiled", default, None))
+    policies = [ttscompile.load(artifact, threads=threads, plan=name) for _, name, _ in plans]
+    original, info = EagerPolicy(checkpoint, threads), policies[0].info
+    eager = Contestant("eager PyTorch", original, None, info.dense_flops, original.noise)
     others = [
-        Contestant(label, ttscompile.load(artifact, threads=threads), plan, info.dense_flops, noise)
-        for label, plan in plans
+        Contestant(label, policy, plan, info.dense_flops, noise_shape(policy.info))
+        for (label, _, plan), policy in zip(plans, policies, strict=True)
     ]
     return [eager, *others], info
 
@@ -281,7 +284,7 @@ def main(
     as_json: bool,
 ) -> None:
     """Time the policy of ARTIFACT; without --plan the given plan is a random one of 5 % computed cells."""
-    info = ttscompile.load(artifact, threads=threads).info
+    info = ttscompile.load(artifact, threads=threads, plan=full_plan(artifact)).info
     if plan_file is None:
         given = random_plan(info.K, len(info.blocks), computed, seed)
     else:

@@ -115,6 +115,10 @@ class DelayedPolicy:
         self._variant.policy.reset()
         self._seed, self.windows = seed or 0, []
 
+    def follow(self, executed: int) -> None:
+        """See ``CompiledPolicy.follow``."""
+        getattr(self._variant.policy, "follow", lambda _: None)(executed)
+
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str, prefix: Any = None) -> Mapping[str, Any]:
         """One call, with the next noise."""
         noise = seeded_noise(self._variant.noise, [self._seed], len(self.windows))

@@ -32,8 +32,8 @@ from rich.table import Table
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.contestants import original_policy
 from ttscompile.cli.output import identity_of, print_identity
-from ttscompile.cli.timing import original_policy
 from ttscompile.frontends.eager import evaluation
 from ttscompile.runtimes.inpainting import noise_levels
 

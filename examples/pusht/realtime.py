@@ -68,6 +68,10 @@ class NumberedNoise:
         self._policy.reset()
         self._seed, self._call = seed or 0, 0
 
+    def follow(self, executed: int) -> None:
+        """See ``CompiledPolicy.follow``."""
+        getattr(self._policy, "follow", lambda _: None)(executed)
+
     def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
         """One call, with the next noise."""
         noise = seeded_noise(self._shape, [self._seed], self._call)

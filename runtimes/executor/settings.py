@@ -202,7 +202,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
             f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
             f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
         )
-    if unknown := [name for name in tiers if name not in info.plans]:
+    if unknown := [name for name in tiers if name.partition("@")[0] not in info.plans]:
         known = list(info.plans)
         raise ExecutorError(f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers among these.")
     return Resolved(

@@ -94,7 +94,7 @@ class Worker:
         if not opened:
             self.end()
             what = f"the policy was not measured within {timeout:g} s: a call of it hangs, or is very slow."
-            raise ExecutorError(f"{what} Look at 'ttscompile realtime DIR'.")
+            raise ExecutorError(f"{what} Look at 'ttscompile bench DIR --control-hz HZ'.")
         if self.failure is not None:
             self._thread.join()
             raise self.failure

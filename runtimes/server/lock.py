@@ -68,7 +68,7 @@ class Lock:
             return
         raise ExecutorError(
             f"{address} may be reached from other machines, and the server has {lacks}: whoever reaches it could drive"
-            " the robot. Give a token and a certificate (--token-file, --tls-certificate), listen on 127.0.0.1, or say"
+            " the robot. Give a token and a certificate (--token-file, --tls), listen on 127.0.0.1, or say"
             " --insecure."
         )
 

@@ -137,6 +137,7 @@ def test_every_truncation_is_found(written: Path) -> None:
             load_artifact(path)
 
 
+@pytest.mark.slow
 def test_flipped_bits_are_found_or_harmless(written: Path) -> None:
     """Attributes and dates of the entries may change, contents may not."""
     path = packed(written)

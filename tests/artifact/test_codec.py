@@ -30,6 +30,7 @@ def through_json(spec: PolicySpec) -> PolicySpec:
     return from_json(PolicySpec, parse(dump(to_json(spec)), "spec"))
 
 
+@pytest.mark.slow
 @given(st.lists(finite.filter(bool), min_size=1, max_size=8), st.data())
 def test_float32_comes_back_bit_by_bit(scale: list[float], data: st.DataObject) -> None:
     n = len(scale)
@@ -94,6 +95,7 @@ def test_a_manifest_with_plans_comes_back(manifest: Manifest) -> None:
     assert again.calibration == changed.calibration
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_of_a_value_is_found(written: Path) -> None:
     """White space may change; whatever is read may not."""
     content = (written / "manifest.json").read_bytes()

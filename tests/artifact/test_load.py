@@ -66,6 +66,7 @@ def test_a_missing_file(calibrated: Path, role: str) -> None:
         load_artifact(calibrated)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", FILES)
 @pytest.mark.parametrize("size", [0, 1, 0.5, -1])
 def test_a_truncated_file(calibrated: Path, role: str, size: float) -> None:
@@ -84,6 +85,7 @@ def test_a_longer_file(calibrated: Path, role: str) -> None:
         load_artifact(calibrated)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", FILES)
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))

@@ -20,6 +20,7 @@ arrays = st.dictionaries(
 )
 
 
+@pytest.mark.slow
 @given(arrays)
 def test_what_is_written_is_read_by_us_and_by_the_library(values: dict[str, np.ndarray]) -> None:
     import tempfile

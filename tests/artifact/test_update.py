@@ -266,6 +266,7 @@ def test_failure_anywhere_leaves_the_old_or_the_new(
     assert set(contents(written)) == {"manifest.json", *manifest.files}
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_anywhere_leaves_the_old_or_the_new(written: Path) -> None:
     """Children die without a word at the n-th sync, rename or removal; the next update cleans up after them."""
     script = textwrap.dedent(

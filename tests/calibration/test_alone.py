@@ -28,6 +28,7 @@ def calibrate(artifact: Path, recording: Path) -> CalibrationResult:
     return ttscompile.calibrate(artifact, [recording], 0.8, max_intervals=4, progress=False)
 
 
+@pytest.mark.slow
 def test_a_calibration_refuses_all_others_from_its_beginning(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

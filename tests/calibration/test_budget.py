@@ -92,6 +92,7 @@ def test_more_flops_than_can_be_saved_are_refused(artifact: Path, recording: Pat
         quick(artifact, recording, target_flops=target)
 
 
+@pytest.mark.slow
 def test_a_target_of_flops_is_kept_and_recorded(artifact: Path, recording: Path) -> None:
     result = quick(artifact, recording, target_flops=0.5)
     assert result.plans[result.default_plan].flops_saved >= 0.5
@@ -157,6 +158,7 @@ def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recordi
         quick(artifact, recording, latency_ms=0.0001, threads=2)
 
 
+@pytest.mark.slow
 def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _timed(monkeypatch, 1.0)
     with killed(saves=2):  # of the latency, and of some targets
@@ -210,6 +212,7 @@ def test_an_error_out_of_reach_and_one_out_of_time_are_failures(tmp_path: Path) 
             budget_of_error(late, Goal("max_action_error", 0.1), 100, BLOCKS)
 
 
+@pytest.mark.slow
 def test_an_error_is_kept_on_held_out_episodes(artifact: Path, recording: Path) -> None:
     loose = quick(artifact, recording, max_action_error=0.05)
     assert loose.validation_error <= 0.05

@@ -48,6 +48,7 @@ def contents(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
+@pytest.mark.slow
 def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: tuple[Path, CalibrationResult]) -> None:
     directory, result = calibrated
     artifact = load_artifact(directory)
@@ -107,6 +108,7 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
     assert not (directory / FILE).exists()
 
 
+@pytest.mark.slow
 def test_another_seed_gives_another_split(
     calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
 ) -> None:
@@ -114,6 +116,7 @@ def test_another_seed_gives_another_split(
     assert other.episodes != calibrated[1].episodes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("saves", [1, 5, 7])  # during targets, search and adaptation
 def test_resuming_after_a_kill_ends_where_it_would_have_ended(
     calibrated: tuple[Path, CalibrationResult],
@@ -145,6 +148,7 @@ def _count_targets(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     return lambda: count
 
 
+@pytest.mark.slow
 def test_without_resume_it_begins_anew_and_the_same_seed_gives_the_same_bytes(
     calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
 ) -> None:
@@ -251,6 +255,7 @@ def test_recordings_that_are_too_short_are_told_of(
     assert "2 of 4 episodes have fewer than 3 calls, and are left out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_constant_observations_are_fine(artifact: Path, tmp_path: Path) -> None:
     path = tmp_path / "constant.npz"
     obs = np.repeat(np.arange(4, dtype=np.float32), 6)[:, None, None] * np.ones((2, 3), np.float32)
@@ -285,6 +290,7 @@ def test_a_strategy_that_fits_corrections_is_not_asked_to(compiled: Path, record
     assert contents(directory) == before
 
 
+@pytest.mark.slow
 def test_a_rival_is_corrected_on_request(compiled: Path, recording: Path, tmp_path: Path) -> None:
     """The schedule stays what it is; its errors fall, and the artifact keeps the correction."""
     results, schedules = [], []

@@ -30,7 +30,6 @@ from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import DRAWS
 from ttscompile.cli import main
-from ttscompile.cli.compare import default_sparsities
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import CalibrationError, OutputError
@@ -70,6 +69,7 @@ def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
+@pytest.mark.slow
 def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
     assert list(found) == [
@@ -99,6 +99,7 @@ def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     assert frontier.calls == 8
 
 
+@pytest.mark.slow
 def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
     found = points(compare(planned, [recording], ["interval"], [0.5], calls=8, learned=400, correct=True))
     plain, corrected = found["interval", "0.5"], found["interval, corrected", "0.5"]
@@ -150,6 +151,7 @@ def interrupted_after(searches: int, monkeypatch: pytest.MonkeyPatch) -> list[st
     return begun
 
 
+@pytest.mark.slow
 def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     planned: Path, frontier: Comparison, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,6 +260,7 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
 
 
+@pytest.mark.slow
 def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     """With a threshold that nothing passes the newest of two frames is taken for the one before."""
 
@@ -337,64 +340,56 @@ def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp
         plot_frontier(*arguments, tmp_path / "none" / "f.png", "title")
 
 
-def test_the_command_prints_the_same_as_a_table_and_as_json(
+def test_bench_prints_the_same_as_a_table_and_as_json(
     planned: Path, other_sampler: Path, recording: Path, tmp_path: Path
 ) -> None:
-    arguments = [
-        str(planned),
-        "--trajectories",
-        str(recording),
-        "--with",
-        str(other_sampler),
-        "--strategies",
-        "interval",
-    ]
-    arguments += ["--sparsities", "0.5,0.8", "--calls", "2"]
+    arguments = [str(planned), "--trajectories", str(recording), "--with", str(other_sampler), "--calls", "2"]
     runner = CliRunner()
-    told = runner.invoke(main, ["compare", *arguments, "--json", "--plot", str(tmp_path / "f.svg")])
+    told = runner.invoke(main, ["bench", *arguments, "--json", "--plot", str(tmp_path / "f.svg")])
     assert told.exit_code == 0, told.stderr
     record = json.loads(told.stdout)
-    assert [point["series"] for point in record["points"]] == ["this artifact"] * 2 + ["interval"] * 2 + ["five"]
+    labels = [one["label"] for one in record["contestants"]]
+    assert labels == ["this artifact: dense", "this artifact: half", "five: dense"]
+    points = record["comparison"]["points"]
+    assert [f"{point['series']}: {point['name']}" for point in points] == labels
+    assert points[1]["error"] > 1e-3 and points[0]["error"] < 1e-6  # of two runtimes
+    assert points[2]["error"] is None  # another sampler takes other noise
+    assert points[1]["distance"] > 1e-3 > points[0]["distance"]
     identity, other = (load_artifact(path).manifest.identity for path in (planned, other_sampler))
     assert record["identity"] == identity
     assert record["with"] == [{"path": str(other_sampler), "identity": other}]
     assert "held-out calls" in (tmp_path / "f.svg").read_text()
     assert "warning: this artifact" in told.stderr
-    assert told.stderr.count("search: interval 0.8\n") == 1  # a log has a line for each part of the work, and no bar
-    lost = runner.invoke(main, ["compare", *arguments, "--json", "--plot", str(tmp_path / "none" / "f.png")])
+    assert told.stderr.count("held-out calls\n") == 1  # a log has a line for each part of the work, and no bar
+    lost = runner.invoke(main, ["bench", *arguments, "--json", "--plot", str(tmp_path / "none" / "f.png")])
     assert lost.exit_code == 2
     assert lost.stdout == ""
-    assert "search" not in lost.stderr, "refused before anything is computed"
+    assert "held-out" not in lost.stderr, "refused before anything is computed"
     assert "folder" in lost.stderr
-    shown = runner.invoke(main, ["compare", *arguments])
+    shown = runner.invoke(main, ["bench", *arguments])
     assert shown.exit_code == 0, shown.stderr
-    assert "another sampler takes other noise, and has none" in shown.stdout.replace("\n", " ")
-    assert "0 is the same" in shown.stdout.replace("\n", " ")
+    words = " ".join(shown.stdout.split())
+    assert "another sampler takes other noise, and has none" in words
+    assert "in which two calls of the original are" in words
+    assert f"five: identity {other[:12]}" in shown.stdout
 
 
-def test_without_sparsities_those_are_taken_that_the_steps_allow(planned: Path, recording: Path) -> None:
-    assert default_sparsities(100) == (0.9, 0.95, 0.98)
-    assert default_sparsities(16) == (11 / 16, 13 / 16, 14 / 16)
-    assert (default_sparsities(3), default_sparsities(2), default_sparsities(1)) == ((1 - 2 / 3,), (0.5,), ())
-    arguments = ["compare", str(planned), "--trajectories", str(recording), "--calls", "2", "--json"]
-    told = CliRunner().invoke(main, [*arguments, "--strategies", "interval"])  # of ten steps: 95 % is none
-    assert told.exit_code == 0, told.stderr
-    made = [point["name"] for point in json.loads(told.stdout)["points"] if point["series"] == "interval"]
-    assert made == ["0.5", "0.7", "0.8"]
-    alone = CliRunner().invoke(main, [*arguments, "--strategies", ""])
-    assert alone.exit_code == 0, alone.stderr
-    assert {point["series"] for point in json.loads(alone.stdout)["points"]} == {"this artifact"}
+def test_bench_judges_the_plans_that_are_named(planned: Path, other_sampler: Path, recording: Path) -> None:
+    twins = shutil.copytree(planned, planned.parent / "three")
+    store_schedules(twins, None, {name: uniform_plan(10, 6, 5) for name in ("half", "same")}, "half", {})
+    words = ["bench", str(twins), "-t", str(recording), "--with", str(planned), "--calls", "2", "--json"]
 
+    def judged(*more: str) -> list[tuple[str, str]]:
+        told = CliRunner().invoke(main, [*words, *more])
+        assert told.exit_code == 0, told.stderr
+        return [(point["series"], point["name"]) for point in json.loads(told.stdout)["comparison"]["points"]]
 
-@pytest.mark.parametrize(
-    ("option", "value", "message"),
-    [
-        ("--strategies", "magic", "'magic' is not one of tts"),
-        ("--sparsities", "0.9,x", "could not convert"),
-        ("--sparsities", "1", "1 is not above 0 and below 1"),
-    ],
-)
-def test_bad_lists_are_refused(planned: Path, option: str, value: str, message: str) -> None:
-    result = CliRunner().invoke(main, ["compare", str(planned), "--trajectories", "a.npz", option, value])
-    assert result.exit_code == 2
-    assert message in result.stderr
+    both = [("compiled", "dense"), ("compiled", "half")]
+    this = [("this artifact", name) for name in ("dense", "half", "same")]
+    assert judged() == this + both
+    assert judged("--plan", "half") == this[:2] + both
+    assert judged("--plan", "same") == [this[0], this[2], both[0]]
+    refused = CliRunner().invoke(main, [*words, "--plan", "quick"])
+    assert refused.exit_code == 2 and "'quick'" in refused.stderr
+    again = CliRunner().invoke(main, [*words, "--with", str(twins), str(twins)])
+    assert again.exit_code == 2 and "two artifacts are called 'three'" in again.stderr

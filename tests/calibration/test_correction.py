@@ -40,6 +40,7 @@ def fitted(task: Task, plan: PlanArray, reads: bool = True) -> Task:
     return replace(task, executor=task.executor.corrected(fit_correction(task.executor, plan, task.calls, reads)))
 
 
+@pytest.mark.slow
 def test_it_helps_on_calls_of_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
     task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
     corrected = fitted(task, plan)
@@ -47,6 +48,7 @@ def test_it_helps_on_calls_of_other_episodes(make_task: MakeTask, plan: PlanArra
     assert corrected.error(plan, held_out) < 0.5 * task.error(plan, held_out)
 
 
+@pytest.mark.slow
 def test_a_linear_policy_is_corrected_to_its_own_noise(
     linear_policy: Path, recording: Path, plan: PlanArray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -65,6 +67,7 @@ def test_a_dense_plan_needs_none(make_task: MakeTask) -> None:
     assert corrected.error(dense, task.calls) < 1e-5
 
 
+@pytest.mark.slow
 def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=70)
     executor, calls = fitted(task, plan).executor, task.calls
@@ -76,6 +79,7 @@ def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArra
     assert_equal_but_for_rounding(ours, theirs.sample, counted.terms)
 
 
+@pytest.mark.slow
 def test_the_same_calls_give_the_same_bytes(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=150)
     one, two = (fit_correction(task.executor, plan, task.calls, True) for _ in range(2))
@@ -84,6 +88,7 @@ def test_the_same_calls_give_the_same_bytes(make_task: MakeTask, plan: PlanArray
     assert one.observed.tobytes() == two.observed.tobytes()
 
 
+@pytest.mark.slow
 def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=400, episodes=range(4))
     held_out = make_task(calls=60, episodes=range(4, 6)).calls
@@ -98,6 +103,7 @@ def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: 
     assert (correction.reads > 0) == task.whole.reads(2)
 
 
+@pytest.mark.slow
 def test_any_schedule_can_be_corrected(make_task: MakeTask, plan: PlanArray) -> None:
     """Also one that computes single blocks, of a strategy that fits no correction itself."""
     task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
@@ -111,6 +117,7 @@ def test_any_schedule_can_be_corrected(make_task: MakeTask, plan: PlanArray) -> 
         assert better.error(schedule, held_out) < 0.5 * task.error(schedule, held_out)
 
 
+@pytest.mark.slow
 def test_a_loop_that_ends_in_no_numbers_gets_no_correction(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=40)
     assert task.calls.path is not None

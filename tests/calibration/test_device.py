@@ -62,6 +62,7 @@ def arriving(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     return shapes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["tts", "bac", "sag", "teacache"])
 def test_the_network_stays_on_its_device(
     artifact: Path, recording: Path, arriving: list[tuple[int, ...]], strategy: str
@@ -82,6 +83,7 @@ def test_a_device_that_torch_does_not_have_is_refused_before_anything_is_read(tm
         ttscompile.calibrate(tmp_path / "nowhere", [tmp_path / "nothing.npz"], device="abacus", progress=False)
 
 
+@pytest.mark.slow
 def test_nothing_is_computed_in_fewer_bits_than_the_policy_has(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

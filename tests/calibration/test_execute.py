@@ -20,6 +20,7 @@ def random_plans(count: int, computed: float) -> np.ndarray:
     return plans
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("computed", [0.05, 0.5])
 def test_plans_on_calls_equal_the_reference(make_task: MakeTask, computed: float) -> None:
     task = make_task(calls=3)
@@ -52,6 +53,7 @@ def test_observations_may_go_through_the_prologue_a_few_at_a_time(
             np.testing.assert_allclose(value, theirs[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streams", [1, 2, 256])
 def test_a_plan_for_each_call_equals_the_reference(
     make_task: MakeTask, streams: int, monkeypatch: pytest.MonkeyPatch

@@ -15,6 +15,7 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.calls import load_episodes
+from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score, _Answers, further, judge, pairs, rooted, timed
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
@@ -195,7 +196,7 @@ def test_a_plan_that_begins_with_the_chunk_before_is_judged_in_both_ways(
     scores = {}
     for last in (1, 9):
         proposal = warm(trials, last)
-        held = trials.holding(proposal)
+        held = holding(trials, proposal)
         assert not held.fresh  # onnxruntime can do it
         answers = list(_Answers(held, proposal.plan, held.held_out).all())
         assert len(answers) == 2
@@ -220,8 +221,8 @@ def test_of_single_calls_nothing_begins_with_the_chunk_before(flowing: Path, tmp
     np.savez(path, obs=np.arange(18, dtype=np.float32).reshape(3, 2, 3), episode_ends=[1, 2, 3])
     trials = trials_of(flowing, path, tmp_path)
     proposal = warm(trials, 3)
-    with pytest.raises(CalibrationError, match="on calls that have one before them"):
-        judge(trials.holding(proposal), proposal.plan)
+    with pytest.raises(CalibrationError, match="is judged on episodes of two calls at least"):
+        judge(holding(trials, proposal), proposal.plan)
     assert judge(trials, trials.base).distance == pytest.approx(0.0, abs=1e-3)
 
 

@@ -26,6 +26,7 @@ def drawn(calls: int, noise: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
     return 5 * known + 3, 0.01 * missing + noise * torch.randn(calls, 2, generator=draw)
 
 
+@pytest.mark.slow
 def test_it_finds_what_is_not_linear() -> None:
     known, missing = drawn(4000)
     found = fit_jump(known, missing, np.arange(4000) % 40, 0)

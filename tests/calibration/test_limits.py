@@ -76,6 +76,7 @@ def test_the_search_ends_in_time_for_what_its_plan_still_takes() -> None:
     assert clock.now == 95.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "limit"), [*((name, 0) for name in NAMES), ("teacache", 1920), ("delta-dit", 960)])
 def test_a_limit_holds_within_an_interval(
     make_task: MakeTask, name: str, limit: float, monkeypatch: pytest.MonkeyPatch

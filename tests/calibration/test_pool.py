@@ -88,6 +88,7 @@ def alone(once: Once, recording: Path, tmp_path_factory: pytest.TempPathFactory)
     return folder
 
 
+@pytest.mark.slow
 def test_parts_that_are_given_at_once_give_the_same_bytes(
     artifact: Path, recording: Path, alone: Path, cluster: Callable[[Elsewhere], None]
 ) -> None:
@@ -100,6 +101,7 @@ def test_parts_that_are_given_at_once_give_the_same_bytes(
     assert identity(artifact) == identity(alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lasts", [0, 17])
 def test_a_cluster_that_goes_leaves_a_state_from_which_this_process_goes_on(
     lasts: int, artifact: Path, recording: Path, alone: Path, cluster: Callable[[Elsewhere], None]
@@ -114,6 +116,7 @@ def test_a_cluster_that_goes_leaves_a_state_from_which_this_process_goes_on(
     assert content(artifact) == content(alone)
 
 
+@pytest.mark.slow
 def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

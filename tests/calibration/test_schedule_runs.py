@@ -64,6 +64,7 @@ def without_jumps(task: Task, plan: PlanArray, reads: bool) -> Correction | None
     return loop.correction(loop.end(plan))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reads", [True, False, None])
 def test_calls_beside_end_where_the_fitted_correction_leads_them(task: Task, reads: bool | None) -> None:
     judged, made = task.executor.select(task.calls, range(30, 40)), runs_of(task, reads)

@@ -42,6 +42,7 @@ def run(search: Search, first: int = 0) -> Found:
     return search.found()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "budget"),
     [*((name, BUDGET) for name in NAMES), ("bac", 59), ("delta-dit", 59), ("deepcache", 59), ("sag", 7)],
@@ -57,6 +58,7 @@ def test_a_plan_is_legal_and_within_the_budget(make_task: MakeTask, name: str, b
     assert budget - model.blocks < computed <= budget  # and hardly less: no strategy leaves a whole step unused
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"interval"}))
 def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, name: str) -> None:
     whole = run(open_search(name, make_task(BUDGET, calls=8)))
@@ -75,6 +77,7 @@ def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, 
     assert found.notes == whole.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["evo", "dip-go", "tts"])
 def test_a_search_beats_even_steps(make_task: MakeTask, name: str) -> None:
     task = make_task(20, calls=24)
@@ -86,6 +89,7 @@ LEAST = {"deepcache": 24, "delta-dit": 15, "l2c": 30, "teacache": 12, "dbcache":
 """Cells of 10 x 6 that a strategy cannot do without; step 0 for the others."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "least"), [(name, LEAST.get(name, 6)) for name in NAMES])
 def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(make_task: MakeTask, name: str, least: int) -> None:
     sparsity = f"{1 - least / 60:.4g}"
@@ -97,6 +101,7 @@ def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(make_task: Ma
     assert int((found.schedule == Source.COMPUTE).sum()) == least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
     found, _ = plan_of(name, make_task(BUDGET, calls=1))

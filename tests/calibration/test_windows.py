@@ -43,6 +43,7 @@ def one_by_one(executor: Executor, calls: Calls, plans: np.ndarray) -> torch.Ten
     return torch.cat(samples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("computed", "streams"), [(0.1, 256), (0.5, 256), (0.5, 5)])
 def test_windows_equal_the_reference_call_by_call(
     make_task: MakeTask, computed: float, streams: int, monkeypatch: pytest.MonkeyPatch
@@ -118,6 +119,7 @@ def test_windows_are_consecutive_and_of_one_episode() -> None:
     assert len(sample_windows(episodes, (2,), 100, 4, seed=0, repeats=3)) == 12
 
 
+@pytest.mark.slow
 def test_a_correction_of_plans_that_differ_and_read_earlier_calls(make_task: MakeTask) -> None:
     """It is fitted along the plans: with it the samples are nearer to the dense ones; and the reference applies it."""
     task = make_task(calls=2)

@@ -9,13 +9,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from tests.plans import store_schedules
 from ttscompile.cli import main
-from ttscompile.cli.bench import fewest_threads
+from ttscompile.cli.bench_report import fewest_threads
 from ttscompile.core.lattice import uniform_plan
 
 
@@ -61,12 +62,29 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
     assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]
 
 
+@pytest.mark.slow
+def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None:
+    for name, command in main.commands.items():
+        options = [one for one in command.params if isinstance(one, click.Option)]
+        known = {one.name for one in options}
+        for section in getattr(command, "sections", ()):
+            assert {*section.options, *section.needs} <= known, f"{name}: {section.title}"
+        told = CliRunner().invoke(main, [name, "--help"]).stdout
+        lines = [line.split() for line in told.splitlines() if line.startswith("  -")]
+        for option in options:
+            word = max(option.opts, key=len)
+            assert sum(word in (one.rstrip(",") for one in line[:2]) for line in lines) == 1, f"{name} {word}"
+            first = (option.help or "").partition(" ")[0]
+            assert first[:1].isupper() and first not in ("Of", "In", "To", "Its"), f"{name} {word}: {option.help}"
+
+
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
     result = run("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
     made = json.loads(result.stdout)
-    assert made["sampler"]["name"] == "ddim"
-    assert made["sampler"]["steps"] == 4
+    assert (made["sampler"]["name"], made["sampler"]["steps"]) == ("ddpm", 100)
+    assert made["loops"]["ddim-4"] == {"sampler": "ddim", "steps": 4}
+    assert made["plans"][made["default_plan"]]["loop"] == "ddim-4"
     assert len(made["blocks"]) == 3
     stages = [stage["stage"] for stage in made["stages"]]
     assert stages[0] == "capture"
@@ -76,6 +94,7 @@ def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_chec
     assert json.loads(run("inspect", tmp_path / "compiled", "--json").stdout) == made
 
 
+@pytest.mark.slow
 def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
     made = json.loads(run("inspect", scheduled, "--json").stdout)
     flops, plans = made["flops"], made["plans"]
@@ -99,6 +118,7 @@ def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> None:
     picture = tmp_path / "plan.png"
     result = CliRunner().invoke(main, ["inspect", str(pruned), "--plot", str(picture)])
@@ -133,25 +153,33 @@ def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path
     assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr
 
 
+@pytest.mark.slow
 def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_checkpoint: Path) -> None:
-    arguments = ("--runs", 2, "--against", "eager,onnxruntime-dense", "--checkpoint", one_layer_checkpoint, "--json")
+    arguments = ("--calls", 2, "--checkpoint", one_layer_checkpoint, "--json")
     made = json.loads(run("bench", scheduled, *arguments).stdout)
     assert made["machine"]["cores"] >= 1
-    compiled, eager, dense = made["contestants"]
-    assert [len(c["times_ms"]) for c in (compiled, eager, dense)] == [2, 2, 2]
+    original, dense, compiled = made["contestants"]
+    assert [c["label"] for c in made["contestants"]] == ["original, ddpm 100", "dense", "uniform (baseline)"]
+    assert [len(c["times_ms"]) for c in (original, dense, compiled)] == [2, 2, 2]
     assert compiled["plan"] == "uniform"
     assert compiled["sparsity"] == pytest.approx(0.95)
     assert dense["sparsity"] == 0
-    assert compiled["flops"] < dense["flops"] < eager["flops"]
+    assert compiled["flops"] < dense["flops"] < original["flops"]
 
 
+@pytest.mark.slow
 def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_worth_it(scheduled: Path) -> None:
-    arguments = ("--runs", 2, "--threads", "2,1,2", "--against", "onnxruntime-dense")
+    arguments = ("--calls", 2, "--threads", "2,1,2")
     made = json.loads(run("bench", scheduled, *arguments, "--json").stdout)
-    assert [one["label"] for one in made["contestants"]] == ["compiled", "compiled, threads: 1", "dense onnxruntime"]
-    assert made["threads"] == 2 and made["best_threads"] in (1, 2)
+    assert [one["label"] for one in made["contestants"]] == [
+        "dense, 2 threads",
+        "uniform (baseline), 2 threads",
+        "dense, 1 thread",
+        "uniform (baseline), 1 thread",
+    ]
+    assert made["threads"] == [2, 1] and made["best_threads"] in (1, 2)
     assert "Load it with threads=" in run("bench", scheduled, *arguments).stdout
-    assert "Load it with threads=" not in run("bench", scheduled, "--runs", 1).stdout
+    assert "Load it with threads=" not in run("bench", scheduled, "--calls", 1).stdout
     assert fewest_threads({4: 9.0, 2: 9.9, 1: 12.0}) == 2
     assert fewest_threads({4: 8.0, 2: 9.9, 1: 12.0}) == 4
 
@@ -171,7 +199,8 @@ def test_threads_that_bench_cannot_time(arguments: tuple[str, ...], told: str, s
     assert told in result.stderr
 
 
+@pytest.mark.slow
 def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:
-    result = run("bench", compiled_layer, "--runs", 1)
-    assert "dense onnxruntime" in result.stdout
+    result = run("bench", compiled_layer, "--calls", 1)
+    assert "dense (default)" in result.stdout
     assert "is not calibrated" in result.stderr

@@ -190,7 +190,7 @@ def test_int8_without_integer_dot_products_is_a_warning(calibrated: Path, monkey
     monkeypatch.setattr(Manifest, "precision_name", "int8")
     finding = found("precision", doctor.artifact_findings(calibrated))
     assert finding.level is Level.WARNING
-    assert "precision='fp32'" in finding.remedy
+    assert "'NAME@fp32'" in finding.remedy
 
 
 def test_too_little_memory_is_a_problem(calibrated: Path, monkeypatch: pytest.MonkeyPatch) -> None:

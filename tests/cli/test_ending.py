@@ -88,7 +88,7 @@ def test_an_interruption_of_the_imports_is_one_too(monkeypatch: pytest.MonkeyPat
         start()
 
 
-@pytest.mark.parametrize("command", ["calibrate", "compare"])
+@pytest.mark.parametrize("command", ["calibrate"])
 @pytest.mark.parametrize("before", [[], ["--traceback"]])
 def test_what_can_go_on_says_so(command: str, before: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(_: Path) -> None:
@@ -129,6 +129,7 @@ def run(*words: object, **settings: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*COMMAND, *map(str, words)], text=True, stderr=subprocess.PIPE, **settings)  # type: ignore[call-overload, no-any-return]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["--help"], ["inspect", "A"], ["inspect", "A", "--json"], ["doctor", "--json"]])
 def test_nobody_reads_the_results(words: list[str], toy_compiled: Path) -> None:
     reader, writer = os.pipe()
@@ -140,6 +141,7 @@ def test_nobody_reads_the_results(words: list[str], toy_compiled: Path) -> None:
     assert (result.returncode, result.stderr) == (Status.UNREAD, "")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 @pytest.mark.parametrize("words", [["--version"], ["inspect", "A"]])
 def test_there_is_no_space_for_the_results(words: list[str], toy_compiled: Path) -> None:
@@ -150,6 +152,7 @@ def test_there_is_no_space_for_the_results(words: list[str], toy_compiled: Path)
     assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.compiles
 def test_files_do_not_take_the_place_of_closed_streams(toy_compiled: Path, tmp_path: Path) -> None:
     """A library that prints would print into them."""
@@ -164,6 +167,7 @@ def test_files_do_not_take_the_place_of_closed_streams(toy_compiled: Path, tmp_p
     assert int((tmp_path / "opened").read_text()) > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_server_with_its_statistics(sent: int, toy_compiled: Path) -> None:
     words = [*COMMAND, "serve", str(toy_compiled), "--control-hz", "1", "--port", "0", "--margin-ticks", "0"]
@@ -176,6 +180,7 @@ def test_a_signal_ends_the_server_with_its_statistics(sent: int, toy_compiled: P
     assert "statistics" in json.loads(printed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sent", "status", "told"), [(signal.SIGINT, 130, "interrupted\n"), (signal.SIGTERM, 143, "ended by SIGTERM\n")]
 )
@@ -186,7 +191,7 @@ def test_a_signal_ends_a_command_and_leaves_nothing(
     archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", toy_compiled)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
-    words = [*COMMAND, "bench", archive, "--runs", "10000"]
+    words = [*COMMAND, "bench", archive, "--calls", "10000"]
     settings = {"env": {**os.environ, "TMPDIR": str(temporary)}, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **settings) as bench:  # type: ignore[call-overload]
         end = time.monotonic() + 60

@@ -37,13 +37,13 @@ def test_a_file_that_is_no_checkpoint(no_checkpoint: Path) -> None:
     assert list(no_checkpoint.parent.iterdir()) == [no_checkpoint]
 
 
-@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate", "compare"])
+@pytest.mark.parametrize("command", ["inspect", "bench", "calibrate"])
 @pytest.mark.parametrize("made", [False, True])
 def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
     directory = tmp_path / "nothing"
     if made:
         directory.mkdir()
-    recorded = command in ("calibrate", "compare")
+    recorded = command == "calibrate"
     arguments = [command, str(directory)] + ["--trajectories", "calls.npz"] * recorded
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
@@ -62,8 +62,10 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["calibrate", "out"], "Missing option '-t' / '--trajectories'"),
         (["calibrate", "out", "--trajectories"], "Missing option '-t' / '--trajectories'"),
         (["inspect", "out", "--plan", "dense"], "--plan is for --plot: give it too"),
-        (["bench", "out", "--against", "eager"], "give --checkpoint FILE too"),
-        (["bench", "out", "--against", "tensorrt"], "'tensorrt' is not one of original, eager, onnxruntime-dense"),
+        (["bench", "out", "--encoders", "."], "--encoders is for --checkpoint: give it too"),
+        (["bench", "out", "--plot", "f.png"], "--plot is for --trajectories: give it too"),
+        (["bench", "out", "--runtime", "tensorrt"], "'tensorrt' is not one of onnxruntime, torch"),
+        (["bench", "out", "--runtime", ""], "--runtime: nothing was given"),
         (["bench", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
         (["serve", "out"], "give --control-hz HZ to drive one robot, or --copies N to answer many"),
         (["serve", "out", "--control-hz", "10", "--wait-ms", "1"], "--wait-ms is for --copies: give it too"),
@@ -95,7 +97,7 @@ def test_a_target_that_cannot_be(toy_compiled: Path) -> None:
         ["convert", "here.ckpt", "-o", "."],
         ["calibrate", "--trajectories", "here.ckpt", "--seed", "1", "nowhere"],
         ["calibrate", "compiled", "--trajectories", "no.npz"],
-        ["compare", "compiled", "--trajectories", "no.npz"],
+        ["bench", "compiled", "-t", "no.npz"],
     ],
 )
 def test_what_is_not_there_is_said_before_the_compiler_is_imported(

@@ -35,11 +35,11 @@ def test_inspect_tells_what_is_computed_once_a_frame(seeing: Path, toy_compiled:
 
 
 def test_bench_says_how_much_of_a_call_is_frames(seeing: Path, toy_compiled: Path) -> None:
-    (measured,) = json.loads(run("bench", seeing, "--runs", 3, "--against", "", "--json"))["contestants"]
-    assert 0 < measured["frames_ms"] < measured["prologue_ms"]
+    (measured,) = json.loads(run("bench", seeing, "--calls", 3, "--json"))["contestants"]
+    assert 0 < measured["parts_ms"]["frames"] < measured["parts_ms"]["prologue"]
     told = "Every call has frames of its own"
-    assert told in run("bench", seeing, "--runs", 1, "--against", "")
-    assert told not in run("bench", toy_compiled, "--runs", 1, "--against", "")
+    assert told in run("bench", seeing, "--calls", 1)
+    assert told not in run("bench", toy_compiled, "--calls", 1)
 
 
 def test_the_page_has_a_row_and_a_column_for_them(seeing: Path, tmp_path: Path) -> None:

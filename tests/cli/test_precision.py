@@ -14,7 +14,7 @@ import ttscompile
 from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
-from ttscompile.cli.timing import Compiled, contestants
+from ttscompile.cli.contestants import Way, contestants
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.verification.precision import EIGHT_BITS
 
@@ -96,13 +96,17 @@ def test_a_part_cannot_stay_fp32_beside_fp32(tmp_path: Path) -> None:
     assert not (tmp_path / "compiled").exists()
 
 
-def test_bench_times_the_rival_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
-    result = run("bench", converted[0], "--runs", 2, "--plan", "dense", "--json")
+def test_bench_times_the_dense_plan_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
+    result = run("bench", converted[0], "--calls", 2, "--json")
     labels = [contestant["label"] for contestant in json.loads(result.stdout)["contestants"]]
-    assert labels == ["compiled, int8", "dense onnxruntime"]
-    entered = contestants(load_artifact(converted[0]), Compiled(), "dense", ["onnxruntime-dense"], None)
+    assert labels == ["dense", "full, int8"]
+    entered = contestants({"": load_artifact(converted[0])}, ["dense@int8", "full@fp32"], [Way()])
+    assert [one.label for one in entered] == ["dense", "dense@int8", "full@fp32"]
+    assert [one.spec.sampler.steps for one in entered] == [100, 100, STEPS]
     ((obs, noise),) = random_calls(entered[0].spec, 1, 0)
     answers = [one.call(obs, noise)["action"] for one in entered]  # type: ignore[index]
-    expected = ttscompile.load(converted[0], precision="fp32").predict_action(obs, noise=noise, plan="dense")["action"]
-    np.testing.assert_array_equal(answers[1], expected)
-    assert not np.array_equal(answers[0], expected)
+    policy = ttscompile.load(converted[0], plan="dense")
+    expected = [policy.predict_action(obs, noise=noise, plan=one)["action"] for one in ("dense", "full@fp32")]
+    np.testing.assert_array_equal(answers[0], expected[0])
+    assert not np.array_equal(answers[1], expected[0])
+    np.testing.assert_array_equal(answers[2], expected[1])

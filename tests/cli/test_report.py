@@ -101,7 +101,7 @@ def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory
     output = tmp_path_factory.mktemp("page") / "report.html"
     point = {"series": HOSTILE, "name": "0.9", "distance": 2.0, "latency_ms": 12.5}
     comparison = calls.with_name("comparison.json")
-    comparison.write_text(json.dumps({"points": [point]}))
+    comparison.write_text(json.dumps({"comparison": {"points": [point]}}))
     options = ("--verify", "--comparison", comparison)
     result = run(calibrated, "-o", output, "--trajectories", calls, *options)
     assert result.exit_code == 0, result.stderr
@@ -110,6 +110,7 @@ def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory
     return output.read_text()
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_and_needs_nothing_else(page: str) -> None:
     reader = Reader(page)
     assert page.startswith("<!doctype html>")
@@ -173,23 +174,25 @@ def test_a_record_is_told_without_brackets() -> None:
     assert (plain(0.123456), plain([]), plain("a_b"), plain(None)) == ("0.1235", "none", "a_b", "None")
 
 
+@pytest.mark.slow
 def test_hostile_names_stay_text(calibrated: Path) -> None:
     artifact = load_artifact(calibrated)
     manifest = artifact.manifest
     spec = replace(manifest.spec, source={HOSTILE: HOSTILE}, sampler=replace(manifest.spec.sampler, name=HOSTILE))
     blocks = tuple(replace(block, kind=HOSTILE, reason=HOSTILE) for block in manifest.blocks)
     record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE, "other": HOSTILE}, "skipped": {HOSTILE: HOSTILE}}
-    record["precision"] = {"name": HOSTILE, "parts": {HOSTILE: HOSTILE, "step": [HOSTILE], "blocks": 0.5}}
-    record["distilled"] = {"plan": HOSTILE, "matrices": [HOSTILE], "before": {"error": HOSTILE}, "after": HOSTILE}
+    record |= {"told": {HOSTILE: HOSTILE, "weights": [HOSTILE]}, "learned": [HOSTILE, HOSTILE]}
     plans = {HOSTILE: manifest.plans["schedule"]}
     manifest = replace(manifest, spec=spec, blocks=blocks, plans=plans, default_plan=HOSTILE, calibration=record)
-    artifact = replace(artifact, manifest=manifest, schedules={HOSTILE: artifact.schedules["schedule"]})
+    artifact = replace(
+        artifact, manifest=manifest, plans={HOSTILE: artifact.plans["schedule"], "dense": artifact.plans["dense"]}
+    )
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     obs = {"obs": np.zeros((2, 2), np.float32)}
     rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
     errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5)
     found = Verification(HOSTILE, None, None, (rung,), 1.0, errors)
-    given = Given(Episode(HOSTILE, obs), None, verified(found), runs=1)
+    given = Given(Episode(HOSTILE, obs), None, verified(found), calls=1)
     page = render(build(artifact, policy, given))
     reader = Reader(page)
     assert "script" not in {tag for tag, _ in reader.tags}
@@ -211,6 +214,7 @@ def test_a_check_that_failed_is_told_and_is_the_exit_status(
     assert "First at step 1, block 2." in text
 
 
+@pytest.mark.slow
 def test_arrays_of_other_names_reach_the_episode_and_the_checks(
     calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,7 +251,16 @@ def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    "content", ["nothing", "[1]", '{"points": [{"error": "x"}]}', '{"points": [{"error": NaN, "latency_ms": 1}]}', "{}"]
+    "content",
+    [
+        "nothing",
+        "[1]",
+        '{"comparison": {"points": [{"error": "x"}]}}',
+        '{"comparison": {"points": [{"error": NaN, "latency_ms": 1}]}}',
+        '{"points": [{"error": 1, "latency_ms": 1}]}',
+        '{"comparison": null}',
+        "{}",
+    ],
 )
 def test_what_is_no_comparison_is_refused_and_nothing_is_written(
     content: str, calibrated: Path, tmp_path: Path
@@ -255,7 +268,7 @@ def test_what_is_no_comparison_is_refused_and_nothing_is_written(
     (tmp_path / "c.json").write_text(content)
     result = run(calibrated, "-o", tmp_path / "r.html", "--comparison", tmp_path / "c.json")
     assert result.exit_code == 2
-    assert "compare" in result.stderr
+    assert "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed" in result.stderr
     assert not (tmp_path / "r.html").exists()
 
 

@@ -17,18 +17,35 @@ def run(*arguments: object) -> Any:
 
 
 def test_bench_times_torch_beside_the_same_plan_in_onnxruntime(toy_compiled: Path) -> None:
-    options = ("--runtime", "torch", "--device", "cpu", "--precision", "bf16", "--against", "onnxruntime")
-    result = run("bench", toy_compiled, *options, "--runs", 2, "--plan", "dense", "--json")
+    options = ("--runtime", "torch,onnxruntime", "--device", "cpu")
+    result = run("bench", toy_compiled, *options, "--calls", 2, "--plan", "dense", "--json")
     assert result.exit_code == 0, result.stderr
     told = json.loads(result.stdout)
-    assert (told["runtime"], told["device"]) == ("torch", "cpu")
-    assert 0 < told["precision_error"]["mean"] < 0.1
+    assert (told["runtime"], told["device"]) == (["torch", "onnxruntime"], "cpu")
+    assert told["precision_error"] is None
     contestants = [(each["label"], each["plan"]) for each in told["contestants"]]
-    assert contestants == [("compiled, torch on cpu, bf16", "dense"), ("onnxruntime", "dense")]
+    assert contestants == [("dense, torch on cpu", "dense"), ("dense, onnxruntime", "dense")]
 
 
-def test_realtime_measures_on_torch(toy_compiled: Path) -> None:
-    result = run("realtime", toy_compiled, "--control-hz", 10, "--runs", 1, "--plan", "dense", "--runtime", "torch")
+def test_bench_times_a_plan_in_fewer_bits_on_torch_and_says_how_far_off_they_are(toy_compiled: Path) -> None:
+    options = ("--runtime", "torch", "--device", "cpu", "--plan", "dense@bf16")
+    result = run("bench", toy_compiled, *options, "--calls", 2, "--json")
+    assert result.exit_code == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert (told["runtime"], told["device"]) == (["torch"], "cpu")
+    error = told["precision_error"]
+    assert error["precision"] == "bf16"
+    assert 0 < error["mean"] <= error["p90"] <= error["largest"] < 1
+    assert error["mean"] < 0.1
+    contestants = [(each["label"], each["plan"]) for each in told["contestants"]]
+    assert contestants == [("dense, torch on cpu", "dense"), ("dense@bf16, torch on cpu", "dense@bf16")]
+    shown = run("bench", toy_compiled, *options, "--calls", 1, "--control-hz", 10)
+    assert "dense calls in bf16 are" in " ".join(shown.stdout.split())
+    assert "dense@bf16, torch on cpu: " in " ".join(shown.stdout.split())
+
+
+def test_a_loop_is_judged_on_torch(toy_compiled: Path) -> None:
+    result = run("bench", toy_compiled, "--control-hz", 10, "--calls", 1, "--plan", "dense", "--runtime", "torch")
     assert result.exit_code in (0, 1), result.stderr  # the machine may be busy
     assert "dense" in result.stdout
 
@@ -38,10 +55,12 @@ def test_realtime_measures_on_torch(toy_compiled: Path) -> None:
     [
         (("bench", "--device", "cuda"), "runtime 'onnxruntime' computes on the CPU alone; found device 'cuda'"),
         (("bench", "--runtime", "torch", "--device", "abacus"), "device 'abacus' cannot be had"),
-        (("bench", "--runtime", "torch", "--precision", "int8"), "found precision 'int8'"),
+        (("bench", "--runtime", "torch", "--plan", "dense@int8"), "the plan wants 'blocks' in 'int8'"),
+        (("bench", "--plan", "dense@bf16"), "the plan wants 'blocks' in 'bf16'"),
+        (("bench", "--plan", "dense@fp4"), "has no plan 'dense@fp4'"),
         (("bench", "--runtime", "tensorrt"), "'tensorrt' is not one of"),
         (("calibrate", "--trajectories", "CALLS", "--device", "abacus"), "device 'abacus' cannot be had"),
-        (("realtime", "--control-hz", "10", "--runtime", "torch", "--device", "abacus"), "device 'abacus'"),
+        (("inspect", "-o", "page.html", "--runtime", "torch", "--device", "abacus"), "device 'abacus'"),
     ],
 )
 def test_what_cannot_be_had_is_bad_usage(

@@ -19,6 +19,7 @@ from ttscompile.driver import compile_denoiser
 from ttscompile.errors import ArtifactError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
 def test_convert_writes_one_file_of_the_same_policy(one_layer_checkpoint: Path, tmp_path: Path, precision: str) -> None:
     file = tmp_path / "policy.onnx"

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from tests.passes.specs import toy_spec
+from tests.plans import store_schedules
 from ttscompile import Affine, Noise
-from ttscompile.cli.timing import Contestant, _different_statistics, measure
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.contestants import Way, _different_statistics, contestants
+from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.measure.units import ms
+from ttscompile.report.timing import Contestant, measure
 from ttscompile.runtimes.random_calls import Observation
 
 
@@ -37,12 +43,25 @@ def test_of_several_calls_in_a_row_the_last_is_timed_and_each_has_its_own_observ
         return Contestant(label, "dense", call, lambda: None, spec, None)
 
     spec = toy_spec()
-    slow, quick = measure([contestant(label) for label in seen], runs=3, seed=0, warm_up=1, in_a_row=3)
+    slow, quick = measure([contestant(label) for label in seen], calls=3, seed=0, warm_up=1, in_a_row=3)
     assert len(slow.times_ms) == len(quick.times_ms) == 3
     assert slow.median_ms < 15
     for observations in seen.values():
         assert len(observations) == len(set(observations)) == 12
     assert seen["slow at first"] == seen["quick"]
+
+
+def test_plans_that_follow_each_other_share_no_memory(toy_compiled: Path, tmp_path: Path) -> None:
+    calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
+    rollout = np.full((5, 5), Source.ROLLOUT, np.int8)
+    rollout[0] = Source.COMPUTE
+    plans = {"a": uniform_plan(5, 5, 2), "b": uniform_plan(5, 5, 3), "c": uniform_plan(5, 5, 4), "reads": rollout}
+    store_schedules(calibrated, None, plans, "a", {"strategy": "tts"})
+    entered = contestants({"": load_artifact(calibrated)}, (), [Way()])
+    assert [one.plan for one in entered] == ["dense", "a", "b", "c", "reads"]
+    dense, a, b, c, reads = (one.policy for one in entered)
+    assert dense is b and a is c and a is not b
+    assert reads not in (a, b)
 
 
 def test_long_times_have_no_exponent() -> None:

@@ -39,14 +39,17 @@ UNKIND = (
 )
 
 NEEDED = {
-    "bench": [("A", "--runs", "1")],
+    "bench": [
+        ("A", "--calls", "1"),
+        ("A", "--calls", "1", "--control-hz", "1"),
+        ("A", "--calls", "1", "--trajectories", "calls.npz"),
+        ("A", "--calls", "1", "--checkpoint", "policy.ckpt"),
+    ],
     "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
-    "compare": [("A", "-t", "calls.npz", "--strategies", "", "--calls", "1")],
     "convert": [("policy.ckpt", "-o", "out")],
     "doctor": [("A",)],
     "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
-    "push": [("A", "org/name", "--dry-run", "--runs", "1")],
-    "realtime": [("A", "--control-hz", "1", "--runs", "1")],
+    "push": [("A", "org/name", "--dry-run")],
     "serve": [
         ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
         ("A", "--copies", "1", "--port", "0"),
@@ -123,6 +126,7 @@ def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules["ttscompile.cli.serve"], "ray_copies", nobody)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stops_at_once")
 @pytest.mark.parametrize(("command", "parameter"), ALL)
 def test_unkind_words_are_refused_or_taken(command: str, parameter: click.Parameter) -> None:

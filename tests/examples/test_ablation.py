@@ -29,6 +29,7 @@ def test_an_interval_is_over_episodes() -> None:
     assert interval(np.full(20, 2.0), episodes) == (2.0, 2.0)
 
 
+@pytest.mark.slow
 def test_it_runs_and_every_row_keeps_the_budget(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tts, "DISTANCES", (1,))
     calls, found = policies.record(tmp_path / "calls.npz", episodes=8), tmp_path / "rows.json"

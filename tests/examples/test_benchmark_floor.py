@@ -1,5 +1,7 @@
 """The floor of large policies: FLOPs of what a call computed, at the rate of a product."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from large_calls import Arithmetic
@@ -8,14 +10,14 @@ from rate import COLUMNS, ROWS, WIDTH, ProductRate
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.towers import ReuseRecord
+from ttscompile.core.plan import TokenReuse
 from ttscompile.ir.flops import graph_flops
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 
 
 def test_frames_that_are_known_and_tokens_that_stay_cost_nothing(once: Once) -> None:
-    artifact = load_artifact(cameras.compiled_tokens(once) / "artifact").at_precision("fp32")
+    artifact = load_artifact(cameras.compiled_tokens(once) / "artifact")
     arithmetic, (tower,) = Arithmetic(artifact), artifact.pieces.towers
     rng = np.random.default_rng(0)
     seen = {key: one.draw(rng) for key, one in artifact.manifest.spec.observations.items()}
@@ -27,8 +29,8 @@ def test_frames_that_are_known_and_tokens_that_stay_cost_nothing(once: Once) -> 
         assert loop == policy.last_report.flops[0] - artifact.manifest.flops.prologue
         return [before, policy.last_report.frames.tokens]
 
-    reuse = ReuseRecord(threshold=0.0, refresh=1000, computed=0.3, error=0.0, other_noise=1.0, calls=1)
-    policy = open_policy(artifact.with_reuse(reuse), seed=0)
+    reusing = replace(artifact.plans["dense"], tokens=TokenReuse(threshold=0.0, refresh=1000))
+    policy = open_policy(artifact, seed=0, plan=reusing)
     assert called(policy)[0] == artifact.manifest.flops.prologue
     known = artifact.manifest.flops.prologue - cameras.TO * len(cameras.CAMERAS) * graph_flops(tower)
     assert called(policy)[0] == known

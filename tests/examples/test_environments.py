@@ -64,6 +64,7 @@ def played(environment: Environment, seed: int, steps: int = STEPS) -> list[np.n
     return told
 
 
+@pytest.mark.slow
 def test_a_seed_and_the_actions_are_the_episode(environment: Environment) -> None:
     """In any order of episodes, and in another object."""
     other = type(environment)()
@@ -90,6 +91,7 @@ def test_frames_keep_their_shapes_and_are_of_the_caller(environment: Environment
     assert {key: array.shape for key, array in environment.observe().items()} == {k: a.shape for k, a in before.items()}
 
 
+@pytest.mark.slow
 def test_an_episode_of_rest_ends_at_its_limit(environment: Environment) -> None:
     environment.reset(0)
     task, scores = environment.task, []
@@ -122,6 +124,7 @@ def test_the_picture_is_of_now(environment: Environment) -> None:
     assert (first != earlier).any()
 
 
+@pytest.mark.slow
 def test_an_environment_without_its_package_names_the_extra(tmp_path: Path) -> None:
     """As a user sees it: the command, in a Python that cannot import the package."""
     (tmp_path / "gymnasium_robotics.py").write_text("raise ModuleNotFoundError('no', name='gymnasium_robotics')")

@@ -81,6 +81,7 @@ def test_another_sampler_starts_from_the_same_noise() -> None:
     assert fewer.steps is None
 
 
+@pytest.mark.slow
 def test_two_policies_see_the_same_noise_and_first_observation() -> None:
     first, second = StayAway(), StayAway()
     run_batch(PushT, variant(first, "dense"), [1, 2])
@@ -113,6 +114,7 @@ def test_the_batch_stays_the_same_when_an_episode_is_done() -> None:
     assert sum(result.legalised) == 39
 
 
+@pytest.mark.slow
 def test_batches_give_what_single_episodes_give() -> None:
     policy = StayAway()
     done: list[int] = []

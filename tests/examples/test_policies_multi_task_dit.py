@@ -14,7 +14,7 @@ import ttscompile
 from tests.once import Once
 from tests.rounding import PROMISED
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.timing import original_policy
+from ttscompile.cli.contestants import original_policy
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.ir.program import Program
@@ -24,6 +24,7 @@ TASK = "push the T onto its place"
 WORLD = 512.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["flow", "pixels"])
 def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     def convert(directory: Path) -> Program:

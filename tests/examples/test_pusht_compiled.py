@@ -34,6 +34,7 @@ def windows() -> np.ndarray:
     return np.stack([frames, frames], axis=1)
 
 
+@pytest.mark.slow
 def test_dense_compiled_is_the_eager_policy(compiled_pusht: Path, pusht_checkpoint: Path, windows: np.ndarray) -> None:
     eager = EagerPolicy(pusht_checkpoint, threads=1)
     dense = open_variant(f"{compiled_pusht}:dense", "onnxruntime", 1)
@@ -46,6 +47,7 @@ def test_dense_compiled_is_the_eager_policy(compiled_pusht: Path, pusht_checkpoi
         np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=PROMISED * 512)
 
 
+@pytest.mark.slow
 def test_eager_policy_has_no_plans(pusht_checkpoint: Path, windows: np.ndarray) -> None:
     eager = EagerPolicy(pusht_checkpoint, threads=1)
     noise = seeded_noise(eager.noise, [0, 1], call=0)
@@ -53,6 +55,7 @@ def test_eager_policy_has_no_plans(pusht_checkpoint: Path, windows: np.ndarray) 
         eager.predict_action({"obs": windows}, noise=noise, plan=np.zeros((100, 24), np.int8))
 
 
+@pytest.mark.slow
 def test_contestants_of_the_benchmark(
     compiled_pusht: Path, pusht_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

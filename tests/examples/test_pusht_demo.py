@@ -9,18 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmark import Measurement
-from demo import COMPILED, DENSE, ORIGINAL, calibration_table, compare, conclusion, final_table
+from demo import ALL_COMPUTED, COMPILED, ORIGINAL, calibration_table, compare, conclusion, final_table
 from episodes import Episodes
 from evaluate import Evaluation, summarise
 from rollout import Episode, Rollout
 from variants import open_variant
 
 from tests.examples.printed import printed
-from tests.plans import store_schedules
+from ttscompile import Plan
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.judge import Score
 from ttscompile.calibration.result import CalibrationResult
-from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.lattice import dense_plan, uniform_plan
+from ttscompile.core.plan import FULL
 
 
 def cells(table: Any) -> list[list[str]]:
@@ -90,17 +92,18 @@ def test_the_conclusion_says_whether_success_was_kept() -> None:
 @pytest.mark.slow
 def test_episodes_that_were_run_before_are_compared(compiled_pusht: Path, tmp_path: Path) -> None:
     """Without running any: the three policies, from the files of their episodes to the figures."""
-    original, artifact = (shutil.copytree(compiled_pusht, tmp_path / name) for name in ("original", "compiled"))
+    artifact = shutil.copytree(compiled_pusht, tmp_path / "compiled")
     manifest = load_artifact(artifact).manifest
-    plan = uniform_plan(manifest.steps, len(manifest.blocks), 1)
-    store_schedules(artifact, None, {"one": plan}, "one", {"strategy": "interval"})
-    for text, coverage in ((f"{original}:dense", 0.8), (str(artifact), 0.7)):  # both compute all with the same weights
+    shape = manifest.steps, len(manifest.blocks)
+    plans = {FULL: Plan(cells=dense_plan(*shape)), "one": Plan(cells=uniform_plan(*shape, 1))}
+    update_plans(artifact, plans, "one", {"strategy": "interval"})
+    for text, coverage in ((f"{artifact}:dense", 0.8), (f"{artifact}:full", 0.75), (str(artifact), 0.7)):
         cache = Episodes(tmp_path / "episodes", "pusht", open_variant(text, "onnxruntime", 1), "onnxruntime")
         for seed in (7, 8):
             cache.write(rollout(coverage, seed).episodes[0])
-    found = compare(original, artifact, (7, 8), 2, 2)
-    assert [one.label for one in found] == [ORIGINAL, DENSE, COMPILED]
-    assert [round(one.score.mean * 0.95, 6) for one in found] == [0.8, 0.8, 0.7]
+    found = compare(artifact, (7, 8), 2, 2)
+    assert [one.label for one in found] == [ORIGINAL, ALL_COMPUTED, COMPILED]
+    assert [round(one.score.mean * 0.95, 6) for one in found] == [0.8, 0.75, 0.7]
 
 
 def test_calibration_table_names_the_default_and_the_baseline() -> None:
@@ -111,8 +114,8 @@ def test_calibration_table_names_the_default_and_the_baseline() -> None:
         target_sparsity=0.95,
         default_plan="schedule",
         plans={
-            "schedule": Score(0.3, (0.2, 0.4), 11.04, 47.0, 0.95, 0.94, 0.93, plans=1),
-            "uniform": Score(1.9, (1.5, 2.1), 91.0, 288.0, 0.95, 0.95, 0.94, plans=1),
+            "schedule": Score(0.1104, (0.05, 0.17), None, None, 0.95, 0.94, 0.93, 1),
+            "uniform": Score(0.91, (0.8, 1.2), None, None, 0.95, 0.95, 0.94, 1),
         },
         episodes={"calibration": (0, 1), "validation": (2,)},
         calls={"calibration": 20, "validation": 10},
@@ -121,10 +124,11 @@ def test_calibration_table_names_the_default_and_the_baseline() -> None:
         seconds=60.0,
     )
     rows = cells(calibration_table(result))
-    assert ["schedule (default)", "0.30", "11.0", "47.0", "95.0%", "93.0%"] in rows
-    assert ["uniform", "1.90", "91.0", "288.0", "95.0%", "94.0%"] in rows
+    assert ["schedule (default)", "0.110", "[0.050, 0.170]", "95.0%", "93.0%"] in rows
+    assert ["uniform", "0.910", "[0.800, 1.200]", "95.0%", "94.0%"] in rows
 
 
+@pytest.mark.slow
 def test_a_bad_checkpoint_is_one_clear_error(tmp_path: Path) -> None:
     bad = tmp_path / "not-a-policy.ckpt"
     bad.write_text("nothing of the kind")

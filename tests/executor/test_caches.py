@@ -69,6 +69,7 @@ def drawn(policy: CompiledPolicy, number: int) -> ttscompile.Noise:
     return ttscompile.Noise(draw.standard_normal((1, horizon, channels), dtype=np.float32), steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_late_calls_dropped_chunks_and_resets(pruned: Path, seed: int) -> None:
     """Every call is answered as by a policy that made the same calls of this episode, and no others."""

@@ -207,6 +207,7 @@ def program(body: str, artifact: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "status", "last"),
     [

@@ -71,6 +71,7 @@ def drive(path: Path, ticks: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np
     return np.array(actions), policy.calls
 
 
+@pytest.mark.slow
 def test_a_compiled_policy_keeps_what_is_committed(inpainting: Path) -> None:
     actions, calls = drive(inpainting, ticks=60)
     assert calls[0][0].shape == (0, 2)  # nothing was scheduled yet

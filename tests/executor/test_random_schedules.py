@@ -259,6 +259,7 @@ def run(ticks: int, derandomize: bool) -> int:
     return Schedule.ticks
 
 
+@pytest.mark.slow
 def test_random_schedules() -> None:
     assert run(3_000, derandomize=True) >= 3_000
 

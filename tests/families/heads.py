@@ -1,6 +1,7 @@
 """Action heads of vision-language-action models, rebuilt, and what their originals made; see ``golden/README.md``."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import diffusers
 from torch import nn
@@ -43,18 +44,27 @@ class Family:
     module: nn.Module
     conditions: tuple[str, ...]
     sampler: SamplerTable
-    prediction: str
-    blocks: dict[str, int]
-    loop: float
+    prediction: str = "prediction"
+    blocks: dict[str, int] = field(default_factory=lambda: {"self_attention": 2, "feed_forward": 2})
+    loop: float = 0.9
     others: dict[str, tuple[int, ...]] = field(default_factory=dict)
     scale: float = 1.0
     masks: bool = False
 
 
+UP_TO = "up to the rounding of float32"
+LEROBOT = f"lerobot 7427f31 `denoise_step`, `euler_integrate`, {UP_TO}"
+
+
+def ddim(steps: int, **settings: Any) -> SamplerTable:
+    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2", **settings)
+    return sampler_table(solver, steps, name="ddim")
+
+
 def smolvla() -> Family:
     return Family(
         title="SmolVLA action expert",
-        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, up to the rounding of float32",
+        verified=LEROBOT,
         module=SmolVLAHead(width=24, heads=4, groups=2, channels=8, hidden=40, layers=4, actions=5),
         conditions=("prefix_mask", "keys", "values"),
         sampler=flow_matching_table(10, start=1.0, end=0.0),
@@ -69,119 +79,89 @@ def rdt() -> Family:
     solver = diffusers.DPMSolverMultistepScheduler(beta_schedule="squaredcos_cap_v2", prediction_type="sample")
     return Family(
         title="RDT-1B",
-        verified="RoboticsDiffusionTransformer deb71d8 `conditional_sample`, up to the rounding of float32",
+        verified=f"RoboticsDiffusionTransformer deb71d8 `conditional_sample`, {UP_TO}",
         module=RDTHead(width=32, heads=4, layers=4, horizon=6, actions=5, lengths=(9, 8), features=(12, 10)),
         conditions=("language", "language_mask", "image", "state", "action_mask", "frequency"),
         sampler=sampler_table(solver, 5, name="dpmsolver++"),
-        prediction="prediction",
         blocks={"self_attention": 4, "cross_attention": 4, "feed_forward": 4},
         loop=0.78,
         masks=True,
     )
 
 
-def pi0() -> Family:
+def _pi(title: str, adaptive: bool, conditions: tuple[str, ...], loop: float) -> Family:
     return Family(
-        title="pi0 action expert",
-        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, up to the rounding of float32",
-        module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=False),
-        conditions=("prefix_mask", "keys", "values", "state"),
+        title=f"{title} action expert",
+        verified=LEROBOT,
+        module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=adaptive),
+        conditions=("prefix_mask", "keys", "values", *conditions),
         sampler=flow_matching_table(10, start=1.0, end=0.0),
         prediction="velocity",
-        blocks={"self_attention": 2, "feed_forward": 2},
-        loop=0.9995,
-    )
-
-
-def pi05() -> Family:
-    return Family(
-        title="pi0.5 action expert",
-        verified="lerobot 7427f31 `denoise_step`, `euler_integrate`, up to the rounding of float32",
-        module=PiHead(width=24, heads=4, groups=1, channels=8, hidden=40, layers=2, actions=5, adaptive=True),
-        conditions=("prefix_mask", "keys", "values"),
-        sampler=flow_matching_table(10, start=1.0, end=0.0),
-        prediction="velocity",
-        blocks={"self_attention": 2, "feed_forward": 2},
-        loop=0.9,
+        loop=loop,
     )
 
 
 def groot() -> Family:
     return Family(
         title="GR00T N1.7 action head",
-        verified="lerobot 7427f31 `get_action_with_features`, up to the rounding of float32",
+        verified=f"lerobot 7427f31 `get_action_with_features`, {UP_TO}",
         module=GR00THead(24, heads=3, layers=4, source=20, out=16, actions=5, embodiments=2, embodiment=1),
         conditions=("features", "state"),
         sampler=flow_matching_table(4),
         prediction="velocity",
         blocks={"cross_attention": 2, "feed_forward": 4, "self_attention": 2},
-        loop=0.9,
         scale=1000.0,
     )
 
 
 def cogact() -> Family:
-    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2", clip_sample=False)
     return Family(
         title="CogACT action model, guidance 1.5",
-        verified="CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, up to the rounding of float32",
+        verified=f"CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, {UP_TO}",
         module=CogACTHead(24, heads=3, layers=2, horizon=6, actions=5, cognition=18, guidance=1.5),
         conditions=("cognition",),
-        sampler=sampler_table(solver, 10, name="ddim"),
-        prediction="prediction",
-        blocks={"self_attention": 2, "feed_forward": 2},
+        sampler=ddim(10, clip_sample=False),
         loop=0.99,
         others={"history_embedder.linear.weight": (24, 5), "history_embedder.linear.bias": (24,)},
     )
 
 
 def dit_policy() -> Family:
-    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
     return Family(
         title="DiT-Policy",
-        verified="dit-policy ba22ee3 `get_actions`, up to the rounding of float32",
+        verified=f"dit-policy ba22ee3 `get_actions`, {UP_TO}",
         module=DiTPolicyHead(24, heads=3, layers=2, hidden=40, waves=16, horizon=6, actions=5),
         conditions=("tokens",),
-        sampler=sampler_table(solver, 8, name="ddim"),
-        prediction="prediction",
-        blocks={"self_attention": 2, "feed_forward": 2},
+        sampler=ddim(8),
         loop=0.5,
     )
 
 
 def scaledp() -> Family:
-    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
     return Family(
         title="ScaleDP (DexVLA)",
-        verified="DexVLA fc21a82 `model_forward`, `forward`, up to the rounding of float32",
+        verified=f"DexVLA fc21a82 `model_forward`, `forward`, {UP_TO}",
         module=ScaleDPHead(24, heads=3, layers=2, hidden=20, horizon=6, actions=5, features=18, state=4),
         conditions=("features", "state"),
-        sampler=sampler_table(solver, 10, name="ddim"),
-        prediction="prediction",
-        blocks={"self_attention": 2, "feed_forward": 2},
-        loop=0.9,
+        sampler=ddim(10),
     )
 
 
 def dita() -> Family:
-    solver = diffusers.DDIMScheduler(100, beta_schedule="squaredcos_cap_v2")
     return Family(
         title="Dita",
-        verified="Dita 66350e7 `forward`, `inference`, up to the rounding of float32",
+        verified=f"Dita 66350e7 `forward`, `inference`, {UP_TO}",
         module=DitaHead(128, heads=2, hidden=80, layers=2, actions=7),
         conditions=("prefix",),
-        sampler=sampler_table(solver, 10, name="ddim"),
-        prediction="prediction",
-        blocks={"self_attention": 2, "feed_forward": 2},
-        loop=0.9,
+        sampler=ddim(10),
     )
 
 
 FAMILIES = {
     "smolvla": smolvla,
     "rdt": rdt,
-    "pi0": pi0,
-    "pi05": pi05,
+    "pi0": lambda: _pi("pi0", False, ("state",), 0.9995),
+    "pi05": lambda: _pi("pi0.5", True, (), 0.9),
     "groot": groot,
     "cogact": cogact,
     "dit_policy": dit_policy,

@@ -13,6 +13,7 @@ from tests.families.modules import CHANNELS, FEATURES, HORIZON, MODULES, TOKENS
 from tests.ir.meta import assert_types_of
 from tests.passes.modules import STREAMS, evaluate_pieces
 from tests.passes.specs import toy_spec
+from tests.quick import first_quick
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile import PolicySpec
 from ttscompile.driver import transform
@@ -54,7 +55,7 @@ def made(name: str) -> tuple[nn.Module, PolicySpec]:
     return MODULES[name]().eval(), toy_spec(sample=(HORIZON, CHANNELS), obs=(TOKENS, FEATURES), steps=4)
 
 
-@pytest.mark.parametrize("name", [name for name in FOUND if name not in LOWERED])
+@pytest.mark.parametrize("name", first_quick(name for name in FOUND if name not in LOWERED))
 def test_blocks_are_found_and_compute_what_the_module_computes(name: str) -> None:
     module, spec = made(name)
     program = transform(module, spec)
@@ -68,6 +69,7 @@ def test_blocks_are_found_and_compute_what_the_module_computes(name: str) -> Non
         assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in LOWERED else pytest.mark.soak) for n in FOUND])
 def test_from_a_module_to_both_runtimes(name: str, tmp_path: Path) -> None:
     module, spec = made(name)

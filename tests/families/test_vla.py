@@ -9,6 +9,7 @@ import ttscompile
 from tests.families.checks import assert_runtimes_agree, in_loop, kinds, rounded
 from tests.families.heads import FAMILIES, Family, loaded
 from tests.families.support import record
+from tests.quick import first_quick
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.driver import transform
 from ttscompile.ir.program import Program
@@ -36,13 +37,14 @@ def test_a_head_computes_what_the_original_computes(name: str) -> None:
     assert_equal_but_for_rounding(made, arrays[family.prediction], counted.terms, counted.angle)
 
 
-@pytest.mark.parametrize("name", [name for name in FAMILIES if name not in LOWERED])
+@pytest.mark.parametrize("name", first_quick(name for name in FAMILIES if name not in LOWERED))
 def test_its_blocks_are_found(name: str) -> None:
     family = FAMILIES[name]()
     module, _, spec = loaded(family, name)
     assert_found(family, transform(module, spec))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in LOWERED else pytest.mark.soak) for n in FAMILIES])
 def test_a_compiled_head_acts_as_the_original(name: str, tmp_path: Path) -> None:
     family = FAMILIES[name]()

@@ -159,6 +159,7 @@ def test_payload_that_is_no_dictionary(tmp_path: Path) -> None:
         load_checkpoint_policy(tmp_path / "policy.ckpt")
 
 
+@pytest.mark.slow
 def test_neither_omegaconf_nor_dill_is_imported(shared: Path) -> None:
     """The golden checkpoints name both packages; reading one imports neither."""
     path = shared / "golden" / "diffusion_policy" / "bert.ckpt"

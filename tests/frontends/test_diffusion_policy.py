@@ -18,6 +18,7 @@ from ttscompile.samplers.table import sampler_table
 from .variants import VARIANTS, Build, Save
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("variant", "as_cond", "model"), VARIANTS)
 def test_variants(payload: Build, save: Save, variant: str, as_cond: bool, model: dict[str, Any]) -> None:
     """Each loads, says what it is, and predicts the same for streams together and alone."""

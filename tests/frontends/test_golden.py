@@ -19,6 +19,7 @@ from ttscompile.ir.evaluate import evaluate
 
 from ..golden import compiled_golden
 from ..once import Once
+from .originals import as_seen, assert_actions
 
 GOLDEN = {
     "mlp_encoder_causal": "token-wise condition encoder",
@@ -43,22 +44,17 @@ def golden(name: str, shared: Path) -> Loaded:
     base = shared / "golden" / "diffusion_policy" / name
     module, spec = load_checkpoint_policy(base.with_suffix(".ckpt"))
     assert spec.source["variant"] == GOLDEN[name]
+    assert spec.observations["obs"].normalizer is not None
     with np.load(base.with_suffix(".npz")) as numbers:
         return module, spec, dict(numbers)
 
 
-def normalized(spec: PolicySpec, obs: npt.NDArray[np.float32]) -> torch.Tensor:
-    """The observation as the network sees it."""
-    normalizer = spec.observations["obs"].normalizer
-    assert normalizer is not None
-    return torch.from_numpy(normalizer.normalize(obs))
-
-
+@pytest.mark.slow
 def test_single_evaluations(golden: Loaded) -> None:
     """The network alone, at three timesteps."""
     module, spec, numbers = golden
     network: Any = module.model
-    cond = normalized(spec, numbers["obs"]) if network.config.cond_dim else None
+    cond = as_seen(spec, numbers)["obs"] if network.config.cond_dim else None
     for timestep, expected in zip(numbers["probe_t"], numbers["probe_eps"], strict=True):
         with torch.inference_mode(), Counted() as counted:
             found = network(torch.from_numpy(numbers["probe_x"]), torch.full((2,), int(timestep)), cond)
@@ -69,7 +65,7 @@ def test_module_is_the_network_with_the_observation_in_place(golden: Loaded) -> 
     """Inpainting overwrites exactly the first To rows of the observation channels, whatever was there."""
     module, spec, numbers = golden
     network: Any = module.model
-    obs, x, t = normalized(spec, numbers["obs"]), torch.from_numpy(numbers["probe_x"]), torch.full((2,), 7)
+    obs, x, t = as_seen(spec, numbers)["obs"], torch.from_numpy(numbers["probe_x"]), torch.full((2,), 7)
     with torch.inference_mode():
         found = module(x, t, obs)
         if network.config.cond_dim:
@@ -88,16 +84,11 @@ def test_whole_call(golden: Loaded) -> None:
     assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
     assert spec.sample == numbers["noise_initial"].shape[1:]
     noise = Noise(numbers["noise_initial"], numbers["noise_steps"])
-    sample = eager_policy(module, spec)({"obs": normalized(spec, numbers["obs"])}, noise).numpy()
     assert spec.chunk.normalizer is not None
-    actions = spec.chunk.normalizer.unnormalize(sample[..., : spec.chunk.action_dim])
-    tolerance = PROMISED * np.ptp(numbers["action_pred"])
-    assert np.abs(actions - numbers["action_pred"]).max() < tolerance
-    executed = actions[:, spec.chunk.start : spec.chunk.stop]
-    assert executed.shape == numbers["action"].shape
-    assert np.abs(executed - numbers["action"]).max() < tolerance
+    assert_actions(spec, eager_policy(module, spec)(as_seen(spec, numbers), noise), numbers)
 
 
+@pytest.mark.slow
 def test_captured_once_for_any_batch(golden: Loaded, name: str, once: Once, shared: Path) -> None:
     """The graph that is compiled, after capture, decompositions and passes, is the module for every batch size."""
     module, _, numbers = golden
@@ -120,7 +111,7 @@ def test_captured_once_for_any_batch(golden: Loaded, name: str, once: Once, shar
 def test_eager_policy_needs_noise_for_a_stochastic_sampler(golden: Loaded) -> None:
     """A missing draw is an error, not a deterministic sampler; DDIM needs none."""
     module, spec, numbers = golden
-    run, obs = eager_policy(module, spec), {"obs": normalized(spec, numbers["obs"])}
+    run, obs = eager_policy(module, spec), as_seen(spec, numbers)
     if spec.sampler.stochastic:
         with pytest.raises(ObservationError, match=r"noise\.steps is None"):
             run(obs, Noise(numbers["noise_initial"]))
@@ -150,13 +141,14 @@ def pusht(shared: Path) -> tuple[nn.Module, PolicySpec]:
     return load_checkpoint_policy(shared / "policies" / "pusht_dpt.ckpt")
 
 
+@pytest.mark.slow
 def test_dense_call_of_the_real_policy(shared: Path, pusht: tuple[nn.Module, PolicySpec]) -> None:
     """The first call of a TTS episode is dense: the authors' implementation and ours agree on it."""
     module, spec = pusht
     with np.load(shared / "golden" / "tts" / "timestep_95.npz") as numbers:
         assert not numbers["plans"][0].any()
         noise = Noise(numbers["noise_initial"][0], numbers["noise_steps"][0])
-        sample = eager_policy(module, spec)({"obs": normalized(spec, numbers["obs"][0])}, noise).numpy()
+        sample = eager_policy(module, spec)(as_seen(spec, {"obs": numbers["obs"][0]}), noise).numpy()
         assert spec.chunk.normalizer is not None
         actions = spec.chunk.normalizer.unnormalize(sample)
         assert np.abs(actions - numbers["action_pred"][0]).max() < PROMISED * np.ptp(numbers["action_pred"])

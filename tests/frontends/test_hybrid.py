@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
@@ -34,16 +33,10 @@ from ..families.support import record
 from ..lower.sessions import run
 from ..runtimes.agreement import call_terms, largest_difference
 from . import hybrid
+from .originals import as_seen, assert_actions, golden
 
-Recorded = dict[str, npt.NDArray[Any]]
 Payload = dict[str, Any]
 WRIST = "obs_encoder.obs_nets.wrist."
-
-
-def recorded(variant: str) -> Recorded:
-    """What the original gave."""
-    with np.load(Path(__file__).parent / "golden" / f"hybrid_{variant}.npz") as numbers:
-        return dict(numbers)
 
 
 @pytest.fixture(scope="module")
@@ -65,17 +58,15 @@ def build(two_cameras: Payload) -> Callable[..., tuple[Any, Any]]:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", hybrid.VARIANTS)
 def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
     """Features of every observed step, and the actions of a whole call, from the file that is saved."""
     torch.save(hybrid.payload(variant), tmp_path / "policy.ckpt")
     module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
-    numbers = recorded(variant)
+    numbers = golden(f"hybrid_{variant}")
     assert list(spec.observations) == list(hybrid.VARIANTS[variant]["obs"])
-    observation = {}
-    for key, array in hybrid.observation(variant).items():
-        normalizer = spec.observations[key].normalizer
-        observation[key] = torch.from_numpy(array if normalizer is None else normalizer.normalize(array))
+    observation = as_seen(spec, hybrid.observation(variant))
     assert isinstance(module, EncodedDenoiser)
     with torch.inference_mode(), Counted() as counted:
         features = module.encoder(observation).flatten(0, 1)
@@ -85,12 +76,8 @@ def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
         halved = copy.deepcopy(module.encoder).half().float()(observation).flatten(0, 1).numpy()
     assert np.abs(halved - numbers["features"]).max() > 5 * allowed(numbers["features"], counted.terms)
     assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
-    sample = eager_policy(module, spec)(observation, Noise(*hybrid.noise(variant))).numpy()
-    assert spec.chunk.normalizer is not None
-    actions = spec.chunk.normalizer.unnormalize(sample[..., : hybrid.ACTION])
-    tolerance = PROMISED * np.ptp(numbers["action_pred"])
-    assert np.abs(actions - numbers["action_pred"]).max() < tolerance
-    assert np.abs(actions[:, spec.chunk.start : spec.chunk.stop] - numbers["action"]).max() < tolerance
+    assert spec.chunk.normalizer is not None and spec.chunk.action_dim == hybrid.ACTION
+    assert_actions(spec, eager_policy(module, spec)(observation, Noise(*hybrid.noise(variant))), numbers)
 
 
 def test_the_encoder_runs_once_in_the_eager_loop(build: Callable[..., tuple[Any, Any]]) -> None:
@@ -120,7 +107,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Program, Path]:
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_compiled_is_the_original(compiled: tuple[Program, Path], runtime: str) -> None:
     """From images in 0..1 and raw positions to actions, through the artifact."""
-    numbers = recorded(COMPILED)
+    numbers = golden(f"hybrid_{COMPILED}")
     policy = ttscompile.load(compiled[1], runtime=runtime)
     out = policy.predict_action(hybrid.observation(COMPILED), noise=Noise(*hybrid.noise(COMPILED)), plan="dense")
     for name in ("action", "action_pred"):
@@ -240,6 +227,7 @@ def test_the_grid_of_half_precision_is_exact(build: Callable[..., tuple[Any, Any
         assert torch.equal(camera.pool.pos_x, grid.pos_x) and torch.equal(camera.pool.pos_y, grid.pos_y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("weights", "message"),
     [

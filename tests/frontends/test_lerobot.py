@@ -242,6 +242,7 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
     np.testing.assert_allclose(found, x, rtol=0, atol=atol)
 
 
+@pytest.mark.slow
 def test_rk4_with_plain_attention_compiles(tmp_path: Path) -> None:
     """Four evaluations a step, each a step of the lattice, in both runtimes; and they agree on random plans."""
     directory = save_policy(tmp_path, **PLAIN, num_layers=1, objective="flow_matching", integration_method="rk4")
@@ -262,6 +263,7 @@ def test_rk4_with_plain_attention_compiles(tmp_path: Path) -> None:
     assert found < bound(call_terms(artifact))
 
 
+@pytest.mark.slow
 def test_a_task_that_is_compiled_in_leaves_no_text_encoder(tmp_path: Path) -> None:
     """Its feature is a constant of the condition piece, for any number of streams."""
     directory = save_policy(tmp_path, num_layers=1)

@@ -112,6 +112,7 @@ def test_whole_call(golden: Golden) -> None:
     assert np.abs(spec.chunk.normalizer.unnormalize(executed) - numbers["action"]).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_compiled_call(golden: Golden, compiled: Path, runtime: str) -> None:
     """The artifact from raw observations to the action in its units, within 1e-4."""
@@ -152,6 +153,7 @@ def test_encoders_and_modulations_leave_the_loop(golden: Golden, compiled: Path)
     assert kinds == ["self_attention", "feed_forward"] * 4
 
 
+@pytest.mark.slow
 def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     """Episodes of random legal plans, several streams."""
     artifact = load_artifact(compiled)

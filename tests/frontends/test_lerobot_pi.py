@@ -18,15 +18,14 @@ from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.ir.program import Program
 
 from ..families.support import record
-from . import pis
+from . import originals, pis
 from .lerobot_tiny import change_json, write_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
 
 
 @pytest.fixture(scope="module")
 def golden() -> Mapping[str, Array]:
-    with np.load(Path(__file__).parent / "golden" / "lerobot_pi.npz") as numbers:
-        return dict(numbers)
+    return originals.golden("lerobot_pi")
 
 
 @pytest.fixture(scope="module", params=pis.KINDS)
@@ -63,6 +62,7 @@ def test_a_camera_that_the_robot_lacks(directory: Path, kind: str, golden: Mappi
     assert np.abs(found - golden[f"{kind}.0"]).max() > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 @pytest.mark.parametrize("kind", ["pi05", pytest.param("pi0", marks=pytest.mark.soak)])
 def test_what_is_compiled_gives_them_too(

@@ -39,47 +39,33 @@ def _weights(change: Callable[[dict[str, torch.Tensor]], object], name: str = "m
     return apply
 
 
-def _step(index: int, **changes: Any) -> Callable[[Path], None]:
-    def apply(directory: Path) -> None:
-        path = directory / "policy_preprocessor.json"
-        content = json.loads(path.read_text(encoding="utf-8"))
-        content["steps"][index] |= changes
-        write_json(path, content)
+def _change(name: str, change: Callable[[Any], object]) -> Callable[[Path], None]:
+    """Changes of a document in the directory, or beside it."""
 
-    return apply
-
-
-def _insert(index: int, step: dict[str, Any], name: str = "policy_preprocessor.json") -> Callable[[Path], None]:
     def apply(directory: Path) -> None:
         content = json.loads((directory / name).read_text(encoding="utf-8"))
-        content["steps"].insert(index, step)
+        change(content)
         write_json(directory / name, content)
 
     return apply
 
 
+def _step(index: int, **changes: Any) -> Callable[[Path], None]:
+    return _change("policy_preprocessor.json", lambda content: content["steps"][index].update(changes))
+
+
+def _insert(index: int, step: dict[str, Any], name: str = "policy_preprocessor.json") -> Callable[[Path], None]:
+    return _change(name, lambda content: content["steps"].insert(index, step))
+
+
 def _normalizer(**changes: Any) -> Callable[[Path], None]:
     """Changes of the normaliser's configuration."""
-
-    def apply(directory: Path) -> None:
-        path = directory / "policy_preprocessor.json"
-        content = json.loads(path.read_text(encoding="utf-8"))
-        content["steps"][3]["config"] |= changes
-        write_json(path, content)
-
-    return apply
+    return _change("policy_preprocessor.json", lambda content: content["steps"][3]["config"].update(changes))
 
 
 def _encoder(part: str, **changes: Any) -> Callable[[Path], None]:
     """Changes of the configuration of CLIP beside the policy."""
-
-    def apply(directory: Path) -> None:
-        path = directory.parent / "clip-small" / "config.json"
-        content = json.loads(path.read_text(encoding="utf-8"))
-        content[part] |= changes
-        write_json(path, content)
-
-    return apply
+    return _change("../clip-small/config.json", lambda content: content[part].update(changes))
 
 
 def _text(content: str) -> Callable[[Path], object]:
@@ -154,6 +140,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD)
 def test_bad_directories(tmp_path: Path, case: str) -> None:
     """Every error names the place, what was found and what was expected."""

@@ -13,7 +13,7 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.timing import original_policy
+from ttscompile.cli.contestants import original_policy
 from ttscompile.core.spec import Noise
 from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -23,6 +23,7 @@ from ttscompile.frontends.families import LoadOptions
 
 from ..families.support import record
 from ..verification.broken import edited
+from . import originals
 from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
@@ -44,8 +45,7 @@ def golden(directory: Path) -> Mapping[str, Array]:
 @pytest.fixture(scope="module")
 def others() -> Mapping[str, Array]:
     """What lerobot made of images of another size, and without a camera."""
-    with np.load(Path(__file__).parent / "golden" / "lerobot_smolvla.npz") as numbers:
-        return dict(numbers)
+    return originals.golden("lerobot_smolvla")
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +68,7 @@ def eager(directory: Path, given: Mapping[str, Array], batch: Mapping[str, Array
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(given["noise"])).numpy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
     policy = ttscompile.load(compiled, runtime=runtime)

@@ -28,17 +28,11 @@ from ..families.support import record
 from ..once import Once
 from ..runtimes.agreement import call_terms, largest_difference
 from . import lerobot_unets
-from .hybrid import Array
 from .lerobot_tiny import write_json
 from .lerobot_unets import ACTION_DIM, ENVIRONMENT, STATE, TOP, WRIST
+from .originals import golden
 
 COMPILED = "one_encoder"
-
-
-def recorded(variant: str) -> dict[str, Array]:
-    """What lerobot gave."""
-    with np.load(Path(__file__).parent / "golden" / f"lerobot_unet_{variant}.npz") as numbers:
-        return dict(numbers)
 
 
 def load(directory: Path) -> tuple[EncodedDenoiser, PolicySpec]:
@@ -48,11 +42,12 @@ def load(directory: Path) -> tuple[EncodedDenoiser, PolicySpec]:
     return module, spec
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", lerobot_unets.VARIANTS)
 def test_lerobot_gave_the_same(variant: str, tmp_path: Path) -> None:
     """The condition, single evaluations, and the executed actions of a whole call, from the files that are saved."""
     module, spec = load(lerobot_unets.save(variant, tmp_path / "policy"))
-    numbers, observation = recorded(variant), lerobot_unets.observation(variant)
+    numbers, observation = golden(f"lerobot_unet_{variant}"), lerobot_unets.observation(variant)
     assert set(spec.observations) == set(observation)
     given = {key: torch.from_numpy(value) for key, value in observation.items()}
     noise = Noise(*lerobot_unets.noise())
@@ -75,7 +70,7 @@ def test_lerobot_gave_the_same(variant: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("variant", ["one_encoder", "separate", "deeper"])
 def test_the_images_matter(variant: str) -> None:
     """Of the recorded condition each camera's features are not all zero, and not the same for both streams."""
-    made, numbers = lerobot_unets.VARIANTS[variant], recorded(variant)
+    made, numbers = lerobot_unets.VARIANTS[variant], golden(f"lerobot_unet_{variant}")
     keypoints = made["settings"].get("spatial_softmax_num_keypoints", 8)
     features = numbers["condition"][:, lerobot_unets.STATE_DIM :][:, : 2 * keypoints]
     assert np.ptp(features, axis=0).max() > 0.1
@@ -114,7 +109,7 @@ def compiled(once: Once) -> tuple[Path, Program]:
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_compiled_is_lerobot(compiled: tuple[Path, Program], runtime: str) -> None:
     """From the robot's own observations to actions in its units, through the artifact."""
-    expected = recorded(COMPILED)["action"]
+    expected = golden(f"lerobot_unet_{COMPILED}")["action"]
     policy = ttscompile.load(compiled[0], runtime=runtime)
     observation = lerobot_unets.observation(COMPILED)
     found = policy.predict_action(observation, noise=Noise(*lerobot_unets.noise()), plan="dense")["action"]
@@ -124,7 +119,7 @@ def test_compiled_is_lerobot(compiled: tuple[Path, Program], runtime: str) -> No
 @pytest.mark.slow
 def test_select_action_is_lerobots(compiled: tuple[Path, Program]) -> None:
     """Frame by frame, action after action, in tensors; the window is the last two frames."""
-    policy, expected = ttscompile.load(compiled[0]), recorded(COMPILED)["action"]
+    policy, expected = ttscompile.load(compiled[0]), golden(f"lerobot_unet_{COMPILED}")["action"]
     observation, noise = lerobot_unets.observation(COMPILED), Noise(*lerobot_unets.noise())
     first, second = ({key: torch.from_numpy(value[:, i]) for key, value in observation.items()} for i in range(2))
     policy.predict_action_chunk(first, noise=noise)
@@ -227,6 +222,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD)
 def test_settings_that_do_not_fit(changed: Callable[..., Path], case: str) -> None:
     """Each is named, with what was expected, and the directory."""
@@ -256,7 +252,7 @@ def test_a_network_that_was_compiled_in_training(changed: Callable[..., Path]) -
     drawn = lerobot_unets.observation("separate")
     given = {name.replace(".", "_"): torch.from_numpy(value) for name, value in drawn.items()}
     with torch.inference_mode():
-        assert module.encoder(given).shape == recorded("separate")["condition"].shape
+        assert module.encoder(given).shape == golden("lerobot_unet_separate")["condition"].shape
 
 
 @pytest.mark.parametrize("option", ["task", "encoders"])

@@ -57,6 +57,7 @@ CASES: list[tuple[type[Any], dict[str, Any], int, dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheduler_class", "settings", "steps", "arguments"), CASES)
 def test_table_gives_what_the_scheduler_gives(
     scheduler_class: type[Any], settings: dict[str, Any], steps: int, arguments: dict[str, Any]
@@ -121,18 +122,14 @@ def near_miss(base: type[Any], name: str, change: Callable[[Any, Any, Any], Any]
     return type(name, (base,), {"step": step})
 
 
-class Remembering:
-    """What a scheduler saw before is kept until it begins anew."""
+class Multistep(DDIMScheduler):
+    """Averages with the output of the step before."""
 
     before: Any = None
 
     def set_timesteps(self, *args: Any, **kwargs: Any) -> None:
-        super().set_timesteps(*args, **kwargs)  # type: ignore[misc]  # of the scheduler beside it
+        super().set_timesteps(*args, **kwargs)
         self.before = None
-
-
-class Multistep(Remembering, DDIMScheduler):
-    """Averages with the output of the step before."""
 
     def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
         mixed = model_output if self.before is None else 0.9 * model_output + 0.1 * self.before
@@ -280,8 +277,14 @@ def test_second_order_is_the_formula() -> None:
     assert table.memory_to_next[0].tolist() == [0]  # the first step has nothing to remember
 
 
-class LongMemory(Remembering, DPMSolverMultistepScheduler):
+class LongMemory(DPMSolverMultistepScheduler):
     """Keeps a trace of the first output for ever."""
+
+    before: Any = None
+
+    def set_timesteps(self, *args: Any, **kwargs: Any) -> None:
+        super().set_timesteps(*args, **kwargs)
+        self.before = None
 
     def step(self, model_output: Any, *args: Any, **kwargs: Any) -> Any:
         self.before = model_output if self.before is None else self.before

@@ -79,6 +79,7 @@ def test_the_loop_is_the_original(sigmas: list[float], clip: float | None) -> No
     assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
 
 
+@pytest.mark.slow
 def test_its_blocks_are_found_and_the_artifact_acts_as_the_original(tmp_path: Path) -> None:
     told: dict[str, tuple[str, ...]] = {}
     coarse = ttscompile.compile_denoiser(Preconditioned(Network()).eval(), spec(SIGMAS), explain=told.__setitem__)

@@ -25,27 +25,13 @@ from ttscompile.runtimes import open_runtime
 from ..families.support import record
 from ..runtimes.agreement import call_terms, largest_difference
 from . import unets
-from .hybrid import Array
+from .originals import as_seen, assert_actions, golden
 
 GIVEN = {"local": "local condition", "inpainting": "inpainting", "hybrid_inpainting": "inpainting"}
 SAVED_BY_THE_ORIGINAL = {"global": "global condition", "local": "local condition", "inpainting": "inpainting"}
 
 
-def recorded(variant: str) -> dict[str, Array]:
-    """What the original gave."""
-    with np.load(Path(__file__).parent / "golden" / f"unet_{variant}.npz") as numbers:
-        return dict(numbers)
-
-
-def inputs(spec: PolicySpec, observation: dict[str, Array]) -> dict[str, torch.Tensor]:
-    """Observations as the module takes them."""
-    made = {}
-    for key, array in observation.items():
-        normalizer = spec.observations[key].normalizer
-        made[key] = torch.from_numpy(array if normalizer is None else normalizer.normalize(array))
-    return made
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", unets.VARIANTS)
 def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
     """Single evaluations, and the actions of a whole call, from the file that is saved."""
@@ -54,7 +40,7 @@ def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
     with smaller if variant == "images_shared" else nullcontext():
         module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
     assert (spec.source["variant"], spec.source["weights"]) == (GIVEN.get(variant, "global condition"), "ema_model")
-    numbers, observation = recorded(variant), inputs(spec, unets.observation(variant))
+    numbers, observation = golden(f"unet_{variant}"), as_seen(spec, unets.observation(variant))
     noise = Noise(*unets.noise(spec.sample))
     with torch.inference_mode():
         evaluate = evaluation(module, spec, observation)
@@ -63,12 +49,7 @@ def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
                 found = evaluate(torch.from_numpy(noise.initial), torch.full((unets.STREAMS,), int(timestep)))
             assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
     assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
-    actions = spec.chunk.unnormalized(eager_policy(module, spec)(observation, noise).numpy())
-    tolerance = PROMISED * np.ptp(numbers["action_pred"])
-    assert np.abs(actions - numbers["action_pred"]).max() < tolerance
-    executed = actions[:, spec.chunk.start : spec.chunk.stop]
-    assert executed.shape == numbers["action"].shape
-    assert np.abs(executed - numbers["action"]).max() < tolerance
+    assert_actions(spec, eager_policy(module, spec)(observation, noise), numbers)
 
 
 @pytest.mark.parametrize("name", SAVED_BY_THE_ORIGINAL)
@@ -79,12 +60,7 @@ def test_checkpoints_that_the_original_saved(name: str, shared: Path) -> None:
     assert spec.source["variant"] == SAVED_BY_THE_ORIGINAL[name]
     with np.load(base.with_suffix(".npz")) as numbers:
         noise = Noise(numbers["noise_initial"], numbers["noise_steps"])
-        sample = eager_policy(module, spec)(inputs(spec, {"obs": numbers["obs"]}), noise).numpy()
-        actions, tolerance = spec.chunk.unnormalized(sample), PROMISED * np.ptp(numbers["action_pred"])
-        assert np.abs(actions - numbers["action_pred"]).max() < tolerance
-        executed = actions[:, spec.chunk.start : spec.chunk.stop]
-        assert executed.shape == numbers["action"].shape
-        assert np.abs(executed - numbers["action"]).max() < tolerance
+        assert_actions(spec, eager_policy(module, spec)(as_seen(spec, {"obs": numbers["obs"]}), noise), numbers)
 
 
 # Settings
@@ -341,7 +317,7 @@ def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 def test_compiled_is_the_original(compiled: tuple[str, Program, Path]) -> None:
     """From raw observations to actions, through the artifact, in both runtimes; which agree on random plans, too."""
     variant, program, directory = compiled
-    numbers, observation = recorded(variant), unets.observation(variant)
+    numbers, observation = golden(f"unet_{variant}"), unets.observation(variant)
     for runtime in ("onnxruntime", "reference"):
         policy = ttscompile.load(directory, runtime=runtime)
         out = policy.predict_action(observation, noise=Noise(*unets.noise(program.spec.sample)), plan="dense")

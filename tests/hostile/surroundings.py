@@ -61,10 +61,10 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "inspect a zip": ("inspect", "A.zip", "--json"),
     "inspect --plot": ("inspect", "A", "--plot", "OUT/plan.png"),
     "verify": ("verify", "V", "--json"),
-    "bench": ("bench", "A", "--runs", "1"),
-    "realtime": ("realtime", "A", "--control-hz", "1", "--margin-ticks", "0", "--runs", "1"),
+    "bench": ("bench", "A", "--calls", "1"),
+    "bench --control-hz": ("bench", "A", "--control-hz", "1", "--margin-ticks", "0", "--calls", "1"),
     "inspect -o": ("inspect", "A", "-o", "OUT/page.html"),
-    "compare": ("compare", "A", "--trajectories", "calls.npz", "--strategies", "", "--plot", "OUT/frontier.svg"),
+    "bench -t": ("bench", "A", "-t", "calls.npz", "--calls", "2", "--plot", "OUT/frontier.svg"),
     "calibrate": ("calibrate", "OUT/B", "--trajectories", "calls.npz", "--max-minutes", "0.01"),
     "convert": ("convert", "policy.ckpt", "-o", "OUT/C", "--sampler", "ddim", "--steps", "2"),
 }

@@ -18,6 +18,7 @@ from ttscompile.artifact.files import exchange, new_folder, recover, replace_fol
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.slow
 def test_killed_at_every_operation() -> None:
     command = [sys.executable, "-m", "tests.hostile.kill_toys"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)

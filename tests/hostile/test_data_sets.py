@@ -196,6 +196,7 @@ def test_rows_of_several_lengths_that_would_reshape(tmp_path: Path) -> None:
         load_trajectories([replaced(as_lerobot(tmp_path), "state", column)], LOW, 3, SOURCES)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_here")
 def test_rows_are_counted_while_they_are_decoded(tmp_path: Path) -> None:
     """A table of rows that are all the same: a quarter of a gigabyte in less than a megabyte."""

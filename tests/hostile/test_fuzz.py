@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CASES = 250
 
 
+@pytest.mark.slow
 def test_nothing_but_errors_of_its_own(tmp_path: Path) -> None:
     make(tmp_path / "corpus")
     command = [sys.executable, "-m", "tests.hostile.fuzz", "--corpus", str(tmp_path / "corpus"), "--processes", "1"]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from tests.calibration import policies
@@ -37,6 +38,7 @@ def hashes(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_same_bytes(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.hostile.test_reproducible", str(tmp_path / "other")]
     environment = {**os.environ, "PYTHONHASHSEED": "4321"}

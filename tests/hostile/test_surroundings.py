@@ -27,6 +27,7 @@ TRIED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices and shells of Linux")
 @pytest.mark.parametrize("surrounding", TRIED)
 def test_a_command_ends_as_it_should(surrounding: str, top: Path) -> None:

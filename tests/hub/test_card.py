@@ -18,6 +18,7 @@ from ttscompile.errors import ReportError
 from ttscompile.report.card import card
 
 
+@pytest.mark.slow
 def test_a_card_says_what_the_policy_needs_and_nothing_of_your_machine(toy_artifact: Path) -> None:
     """Of real time only who measures can tell; of text only a policy that is told its task needs a tokenizer."""
     made = load_artifact(toy_artifact)
@@ -31,6 +32,7 @@ def test_a_card_says_what_the_policy_needs_and_nothing_of_your_machine(toy_artif
     assert "tokenizer" not in text and "give `load` its folder, `tokenizer=DIR`" in of_words
 
 
+@pytest.mark.slow
 def test_a_card_of_a_calibrated_artifact_has_its_figures(
     toy_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -55,7 +57,7 @@ def test_a_card_of_a_calibrated_artifact_has_its_figures(
         "variants": [{**variant, "episodes": [{}] * 8}, {**variant, "identity": "0" * 64, "episodes": []}],
     }
     (tmp_path / "success.json").write_text(json.dumps(document))
-    words = ["push", str(calibrated), "org/name", "--dry-run", "--runs", "1", "--evaluation"]
+    words = ["push", str(calibrated), "org/name", "--dry-run", "--evaluation"]
     result = CliRunner().invoke(main, [*words, str(tmp_path / "success.json")])
     assert result.exit_code == 0, result.output
     record = load_artifact(calibrated).manifest.calibration

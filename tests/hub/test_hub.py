@@ -175,6 +175,7 @@ def test_a_changed_artifact_is_refused_as_any_other(hub: Hub, toy_files: dict[st
         ttscompile.load("hf://org/name")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_converted_and_passes_its_licence_on(
     hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -196,7 +197,7 @@ def test_a_checkpoint_is_converted_and_passes_its_licence_on(
     assert hub.downloaded() == {*files, *clip, "README.md"}
     source = load_artifact(tmp_path / "compiled").manifest.spec.source
     assert (source["base"], source["base_licence"]) == (f"hf://org/base@{commit}", "apache-2.0")
-    pushed = CliRunner().invoke(main, ["push", str(tmp_path / "compiled"), "org/made", "--runs", "1"])
+    pushed = CliRunner().invoke(main, ["push", str(tmp_path / "compiled"), "org/made"])
     assert pushed.exit_code == 0, pushed.output
     card = hub.find("org/made", "main")[1]["README.md"].decode()
     for told in (
@@ -213,6 +214,7 @@ def test_a_checkpoint_is_converted_and_passes_its_licence_on(
     assert pushed.stdout == f"pushed hf://org/made@{hub.find('org/made', 'main')[0]}\n"
 
 
+@pytest.mark.slow
 def test_the_card_tells_what_was_left_out(tmp_path: Path) -> None:
     """Else the command on it makes another artifact."""
     shorter = {"task": "push", "without": "observation.images.side, observation.images.`top`"}
@@ -369,7 +371,7 @@ def test_the_environment_says_which_hub_and_the_cache_serves_when_it_is_gone(
     with serving() as hub:
         settings = {"HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1", "HF_TOKEN": "none"}
         env = {**os.environ, **settings}
-        pushed = run("-P", "-m", "ttscompile", "push", str(toy_artifact), "org/name", "--runs", "1")
+        pushed = run("-P", "-m", "ttscompile", "push", str(toy_artifact), "org/name")
         origin = pushed.removeprefix("pushed ")
         assert origin == f"hf://org/name@{hub.find('org/name', 'main')[0]}"
         assert run("-P", "-c", code, "hf://org/name") == origin

@@ -16,6 +16,7 @@ from tests.lower.modules import ALL, captured
 from tests.lower.sessions import run
 from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
+from tests.quick import first_quick
 from tests.rounding import bound
 from ttscompile.capture.export import capture
 from ttscompile.errors import CaptureError, LoweringError
@@ -88,14 +89,14 @@ def test_every_row_has_an_example_and_every_example_a_row() -> None:
     assert [name for name, row in OPERATIONS.items() if row.name != name] == []
 
 
-@pytest.mark.parametrize("names", [*CHUNKS, UNLOWERED], ids=lambda names: f"{names[0]} to {names[-1]}")
+@pytest.mark.parametrize("names", first_quick([*CHUNKS, UNLOWERED]), ids=lambda names: f"{names[0]} to {names[-1]}")
 def test_every_row_is_exercised_and_has_the_types_of_meta_tensors(names: list[str]) -> None:
     graph = _captured(tuple(names))[0]
     assert sorted(set(names) - {operation(node.op).name for node in graph.nodes}) == []
     assert_types(graph, names[0])
 
 
-@pytest.mark.parametrize("names", CHUNKS, ids=lambda names: f"{names[0]} to {names[-1]}")
+@pytest.mark.parametrize("names", first_quick(CHUNKS), ids=lambda names: f"{names[0]} to {names[-1]}")
 def test_a_row_with_an_onnx_form_computes_the_same_in_onnxruntime(names: list[str]) -> None:
     graph, weights, numbers = _captured(tuple(names))
     inputs = values(dict(graph.inputs), 3)
@@ -117,13 +118,13 @@ def _cancelled(obs: Tensor, normalised: Tensor) -> float:
     return bound(12) * float(lost.max() * normalised.abs().max())
 
 
-@pytest.mark.parametrize("name", UNLOWERED)
+@pytest.mark.parametrize("name", first_quick(UNLOWERED))
 def test_a_row_without_an_onnx_form_is_refused(name: str) -> None:
     with pytest.raises(LoweringError, match=r"piece 'examples' could not be exported .*Its operations are .*aten\."):
         lower_graph(_captured((name,))[0], "examples")
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", first_quick(ALL))
 def test_networks_have_the_types_of_meta_tensors(name: str) -> None:
     assert_types(captured(name)[1], name)
 

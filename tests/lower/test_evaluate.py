@@ -22,6 +22,7 @@ def one_node(op: str, *args: Argument, inputs: dict[str, TensorType] | None = No
     return Graph(inputs, {}, (Node("y", op, args, (), (TensorType((B, 2), "float32"),), "user.py:7"),), ("y",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_equals_the_module(name: str) -> None:
     module, graph, weights = captured(name)

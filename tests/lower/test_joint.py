@@ -21,6 +21,7 @@ def f32(*shape: int | Batch) -> TensorType:
     return TensorType(shape, "float32")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [1, 2, 3, 5, 8])
 def test_each_block_is_what_its_own_model_is(blocks: int) -> None:
     program = toy_program(blocks=blocks)

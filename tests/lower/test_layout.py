@@ -131,6 +131,7 @@ def moving_graphs(draw: st.DrawFn) -> tuple[Graph, dict[str, torch.Tensor]]:  # 
     return recorder.graph(*outputs), recorder.weights
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(moving_graphs())
 def test_any_sequence_of_moves_and_computations(case: tuple[Graph, dict[str, torch.Tensor]]) -> None:

@@ -37,6 +37,7 @@ def assert_parity(graph: Graph, weights: dict[str, torch.Tensor]) -> None:
             assert_equal_but_for_rounding(result, expected, counted.terms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_parity(name: str) -> None:
     _, graph, weights = captured(name)
@@ -74,6 +75,7 @@ def test_a_model_holds_operations_and_names_and_nothing_else() -> None:
     assert "Shape" not in {node.op_type for node in model.graph.node}  # shapes are known but for the batch
 
 
+@pytest.mark.slow
 def test_sequence_first_inputs_and_multiples_of_the_batch() -> None:
     build = Builder()
     x, heads = build.input("x", 5, B, 8), build.input("heads", Batch(4), 5, 2)
@@ -146,6 +148,7 @@ def program() -> Program:
     return Program(spec(table(out_to_x0=1.0, x0_to_next=1.0)), pieces.stem.graph, {}, (), pieces)
 
 
+@pytest.mark.slow
 def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
     exports: list[Any] = []
     original = torch.onnx.export
@@ -185,6 +188,7 @@ def test_structure_is_all_but_names() -> None:
     assert len(keys) == 3  # 1 == 1.0 == True, and yet they are different programs
 
 
+@pytest.mark.slow
 def test_what_cannot_be_lowered() -> None:
     type_, vector = TensorType((2, 2), "float32"), TensorType((2,), "float32")
     nodes = (

@@ -70,6 +70,7 @@ def graphs(draw: st.DrawFn) -> Graph:
     return Graph(first, rest, tuple(nodes), tuple(outputs))
 
 
+@pytest.mark.slow
 @given(graphs())
 def test_round_trip_is_exact(graph: Graph) -> None:
     result = through_text(graph)

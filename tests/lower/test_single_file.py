@@ -41,6 +41,7 @@ from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -82,6 +83,7 @@ def test_random_plans_of_all_sources(tmp_path: Path, options: dict[str, Any]) ->
         assert (reads > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "read"), [(0.0, 3), (0.1, 3), (0.0, 0)])
 def test_a_schedule_with_a_correction(tmp_path: Path, noise: float, read: int) -> None:
     program = toy_program(steps=7, noise=noise)
@@ -186,6 +188,7 @@ def test_every_block_has_a_branch_that_computes_and_one_that_reuses() -> None:
     assert found == [(f"block_{b:02d}", f"block_{b:02d}_reused") for b in range(8)]
 
 
+@pytest.mark.slow
 def test_blocks_of_another_precision(tmp_path: Path) -> None:
     program = toy_program(blocks=6)
     models = lower_program(program)
@@ -247,6 +250,7 @@ def test_two_gigabytes_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
         lower_single_file(program, lower_program(program), program.weights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_the_compiler_writes_it(name: str, compiled_module: Callable[[str], tuple[nn.Module, Path]]) -> None:
     """Of modules that nobody prepared."""
@@ -265,6 +269,7 @@ def test_the_compiler_writes_it(name: str, compiled_module: Callable[[str], tupl
         written |= plan == Source.COMPUTE
 
 
+@pytest.mark.slow
 def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ArtifactError, match="single file cannot be written"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from tests.runtimes.agreement import call_terms
 from tests.runtimes.pruners import calibrated, random_pruner
 from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.distilled import DistilledWeights
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.block_weights import BlockWeights
+from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import Source, uniform_plan
-from ttscompile.errors import ArtifactError, IllegalPlanError
+from ttscompile.core.plan import Plan
+from ttscompile.errors import IllegalPlanError
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes.single_file import inputs_of
@@ -138,19 +140,20 @@ def test_a_policy_without_a_pruner_has_no_such_input(tmp_path: Path) -> None:
     assert not [name for name in names if "pruner" in name]
     with pytest.raises(InvalidArgument, match="use_pruner"):
         Episode(model, 1).call(obs, noise, np.zeros((5, 5)), use_pruner=np.array(True))
-    with pytest.raises(ArtifactError, match=r"has no plan 'pruner'; it has \['dense'\]"):
+    with pytest.raises(IllegalPlanError, match=r"has no plan 'pruner'; it has \['dense'\]"):
         inputs_of(tmp_path / "artifact", "pruner")
 
 
 def test_a_plan_with_weights_of_its_own_is_refused(tmp_path: Path) -> None:
     program = toy_program()
     make(program, tmp_path)
-    own = DistilledWeights({"block.0.w": np.zeros((4, 4), np.float32)}, {})
-    schedules = {"evenly": uniform_plan(5, 5, 2), "distilled": uniform_plan(5, 5, 2)}
-    update_calibration(tmp_path / "artifact", None, schedules, "distilled", {}, distilled=own)
-    with pytest.raises(IllegalPlanError, match="plan 'distilled' has weights of its own"):
+    own = BlockWeights({"block.0.w": np.zeros((4, 4), np.float32)}, {})
+    evenly = Plan(cells=uniform_plan(5, 5, 2))
+    plans = {"evenly": evenly, "weights": replace(evenly, weights="weights")}
+    update_plans(tmp_path / "artifact", plans, "weights", weights={"weights": own})
+    with pytest.raises(IllegalPlanError, match="plan 'weights' has weights of its own"):
         inputs_of(tmp_path / "artifact")
-    np.testing.assert_array_equal(inputs_of(tmp_path / "artifact", "evenly")["plan"], schedules["evenly"][None])
+    np.testing.assert_array_equal(inputs_of(tmp_path / "artifact", "evenly")["plan"], uniform_plan(5, 5, 2)[None])
 
 
 def graphs(graph: GraphProto) -> Iterator[GraphProto]:

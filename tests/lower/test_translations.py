@@ -60,6 +60,7 @@ def test_group_norm_is_one_normalisation(inner: tuple[int, ...]) -> None:
     assert "InstanceNormalization" in names and not names & {"ReduceMean", "GroupNormalization"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("positions", [3, 8, 31])
 def test_a_convolution_over_few_positions_is_a_product(positions: int) -> None:
     calls = []
@@ -70,6 +71,7 @@ def test_a_convolution_over_few_positions_is_a_product(positions: int) -> None:
     assert "Conv" not in names and names & {"MatMul", "Gemm"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("positions", "groups"), [(33, 1), (64, 1), (4, 2)])
 def test_one_over_many_positions_or_in_groups_stays(positions: int, groups: int) -> None:
     shapes = {"w": (10, CHANNELS // groups, 3), "b": (10,)}

@@ -4,8 +4,8 @@
 
 Needs the compiler. ``robot.py`` reads the folder on a machine that has the runtime alone. Two policies are Push-T's
 transformer (matrix products, attention, GELU) and its U-Net (convolutions, group norms), each with blocks of eight bits
-and, in the same artifact, of fp32; observations and noise are drawn. Actions are of whole episodes of three calls, so
-that the residuals of the call before are read.
+and of fp32, and with its own loop and one of few steps, in one artifact; observations and noise are drawn. Actions are
+of whole episodes of three calls, so that the residuals of the call before are read.
 """
 
 import sys
@@ -18,7 +18,9 @@ import numpy.typing as npt
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.core.spec import PRECISIONS
+from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.random_calls import random_calls
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,18 +66,24 @@ def calibrate(artifact: Path, recording: Path) -> None:
 
 
 def answers(artifact: Path, precisions: Sequence[str] = PRECISIONS) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """Of each call its observation and noise, ``CALL/obs/KEY``, and its actions, ``CALL/action/PRECISION/PLAN``."""
-    calls = random_calls(load_artifact(artifact).manifest.spec, CALLS, seed=1)
-    for number, (obs, noise) in enumerate(calls):
+    """Of each call its observation and noise, and its actions.
+
+    They are ``CALL/obs/KEY``, ``CALL/noise`` and, where the loop of a plan draws any, ``CALL/steps/PLAN``; and
+    ``CALL/action/PRECISION/PLAN``.
+    """
+    opened = load_artifact(artifact)
+    for number, (obs, noise) in enumerate(random_calls(opened.manifest.spec, CALLS, seed=1)):
         yield from ((f"{number}/obs/{key}", value) for key, value in obs.items())
         yield f"{number}/noise", noise.initial
-    for precision in precisions:
-        policy = ttscompile.load(artifact, precision=precision)
-        for plan in policy.info.plans:
-            policy.reset()
+    for name, plan in opened.plans.items():
+        calls = random_calls(view_of(opened, plan).manifest.spec, CALLS, seed=1)  # which begin alike in all loops
+        for number, (_, noise) in enumerate(calls):
+            if noise.steps is not None:
+                yield f"{number}/steps/{name}", noise.steps
+        for precision in precisions:
+            policy = open_policy(opened, plan=f"{name}@{precision}")
             for number, (obs, noise) in enumerate(calls):
-                action = policy.predict_action(obs, noise=noise, plan=plan)["action"]
-                yield f"{number}/action/{precision}/{plan}", action
+                yield f"{number}/action/{precision}/{name}", policy.predict_action(obs, noise=noise)["action"]
 
 
 if __name__ == "__main__":

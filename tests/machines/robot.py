@@ -101,25 +101,27 @@ def compare(name: str, artifact: Path, actions: Path) -> Iterator[Check]:
         expected, exact = (
             np.stack([given[f"{call}/action/{each}/{plan}"] for call in calls]) for each in (precision, "fp32")
         )
-        found = act(artifact, precision, plan, [of_call(given, call) for call in calls])
+        found = act(artifact, precision, plan, [of_call(given, call, plan) for call in calls])
         allowed = TOLERANCE if precision == "fp32" else GROWTH * apart(expected, exact) + TOLERANCE
         yield judged(f"actions {name} {precision} {plan}", found, exact, allowed, apart(found, expected))
 
 
-def of_call(given: Mapping[str, Array], call: str) -> tuple[dict[str, Array], Array]:
-    """Observation and initial noise of a call."""
+def of_call(given: Mapping[str, Array], call: str, plan: str) -> tuple[dict[str, Array], tuple[Array, Array | None]]:
+    """Observation and noise of a call; that of its steps is of the loop of the plan."""
     prefix = f"{call}/obs/"
     obs = {key.removeprefix(prefix): value for key, value in given.items() if key.startswith(prefix)}
-    return obs, given[f"{call}/noise"]
+    return obs, (given[f"{call}/noise"], given.get(f"{call}/steps/{plan}"))
 
 
-def act(artifact: Path, precision: str, plan: str, calls: Sequence[tuple[dict[str, Array], Array]]) -> Array:
+def act(
+    artifact: Path, precision: str, plan: str, calls: Sequence[tuple[dict[str, Array], tuple[Array, Array | None]]]
+) -> Array:
     """Executed actions ``[calls, B, Ta, Da]`` of an episode."""
     import ttscompile
 
-    policy = ttscompile.load(artifact, precision=precision)
+    policy = ttscompile.load(artifact, plan=f"{plan}@{precision}")
     policy.reset()
-    made = [policy.predict_action(obs, noise=ttscompile.Noise(noise, None), plan=plan) for obs, noise in calls]
+    made = [policy.predict_action(obs, noise=ttscompile.Noise(*noise)) for obs, noise in calls]
     return np.stack([each["action"] for each in made])
 
 

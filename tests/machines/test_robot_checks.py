@@ -34,10 +34,21 @@ def found(folder: Path) -> list[robot.Check]:
     return list(robot.compare("toy", folder / "artifact", folder / "actions.npz"))
 
 
+@pytest.mark.slow
 def test_the_machine_that_compiled_agrees_with_itself(folder: Path) -> None:
     checks = found(folder)
     assert [check.what for check in checks] == [f"actions toy fp32 {plan}" for plan in PLANS]
     assert all(check.passed for check in checks)
+
+
+def test_what_a_loop_draws_in_its_steps_goes_along(tmp_path: Path) -> None:
+    artifact = written_artifact(toy_program(pruner=False), tmp_path / "artifact").path
+    answers: dict[str, Any] = dict(made.answers(artifact, ("fp32",)))
+    assert answers["1/steps/dense"].shape == (5, *answers["1/noise"].shape)
+    np.savez(tmp_path / "actions.npz", **answers)
+    assert [check.passed for check in found(tmp_path)] == [True]
+    np.savez(tmp_path / "actions.npz", **{**answers, "1/steps/dense": answers["0/steps/dense"]})
+    assert [check.passed for check in found(tmp_path)] == [False]
 
 
 @pytest.mark.parametrize(("off", "passed"), [(0.5e-5, True), (2e-5, False)])

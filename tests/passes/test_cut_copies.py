@@ -14,6 +14,7 @@ from ttscompile.ir.program import Captured
 from ttscompile.passes.cut_copies import CutCopies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("halve", HALVES)
 def test_copies_are_cut_by_their_number(halve: str) -> None:
     module = Doubled(lambda x: torch.cat([x, x]), HALVES[halve]).eval()

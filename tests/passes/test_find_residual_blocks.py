@@ -235,6 +235,7 @@ class _Decoder(nn.Module):
         return self.o(h)
 
 
+@pytest.mark.slow
 def test_a_captured_decoder_has_three_blocks_a_layer() -> None:
     from ttscompile.capture.export import capture
 

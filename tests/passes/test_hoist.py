@@ -1,5 +1,7 @@
 """What is left in the loop, and when the rest is computed."""
 
+import pytest
+
 from tests.passes.graphs import B
 from tests.passes.modules import SHAPE, compiled, graph_inputs, hoisted
 from ttscompile import ObservationSpec
@@ -27,12 +29,14 @@ def test_time_token_becomes_a_table_and_observation_tokens_are_encoded_once() ->
     assert loop == 2 * layer + 2 * (2 * 4 * 2 * width)
 
 
+@pytest.mark.slow
 def test_a_mixing_condition_encoder_runs_all_steps_in_one_batch() -> None:
     _, program = compiled("condition encoder mixes tokens")
     assert program.pieces.step is not None
     assert Binding.STEP in program.pieces.bindings.values()
 
 
+@pytest.mark.slow
 def test_modulations_leave_the_loop() -> None:
     _, program = compiled("adaLN")
     pieces = program.pieces

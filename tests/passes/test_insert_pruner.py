@@ -30,6 +30,7 @@ def test_pruner_reads_the_encoded_observation_and_forces_step_zero() -> None:
     assert (logits[:, 0, :, 1:] < -1e8).all() and (logits.argmax(-1) == 0).all()
 
 
+@pytest.mark.slow
 def test_pruner_shrinks_until_it_costs_one_percent_and_says_when_it_cannot() -> None:
     large = transform(TokenDecoder(width=64).eval(), spec())
     assert large.pieces.pruner is not None

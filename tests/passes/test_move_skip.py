@@ -52,6 +52,7 @@ def told_by(module: nn.Module) -> tuple[ttscompile.Program, dict[str, tuple[str,
     return transform(module.eval(), spec(DDIMScheduler), explain=told.__setitem__), told
 
 
+@pytest.mark.slow
 def test_the_blocks_are_those_of_the_network_inside() -> None:
     program, told = told_by(Skipping())
     inside, told_inside = told_by(Skipping().net)
@@ -68,6 +69,7 @@ def test_a_stream_that_is_the_sample_stays_as_it_is() -> None:
     assert len(program.blocks) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheduler", "settings"),
     [

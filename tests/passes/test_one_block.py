@@ -67,6 +67,7 @@ def test_a_prediction_of_another_shape_is_refused() -> None:
         OneBlock("")(captured(plain(B, 4, 6)))
 
 
+@pytest.mark.slow
 def test_a_unet_is_one_block_and_its_films_are_tables() -> None:
     _, program, told = explained("U-Net")
     assert "hold" in told["OneBlock"][0] and "1 block: network" in told["find_residual_blocks"][0]

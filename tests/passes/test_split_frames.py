@@ -28,6 +28,7 @@ def convolutions(program: Program) -> int:
     return sum(node.op.startswith("aten.conv") for node in program.pieces.condition.nodes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "told", "rows"),
     [("each", False, (2, 2)), ("shared", False, (4,)), ("stacked", False, (4,)), ("each", True, (1, 2, 2))],
@@ -52,6 +53,7 @@ def test_every_tower_is_a_piece_that_knows_nothing_of_the_window(kind: str, told
     torch.testing.assert_close(context, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mixed", "channels"])
 def test_what_needs_the_whole_window_stays(kind: str) -> None:
     program = compiled(kind)
@@ -60,6 +62,7 @@ def test_what_needs_the_whole_window_stays(kind: str) -> None:
     assert convolutions(program) > 0
 
 
+@pytest.mark.slow
 def test_what_costs_less_than_looking_stays() -> None:
     program = compiled("each")
     with pytest.MonkeyPatch.context() as patch:

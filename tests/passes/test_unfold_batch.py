@@ -14,6 +14,7 @@ from ttscompile.ir.graph import Batch
 from ttscompile.ir.rows import unfold
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("double", "shape"),
     [

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -153,6 +154,23 @@ def test_it_is_saved_as_it_is_and_not_trained(saved: tuple[str, Path, Path], tmp
     (tmp_path / "copy" / "config.json").write_text(json.dumps(config))
     with pytest.raises(ValueError, match=r"observes \[.*'observation.more'.*convert the checkpoint again"):
         opened(tmp_path / "copy")
+
+
+def test_an_older_configuration_has_its_precision_in_the_name_of_the_plan(
+    saved: tuple[str, Path, Path], tmp_path: Path
+) -> None:
+    _, _, compiled = saved
+    copy = Path(shutil.copytree(compiled, tmp_path / "copy"))
+    config = json.loads((copy / "config.json").read_text())
+    for plan, found in ((None, "dense@fp32"), ("dense@fp32", "dense@fp32@fp32")):
+        (copy / "config.json").write_text(json.dumps({**config, "plan": plan, "precision": "fp32"}))
+        if plan is None:
+            policy, _, _ = opened(copy)
+            assert (policy.config.plan, policy.config.precision) == (found, None)
+            assert policy._policy.info.default_plan == found
+        else:
+            with pytest.raises(ttscompile.errors.IllegalPlanError, match=f"no plan {found!r}"):
+                opened(copy)
 
 
 def test_of_a_repository_an_artifact_s_files_are_downloaded(

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from tests.plans import store_schedules
 from tests.runtimes.plans import random_correction
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import update_calibration
+from ttscompile.artifact.view import view_of
 from ttscompile.cli import main
 from ttscompile.core.lattice import dense_plan, uniform_plan
+from ttscompile.core.plan import Plan
 from ttscompile.ir.plan_head import first_numbers
 from ttscompile.report.usage import BRANCH, CONTEXTS, HEAD, TABLE, told_unused, unused, usage_table, uses
 from ttscompile.runtimes.liveness import sources_of_pruner
@@ -55,7 +58,7 @@ def test_what_schedules_use(own: Artifact) -> None:
     single[3, 1], single[4, 2] = 1, 3
     schedules = {"evenly": uniform_plan(5, 5, 2), "single": single}
     corrections = {"evenly": random_correction(own, np.random.default_rng(0))}
-    update_calibration(own.path, None, schedules, "evenly", {}, corrections=corrections)
+    store_schedules(own.path, None, schedules, "evenly", {}, corrections=corrections)
     artifact = load_artifact(own.path)
     found = plans_of(artifact)
     assert found[BRANCH, "COMPUTE", 0] == ("dense", "evenly", "single")
@@ -77,7 +80,7 @@ def test_what_schedules_use(own: Artifact) -> None:
 
 def test_a_pruner_uses_what_it_can_choose(own: Artifact) -> None:
     """Of the toy's, which nobody knows, everything but reuse in step 0."""
-    update_calibration(own.path, dict(own.pruner), {}, "pruner", {})
+    store_schedules(own.path, dict(own.pruner), {}, "pruner", {})
     artifact = load_artifact(own.path)
     assert {use.plans for use in uses(artifact) if use.kind == HEAD} == {("pruner",)}
     assert all("pruner" in use.plans for use in uses(artifact) if use.kind == BRANCH)
@@ -87,7 +90,7 @@ def test_a_pruner_uses_what_it_can_choose(own: Artifact) -> None:
 def test_the_sources_that_a_head_of_ours_can_choose(own: Artifact) -> None:
     """As it is put in it is dense; one number more, and one cell can be FORWARD; and at -1 nothing else changes."""
     head = first_numbers(4, 8, 2, 5, 5)
-    made = Artifact(**{**vars(own), "pruner": head})  # only its numbers are read
+    made = view_of(replace(own, pruner=head), Plan(cells=None))  # only its numbers are read
     assert sources_of_pruner(made)[..., 0].all()
     assert not sources_of_pruner(made)[..., 1:].any()
     head["pruner.base"][2, 3, 1] = 4.0

@@ -71,6 +71,7 @@ def test_the_budget_goes_to_all_blocks_alike_and_then_to_those_that_gain_most() 
     assert spend([first, second], {0: [1]}, 7) == [3, 3]  # {0, 2, 4, 5} and {0, 2, 5}
 
 
+@pytest.mark.slow
 def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
     task = make_task(20)
     calls = task.executor.select(task.calls, [0, 1])

@@ -57,6 +57,7 @@ def every_direction(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear, "DIRECTIONS", 8)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("every_direction")
 def test_any_single_change_of_a_linear_policy_is_predicted_exactly(linear_policy: Path, recording: Path) -> None:
     task, plan = tasks.make_task(linear_policy, recording, calls=5), sparse_plan()
@@ -83,6 +84,7 @@ def test_moving_a_computation_is_predicted_exactly_as_far_as_its_own_block(
     assert_equal_but_for_rounding(predicted, expected, terms_of_actions(task, plan))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("every_direction")
 def test_cells_of_a_nonlinear_policy_are_ranked(make_task: MakeTask) -> None:
     task, plan = make_task(calls=12), sparse_plan(2)

@@ -65,6 +65,7 @@ def test_the_decided_plans_do_what_the_call_did(make_task: MakeTask, rule: Crite
     np.testing.assert_array_equal(decided.cells, (decided.plans == Source.COMPUTE).sum((1, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_the_reference_decides_the_same(make_task: MakeTask, rule: Criterion) -> None:
     task = make_task(30)
@@ -89,6 +90,7 @@ def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criteri
         np.testing.assert_array_equal(alone.plans[0], together.plans[i])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["teacache", "dbcache"])
 @pytest.mark.parametrize("budget", [20, 40])
 def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: int) -> None:

@@ -18,6 +18,7 @@ def found(compiled: Path, recording: Path) -> Oracle:
     return oracle(compiled, [recording], 3, schedules=4, calls=12, draws=2)
 
 
+@pytest.mark.slow
 def test_three_parts_of_the_episodes_share_none(found: Oracle) -> None:
     parts = [set(numbers) for numbers in found.episodes.values()]
     assert all(parts) and sum(map(len, parts)) == len(set.union(*parts))
@@ -36,6 +37,7 @@ def test_the_rows(found: Oracle) -> None:
     assert rows[average[0]].steps <= 3 and rows[average[0]].error <= rows[AFTER].error
 
 
+@pytest.mark.slow
 def test_the_same_arguments_give_the_same_figures(found: Oracle, compiled: Path, recording: Path) -> None:
     assert oracle(compiled, [recording], 3, schedules=4, calls=12, draws=2) == found
 

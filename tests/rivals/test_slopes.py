@@ -34,6 +34,7 @@ def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
     return np.asarray(slope.sum(0).numpy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reuse", [Source.FORWARD, Source.TIMESTEP])
 @pytest.mark.parametrize("computed", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("size", [1, 2**28])

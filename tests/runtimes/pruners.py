@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.plans import store_schedules
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.ir.program import Program
 
@@ -28,5 +28,5 @@ def calibrated(folder: Path, program: Program, corrected: bool = True) -> Path:
     artifact, shape = load_artifact(folder), (program.spec.sampler.steps, len(program.blocks))
     corrections = {"pruner": random_correction(artifact, np.random.default_rng(1))} if corrected else {}
     schedules = {"evenly": uniform_plan(*shape, 2)}
-    update_calibration(folder, random_pruner(program, 2), schedules, "pruner", {}, corrections=corrections)
+    store_schedules(folder, random_pruner(program, 2), schedules, "pruner", {}, corrections=corrections)
     return folder

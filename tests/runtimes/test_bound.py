@@ -98,6 +98,7 @@ def normalized(artifact: Artifact, predicted: np.ndarray) -> np.ndarray:
     return chunk.normalizer.normalize(predicted)
 
 
+@pytest.mark.slow
 def test_every_way_to_make_a_call_bounds_it_alike(corrected: Corrected) -> None:
     artifact, correction, plan, file = corrected
     obs, noise = random_inputs(artifact, np.random.default_rng(1), STREAMS)

@@ -50,6 +50,7 @@ def call(runtime: Runtime, artifact: Artifact, seed: int, plan: np.ndarray | Non
     return runtime.predict(*random_inputs(artifact, np.random.default_rng(seed), 2), Plan(cells=plan))[0]
 
 
+@pytest.mark.slow
 def test_the_pruners_thread_is_made_at_load_and_lives_as_long_as_the_runtime(pruned: Artifact) -> None:
     before = len(helpers())
     runtime = open_runtime(pruned)
@@ -204,6 +205,7 @@ def test_two_runtimes_work_at_the_same_time(pruned: Artifact) -> None:
     assert all(np.array_equal(a, b) for x, y in zip(alone, together, strict=True) for a, b in zip(x, y, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole_steps", [True, False])
 def test_a_first_call_with_a_schedule_binds_nothing(
     make_artifact: MakeArtifact, monkeypatch: pytest.MonkeyPatch, whole_steps: bool

@@ -65,6 +65,7 @@ def done(policy: CompiledPolicy) -> tuple[int, int]:
     return policy.last_report.frames.computed, policy.last_report.frames.remembered
 
 
+@pytest.mark.slow
 def test_only_new_frames_are_computed(policy: CompiledPolicy) -> None:
     act(policy, window(frame(0), frame(1)))
     assert done(policy) == (5, 0)  # two frames of two cameras, and the instruction
@@ -259,6 +260,7 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
     assert sum(rung.status == "passed" for rung in found.rungs) >= 6
 
 
+@pytest.mark.slow
 def test_towers_in_eight_bits(compiled: Path, tmp_path: Path) -> None:
     """A tower has a precision of its own; a remembered frame has the bits that it would have again."""
     ttscompile.compile_denoiser(*cameras.policy("shared", told=True), tmp_path / "int8", precision="int8")

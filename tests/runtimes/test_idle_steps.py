@@ -42,6 +42,7 @@ def random_plans(rng: np.random.Generator, artifact: Artifact, streams: int, wri
     return legalize(plans, manifest.groups, written)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streams", [1, 3])
 @pytest.mark.parametrize(
     ("memories", "clip", "sequence_first", "steps"),
@@ -99,6 +100,7 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
     assert (runs, len(prepared)) == ([(1, 4), (8, 12)], 2)
 
 
+@pytest.mark.slow
 def test_a_network_of_another_form_has_no_such_steps(make_artifact: MakeArtifact) -> None:
     """Its prediction is not affine in the stream."""
     program = toy_program()

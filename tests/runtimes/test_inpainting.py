@@ -132,6 +132,7 @@ def test_a_table_without_noise_levels_is_seen(made: Callable[[], SamplerTable]) 
     assert noise_levels(made()) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streams", [1, 3])
 @pytest.mark.parametrize("name", ["ddpm", "ddim"])
 def test_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, streams: int) -> None:
@@ -176,6 +177,7 @@ def test_between_steps_the_committed_actions_have_the_noise_of_the_step(artifact
     assert_equal_but_for_rounding(known.values[0], first, terms=4)
 
 
+@pytest.mark.slow
 def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArtifact) -> None:
     """The definition with a scheduler of diffusers, written out; only the first of two channels is action.
 

@@ -63,6 +63,7 @@ def masked(array: np.ndarray, under: float = np.nan) -> np.ma.MaskedArray:
     return np.ma.masked_array(data, mask=mask)
 
 
+@pytest.mark.slow
 def test_masked_arrays_come_through_nowhere(policy: CompiledPolicy) -> None:
     noise, obs = some_noise(), {"obs": OBS}
     for under in (np.nan, 651.0):
@@ -240,7 +241,7 @@ def test_numbers_that_no_training_has_seen_are_refused(policy: CompiledPolicy, n
             actions(policy, noise=noise)
         values.flat[0] = kept
     with pytest.raises(ObservationError, match=r"prefix must be between .* when normalised"):
-        check_prefix(np.full((1, 1, 2), min(10 * number, 3.4e38), np.float32), 1, policy._manifest.spec, None)
+        check_prefix(np.full((1, 1, 2), min(10 * number, 3.4e38), np.float32), 1, policy._spec, None)
 
 
 def test_the_limit_is_the_limit_in_every_entry(policy: CompiledPolicy) -> None:
@@ -335,6 +336,7 @@ def test_actions_that_overflow_are_an_error_and_end_the_episode(make_artifact: M
     assert call(0, [0, 0]).item() == 0
 
 
+@pytest.mark.slow
 def test_four_thousand_streams_are_each_what_they_are_alone(policy: CompiledPolicy, normed: Artifact) -> None:
     rng, count, rollout = np.random.default_rng(0), 4096, PLAN.copy()
     rollout[3] = Source.ROLLOUT

@@ -14,6 +14,7 @@ from torch.nn import functional
 import ttscompile
 from tests.lower.whole_call import Episode, inputs
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.lower.integer_attention import FEWEST, HEADS
@@ -61,11 +62,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_blocks_and_dense_steps_have_it(compiled: Path) -> None:
-    artifact = load_artifact(compiled)
+    artifact = view_of(load_artifact(compiled), "full")
     counts = {
         name: sum(
-            node.op_type == HEADS for node in onnx.load(artifact.onnx_path(name), load_external_data=False).graph.node
+            node.op_type == HEADS
+            for node in onnx.load(compiled / artifact.onnx_file(name), load_external_data=False).graph.node
         )
         for name in ("block_00", "block_01", "dense_step", "stem")
     }
@@ -74,7 +77,7 @@ def test_blocks_and_dense_steps_have_it(compiled: Path) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_call_is_near_to_float32_and_the_single_file_computes_it(compiled: Path, threads: int) -> None:
-    policies = [ttscompile.load(compiled, precision=name, threads=threads) for name in ("int8", "fp32")]
+    policies = [ttscompile.load(compiled, plan=name, threads=threads) for name in ("full", "full@fp32")]
     obs, noise = inputs(policies[0], np.random.default_rng(0), 2)
     sparse = uniform_plan(STEPS, BLOCKS, 2)
     for plan in (np.zeros((STEPS, BLOCKS), np.int8), sparse):

@@ -39,6 +39,7 @@ def episode(artifact: Artifact, name: str, inputs: list[tuple[dict[str, np.ndarr
     return [runtime.predict(obs, noise, Plan(repair=True))[0] for obs, noise in inputs]  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNTIMES)
 @pytest.mark.parametrize("seed", range(2))
 def test_any_sequence_of_calls_resets_failures_and_refusals(

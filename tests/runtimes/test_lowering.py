@@ -122,6 +122,7 @@ class FakeWorkspace:
         np.moveaxis(self.fresh, self.axis, 0)[:] = 0.5 * self.sample[then]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -100,6 +100,7 @@ def test_the_reference_is_the_formula(name: str) -> None:
         assert_equal_but_for_rounding(result.sample[0], expected, amplified(counted.terms, program.spec.sampler))
 
 
+@pytest.mark.slow
 def test_both_runtimes_agree(made: Made) -> None:
     artifact = made[1]
     runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
@@ -129,6 +130,7 @@ def test_both_runtimes_agree_under_corrections_and_forget_between_calls(made: Ma
         assert np.abs(plain - samples[0]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_the_single_file_agrees(made: Made) -> None:
     program, artifact, policy, model = made
     rng = np.random.default_rng(1)
@@ -173,6 +175,7 @@ def test_noise_of_a_deterministic_sampler_is_not_read(made: Made) -> None:
     assert np.array_equal(one, other) != artifact.manifest.spec.sampler.stochastic
 
 
+@pytest.mark.slow
 def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> None:
     """Batches of plans and calls, and corrections fitted step by step: the memories go along with the samples."""
     artifact, rng = made[1], np.random.default_rng(4)

@@ -75,6 +75,7 @@ def test_a_schedule_is_lowered_once_at_load_and_never_in_a_call(
     assert len(lowered) == len(set(lowered)) >= 2
 
 
+@pytest.mark.slow
 def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> None:
     program = pencil_program()
     pieces = program.pieces
@@ -94,6 +95,7 @@ def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> N
         assert sample.ravel().tolist() == [35 + 3 + 7, 33 + 1 + 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "variant", [{}, {"sequence_first": True}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}]
 )

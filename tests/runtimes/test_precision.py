@@ -44,6 +44,7 @@ def test_it_is_the_reference_within_the_tolerance_of_eight_bits_on_random_plans(
         assert 1e-5 < found < CARRIED * EIGHT_BITS, "not in eight bits, or further off than verify allows"
 
 
+@pytest.mark.slow
 def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -> None:
     with_both, plain = load_artifact(int8), load_artifact(fp32)
     obs, noise = random_inputs(plain, np.random.default_rng(0), 2)

@@ -16,6 +16,7 @@ from tests.lower.whole_call import Episode, inputs
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.view import view_of
 from ttscompile.driver import transform
 from ttscompile.errors import LoweringError
 from ttscompile.ir.flops import graph_flops
@@ -53,10 +54,11 @@ def compiled(path: Path, loud: float = 0.0, **options: object) -> tuple[Manifest
 
 
 def operations(path: Path, piece: str) -> set[str]:
-    artifact = load_artifact(path)
-    return {node.op_type for node in onnx.load(artifact.onnx_path(piece), load_external_data=False).graph.node}
+    model = onnx.load(path / view_of(load_artifact(path)).onnx_file(piece), load_external_data=False)
+    return {node.op_type for node in model.graph.node}
 
 
+@pytest.mark.slow
 def test_the_encoder_has_integer_products_and_convolutions_beside_the_blocks(int8: Path) -> None:
     found = operations(int8, "condition")
     assert {"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "Conv"} <= found, "a convolution of three channels stays"
@@ -145,6 +147,7 @@ def test_a_prologue_that_is_small_beside_a_step_stays_as_it_is(program: Program)
     assert notes == ("condition stays fp32: 0.0% of the arithmetic of a step",)
 
 
+@pytest.mark.slow
 def test_a_frame_piece_counts_with_all_of_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     pieces = (seen := transform(*cameras.policy("stacked"))).pieces
     assert pieces.rows == (4,)

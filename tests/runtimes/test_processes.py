@@ -60,6 +60,7 @@ def program(code: str, *arguments: object, **environment: str) -> subprocess.Com
     )
 
 
+@pytest.mark.slow
 @forks
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_forked_child_is_told_to_load_the_policy_itself_and_can(pruned: Path, threads: int) -> None:
@@ -208,6 +209,7 @@ def test_a_call_at_the_end_is_made_by_handlers_that_were_registered_after_the_po
     assert before.startswith("before: the program is ending, and the policy makes no more calls. Register")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted in /proc")
 @pytest.mark.parametrize(
     "environment",

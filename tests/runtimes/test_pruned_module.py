@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 import ttscompile
+from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.write import update_calibration
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.ir.program import Program
@@ -264,6 +264,6 @@ def test_it_is_the_module_of_a_default_plan_that_the_pruner_makes(tmp_path: Path
     schedules = {"evenly": uniform_plan(5, 5, 2)}
     with pytest.raises(IllegalPlanError, match=r"no plan of it is made by a pruner; it has \['dense'\]"):
         ttscompile.to_module(tmp_path / "artifact", "pruner")
-    update_calibration(tmp_path / "artifact", random_pruner(program, 0), schedules, "made", {})
+    store_schedules(tmp_path / "artifact", random_pruner(program, 0), schedules, "made", {})
     assert isinstance(ttscompile.to_module(tmp_path / "artifact"), PrunedCall)
     assert not isinstance(ttscompile.to_module(tmp_path / "artifact", "evenly"), PrunedCall)

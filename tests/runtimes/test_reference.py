@@ -64,6 +64,7 @@ def inputs(rng: np.random.Generator, streams: int, program: Program = TOY) -> tu
     return {"obs": torch.from_numpy(rng.standard_normal((streams, 2)).astype(np.float32))}, Noise(initial, steps)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), streams=st.integers(1, 3), computed=st.floats(0, 0.6))
 def test_every_stream_does_what_section_2_says(seed: int, streams: int, computed: float) -> None:

@@ -234,6 +234,7 @@ def test_without_proc_exchanged_there_and_back_is_seen(
             ttscompile.load(places[0], runtime)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", CHANGES)
 def test_loads_while_another_process_changes_the_artifact(way: str, tmp_path: Path) -> None:
     """A short version of ``replaced.py``."""
@@ -254,6 +255,7 @@ def test_loads_while_commands_change_the_artifact(tmp_path: Path) -> None:
     assert made["mixed"] == 0, made
 
 
+@pytest.mark.slow
 def test_a_policy_that_is_let_go_leaves_no_descriptor(places: tuple[Path, Path]) -> None:
     """A short version of ``unloaded.py``, where 5,000 loads leave as much as 500."""
     ttscompile.load(places[0])

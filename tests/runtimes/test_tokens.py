@@ -94,6 +94,7 @@ def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) ->
     return tower
 
 
+@pytest.mark.slow
 def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> None:
     literal = LiteralTokens(artifact.graph("frame_00"), artifact.weights)
     tower, rng, image = tower_of(artifact, refresh=6), np.random.default_rng(0), picture(0)

@@ -61,6 +61,7 @@ def replaying(lines: list[Line]) -> Callable[[Line], Line]:
     return capture
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
 def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, int]) -> None:
     """Batches of one to four streams, each with a plan of its own or all with the same."""
@@ -119,6 +120,7 @@ def both(artifact: Artifact, lines: list[Line]) -> list[Runtime]:
     return [Runtime(artifact, TorchBackends(capture=replaying(lines))), open_runtime(artifact, "reference")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["evenly", "mixed", DENSE])
 @pytest.mark.parametrize("streams", [1, 3])
 def test_a_call_is_captured_once_and_replayed_on_other_inputs(calibrated: Artifact, name: str, streams: int) -> None:
@@ -163,6 +165,7 @@ def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_runs_as
     assert len(lines) == 1 + len(seen)
 
 
+@pytest.mark.slow
 def test_another_batch_size_is_captured_anew(calibrated: Artifact) -> None:
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(1)
@@ -359,6 +362,7 @@ def test_nothing_of_an_artifact_gets_into_the_source_of_a_function() -> None:
     assert torch.equal(write_function(graph, {}, [x], 1, None)(x)[0], x.tanh())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [{}, {"normed": True, "sequence_first": True}], ids=str)
 def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, variant: dict[str, bool]) -> None:
     """On torch's device of tensors without numbers, which most operations refuse to mix with the CPU's."""

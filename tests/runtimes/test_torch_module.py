@@ -15,7 +15,7 @@ from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.core.lattice import uniform_plan
-from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, RuntimeUnavailableError
+from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError
 
 from .agreement import call_terms
 from .conftest import MakeArtifact
@@ -84,6 +84,7 @@ def test_the_default_plan_is_the_artifacts(artifact: Artifact) -> None:
     assert torch.equal(found, named)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [{"sequence_first": True}, {"noise": 0.0}, {"blocks": 1}], ids=str)
 def test_other_forms_of_networks(make_artifact: MakeArtifact, variant: dict[str, bool]) -> None:
     made = make_artifact(toy_program(**variant))
@@ -92,6 +93,7 @@ def test_other_forms_of_networks(make_artifact: MakeArtifact, variant: dict[str,
     assert_equal_but_for_rounding(found, expected(made, given, "dense"), terms(made))
 
 
+@pytest.mark.slow
 def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Artifact) -> None:
     module = ttscompile.to_module(artifact.path, "mixed")
     with torch.no_grad():
@@ -101,6 +103,7 @@ def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Art
     assert_equal_but_for_rounding(found.detach(), expected(artifact, other, "mixed"), terms(artifact))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(artifact: Artifact, tmp_path: Path) -> None:
     if shutil.which("g++") is None:
@@ -129,7 +132,7 @@ def test_a_schedule_that_a_module_cannot_have_is_refused(artifact: Artifact) -> 
 
 
 def test_an_unknown_plan_is_refused(artifact: Artifact) -> None:
-    with pytest.raises(ArtifactError, match="no schedule 'best'"):
+    with pytest.raises(IllegalPlanError, match="no plan 'best'"):
         ttscompile.to_module(artifact.path, "best")
 
 

@@ -8,6 +8,8 @@ import time
 import tracemalloc
 from pathlib import Path
 
+import pytest
+
 from .served import SETTINGS, served, talk
 from .serving import connected, serving
 
@@ -46,6 +48,7 @@ def talk_often(url: str, connections: int, rounds: int) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_memory_files_and_threads_stay_as_they_were() -> None:
     assert Path("/proc/self/fd").is_dir(), "this test needs Linux"
     with serving(settings=SETTINGS) as url:
@@ -62,6 +65,7 @@ def test_memory_files_and_threads_stay_as_they_were() -> None:
     assert bytes_after - bytes_before < MOST_BYTES_EACH * count
 
 
+@pytest.mark.slow
 def test_what_is_printed_of_a_million() -> None:
     """A short version of ``served.py``."""
     first, *_, last = made = served(400)

@@ -29,6 +29,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sandbox, "reader", read_here)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("version", "codec"), [(3, "libx264"), (2, "libx264"), (3, "libsvtav1"), (3, "libx265")])
 def test_frames_are_those_of_their_rows(tmp_path: Path, version: int, codec: str) -> None:
     """In a process of its own, with its limits; the rows of the second episode are stored backwards."""

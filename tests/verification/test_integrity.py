@@ -16,6 +16,7 @@ from ttscompile.verification.rung import FAILED, PASSED
 FLIPS = 1000
 
 
+@pytest.mark.slow
 def test_a_thousand_random_flips_are_found(sound: Path, tmp_path: Path) -> None:
     """Half of them anywhere, in proportion to the size of the files; half in a file drawn at random."""
     artifact = Path(shutil.copytree(sound, tmp_path / "compiled"))

@@ -111,6 +111,7 @@ def test_the_table_of_one_step(artifact: Path) -> None:
     assert "All of them read" in rung.told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weight", ["embed.weight", "head.weight"])
 def test_what_is_no_block(weight: str, artifact: Path) -> None:
     small = np.array(load_artifact(artifact).weights[weight]).nbytes <= 256
@@ -159,6 +160,7 @@ def test_the_sampler_at_one_step(artifact: Path) -> None:
     assert "the sampler" in rung.told
 
 
+@pytest.mark.slow
 def test_a_plan_shifted_by_a_step(artifact: Path) -> None:
     with edited(artifact, "plans") as arrays:
         arrays["schedule"] = policy.shifted(arrays["schedule"])
@@ -265,6 +267,7 @@ def test_a_record_of_another_policy_is_refused(artifact: Path) -> None:
         ttscompile.verify(artifact)
 
 
+@pytest.mark.slow
 def test_episodes_are_judged_by_what_other_noise_would_change(artifact: Path, recording: Path) -> None:
     found = ttscompile.verify(artifact, [recording], calls=8)
     rung = found.rung("sparsity error")
@@ -282,6 +285,7 @@ def test_episodes_are_judged_by_what_other_noise_would_change(artifact: Path, re
     assert rung.figure > rung.tolerance
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_much_worse_than_calibrated_fails_within_the_noise(artifact: Path, recording: Path) -> None:
     measured = ttscompile.verify(artifact, [recording], calls=8).rung("sparsity error")
     assert measured.figure is not None

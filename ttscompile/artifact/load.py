@@ -389,9 +389,8 @@ def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -
         IllegalPlanError: it is not.
     """
     if plan.dtype != np.int8 or plan.ndim != 2:
-        raise IllegalPlanError(
-            f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {plan.dtype}{list(plan.shape)}."
-        )
+        found = f"{plan.dtype}{list(plan.shape)}"
+        raise IllegalPlanError(f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {found}.")
     try:
         check_plan(plan, steps, blocks, 1)
     except IllegalPlanError as error:

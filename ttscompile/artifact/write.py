@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import numpy.typing as npt
 
 from ..core.paths import require_free_or_path
@@ -23,7 +22,6 @@ from . import records, tensors
 from .bind import LoweredPieces, Place, bind, places_of, store_pieces
 from .block_weights import BlockWeights, store_weights, without_weights
 from .codec import decode, encode, identities
-from .corrections import correction_arrays, require_fit
 from .files import (
     PARTIAL,
     content_hash,
@@ -40,6 +38,7 @@ from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import Artifact, load_artifact, plan_of, read_manifest, require_artifact_path, table_prefix
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
+from .stores import plan_arrays_of, store_arrays, store_pruner
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -169,11 +168,11 @@ def update_plans(
             if default_plan not in {DENSE, *manifest.plans}:
                 raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *manifest.plans]}.")
             manifest = replace(manifest, default_plan=default_plan, calibration=told)
-            manifest = _store(directory, manifest, "plans", _plan_arrays(manifest, plans))
+            manifest = store_arrays(directory, manifest, "plans", plan_arrays_of(manifest, plans))
             pruners = dict[str, Mapping[str, npt.NDArray[Any]]]()
             if pruner_weights is not None:
                 own = pruner_loop if pruner_loop in manifest.loop_pruners else ORIGINAL
-                manifest = _store_pruner(artifact, manifest, pruner_weights, own)
+                manifest = store_pruner(artifact, manifest, pruner_weights, own)
                 pruners[own] = pruner_weights
             after = replace(
                 artifact,
@@ -186,7 +185,9 @@ def update_plans(
                 pruner=pruners.pop(ORIGINAL, artifact.pruner),
                 loop_pruners={**artifact.loop_pruners, **pruners},
             )
-            manifest = _store(directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after)))
+            manifest = store_arrays(
+                directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after))
+            )
             content = encode(identified(manifest))
             manifest = decode(content)  # refuses what nobody could load
             replace_file(directory / MANIFEST, content)
@@ -372,58 +373,6 @@ def _file_name(piece: str, program: Program) -> str:
         if piece == of_loop(ADVANCE, loop):
             return f"{ADVANCE}_{i:02d}"
     return piece
-
-
-def _plan_arrays(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, npt.NDArray[Any]]:
-    """Schedules and corrections of plans, by the names that they have in the file."""
-    arrays = dict[str, npt.NDArray[Any]]()
-    for name, record in manifest.plans.items():
-        if record.kind == "schedule":
-            arrays[name] = np.asarray(plans[name].cells)
-    for name in manifest.plans:
-        if (correction := plans[name].correction) is not None:
-            require_fit(correction, manifest, plans[name].loop)
-            arrays |= correction_arrays(name, correction)
-    return arrays
-
-
-def _store(directory: Path, manifest: Manifest, store: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Manifest:
-    """Write the file of a store beside the old one; without arrays there is none."""
-    files = {name: record for name, record in manifest.files.items() if name != getattr(manifest.stores, store)}
-    stores: dict[str, Any] = {store: None}
-    if arrays:
-        content = tensors.serialize(arrays)
-        path = directory / f"{store}-{content_hash(content)}.safetensors"
-        replace_file(path, content)
-        stores[store], files[path.name] = path.name, describe(path)
-    return replace(manifest, files=files, stores=replace(manifest.stores, **stores))
-
-
-def _store_pruner(
-    artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]], loop: str
-) -> Manifest:
-    """Write the weights of a loop's pruner, and its model that refers to them, beside the old ones."""
-    import onnx
-
-    own = artifact.pruner if loop == ORIGINAL else artifact.loop_pruners[loop]
-    piece = PRUNER if loop == ORIGINAL else of_loop(PRUNER, loop)
-    old = manifest.stores.pruner if loop == ORIGINAL else manifest.loop_pruners[loop]
-    record = manifest.pieces[piece]
-    values = {name: np.asarray(value) for name, value in weights.items()}
-    expected = {name: (str(value.dtype), value.shape) for name, value in own.items()}
-    tensors.check_arrays("pruner's weight", values, expected, artifact.path, "Calibrate this artifact again.")
-    content = tensors.serialize(values)
-    path = artifact.path / f"{PRUNER}-{content_hash(content)}.safetensors"
-    replace_file(path, content)
-    model = onnx.load(artifact.path / record.file, load_external_data=False)
-    bound = bind(model, places_of(path, values), piece, again=True)
-    replace_file(path.with_suffix(".onnx"), bound)
-    files = {name: one for name, one in manifest.files.items() if name not in (old, record.file)}
-    files |= {each.name: describe(each) for each in (path, path.with_suffix(".onnx"))}
-    pieces = {**manifest.pieces, piece: replace(record, file=path.with_suffix(".onnx").name)}
-    if loop == ORIGINAL:
-        return replace(manifest, files=files, pieces=pieces, stores=replace(manifest.stores, pruner=path.name))
-    return replace(manifest, files=files, pieces=pieces, loop_pruners={**manifest.loop_pruners, loop: path.name})
 
 
 def _remove_stale(directory: Path) -> None:

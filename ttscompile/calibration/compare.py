@@ -1,6 +1,6 @@
 """What accuracy costs: the judge on a list of plans, of strategies, of the artifact, and of other artifacts.
 
-Every point is a plan that onnxruntime executes, in its precision and with its correction, on the same held-out calls;
+Every point is a plan that a runtime executes, in its precision and with its correction, on the same held-out calls;
 how far its actions are from those of the original, and what a call takes: all points take their turn, so that whatever
 else the machine does hits all.
 """
@@ -11,16 +11,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from ..artifact.load import Artifact, load_artifact
 from ..core.coercion import integer
 from ..core.correction import FEATURES
-from ..core.plan import Plan
+from ..core.plan import DENSE, Plan
 from ..errors import CalibrationError
 from ..measure.points import Comparison, MeasuredPoint
 from ..pool import Work, opened_pool
+from ..runtimes.open import require_able
 from .budget import cells_of, goal_of
 from .calls import Calls, Split, digest_of, load_episodes
 from .execute import Executor
@@ -73,6 +76,9 @@ def compare(
     progress: Progress = lambda what, done, total: None,
     ray: str | None = None,
     resume: bool = False,
+    plans: Sequence[str] = (),
+    runtime: str = "onnxruntime",
+    device: str | None = None,
 ) -> Comparison:
     """Measure plans against each other. Searches that are done are kept in the artifact's directory until the end.
 
@@ -82,10 +88,10 @@ def compare(
         strategies: names; each finds a plan for each sparsity.
         sparsities: shares of the cells to reuse.
         observation: see ``ttscompile.calibrate``.
-        others: artifacts of the same policy, for instance with other samplers; all their plans take part.
+        others: artifacts of the same policy, for instance with other samplers; their plans take part.
         calls: held-out calls, at most.
         learned: calls that strategies learn from, at most.
-        threads: how many threads onnxruntime uses.
+        threads: how many threads the runtime uses.
         seed: the seed of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.
         max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
@@ -97,6 +103,10 @@ def compare(
             ``ttscompile.calibrate``; held-out calls are timed in this process. None does everything here.
         resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
             strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
+        plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
+            all where none is named. ``NAME@PRECISION`` is one in another precision.
+        runtime: that executes the plans.
+        device: see ``load``.
 
     Raises:
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
@@ -104,12 +114,15 @@ def compare(
             nothing to resume with these arguments.
         TrajectoryError: the recordings do not fit the policy.
         ArtifactError: an artifact cannot be opened.
+        IllegalPlanError: the artifact has no plan of this name.
     """
     calls, learned = integer(calls, "calls", CalibrationError, 1), integer(learned, "learned", CalibrationError, 2)
     threads, seed = integer(threads, "threads", CalibrationError, 1), integer(seed, "seed", CalibrationError)
     if intervals is not None:
         intervals = integer(intervals, "intervals", CalibrationError, 1)
     artifact = load_artifact(path)
+    for name in plans:
+        require_able(runtime, artifact, artifact.plan(name))  # refused before anything is searched for
     compared: dict[str, Artifact] = {}
     for other in others:
         name = other.resolve().name
@@ -130,7 +143,9 @@ def compare(
     with opened_pool(ray) as pool:
         state = StateFile(path, settings, COMPARISON, needed=False)
         limits = learned, learned
-        trials = Trials.of(artifact, episodes, state, seed=seed, pool=pool, limits=limits, observations=calls)
+        on = None if device is None else torch.device(device)
+        how: dict[str, Any] = {"limits": limits, "observations": calls, "device": on, "runtime": runtime}
+        trials = Trials.of(artifact, episodes, state, seed=seed, pool=pool, **how)
         manifest = trials.executor.view.manifest
         budgets = {one: cells_of(goal_of(target_sparsity=one), manifest, False) for one in sparsities}
         wished = [(strategy_of(name).name, sparsity) for name in strategies for sparsity in budgets]
@@ -141,14 +156,14 @@ def compare(
         missing = [wish for wish in names if searches.known(*wish) is None]
         if missing:
             progress("dense calls to learn from", 0, 1)
-            how, task = (intervals, 60 * max_minutes, correct), _of_schedules(trials.executor, trials.calls, seed)
-            given = *where(trials.executor), trials.calls, seed, how
-            outcomes = pool.map(Work(partial(_searched, task, how), _searched_elsewhere, given), missing)
+            effort, task = (intervals, 60 * max_minutes, correct), _of_schedules(trials.executor, trials.calls, seed)
+            given = *where(trials.executor), trials.calls, seed, effort
+            outcomes = pool.map(Work(partial(_searched, task, effort), _searched_elsewhere, given), missing)
             for number, wish in enumerate(missing, len(names) - len(missing)):
                 progress(f"search: {names[wish]}", number, len(names))
                 searches.keep(*wish, next(outcomes))
             progress("search", len(names), len(names))
-        entrants = [Entrant("this artifact", name, trials, plan) for name, plan in artifact.plans.items()]
+        entrants = [Entrant("this artifact", name, trials, plan) for name, plan in named_plans(artifact, plans).items()]
         skipped, cut = dict[str, str](), list[str]()
         for strategy, sparsity in wished:
             for series, one in (searches.known(strategy, budgets[sparsity]) or {}).items():
@@ -161,7 +176,7 @@ def compare(
                 cut += [f"{series} {sparsity:g}"] * short
         for name, other_artifact in compared.items():
             own = replace(trials, artifact=other_artifact)
-            entrants += [Entrant(name, plan, own, one) for plan, one in other_artifact.plans.items()]
+            entrants += [Entrant(name, plan, own, one) for plan, one in named_plans(other_artifact, plans).items()]
         points = _measured(entrants, threads, progress)
         warnings = _warnings(artifact, trials.split, compared)
         if missing and state.warning:
@@ -175,6 +190,12 @@ def compare(
         return Comparison(
             points, len(held_out.calls), trials.split.validation, threads, other_noise(trials), skipped, tuple(warnings)
         )
+
+
+def named_plans(artifact: Artifact, names: Sequence[str] = ()) -> dict[str, Plan]:
+    """The dense plan, and those of these names that an artifact has; all where none is named. See ``Artifact.plan``."""
+    known = [name for name in names if name.partition("@")[0] in artifact.plans]
+    return {name: artifact.plan(name) for name in (DENSE, *(known if names else artifact.plans))}
 
 
 How = tuple[int | None, float, bool]

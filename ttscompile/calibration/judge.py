@@ -28,7 +28,6 @@ from ..core.spec import FloatArray, SamplerTable
 from ..errors import CalibrationError
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
-from ..runtimes.reference.backend import ReferenceBackend
 from ..runtimes.report import CallReport
 from ..runtimes.runtime import Runtime
 from .calls import LARGEST
@@ -120,13 +119,13 @@ def further(score: Score, other: Score) -> tuple[float, float]:
 
 
 def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = TIMED) -> list[Times]:
-    """What calls of plans take with onnxruntime, of one stream, in turn: whatever else the machine does hits all.
+    """What calls of plans take, of one stream, in turn: whatever else the machine does hits all.
 
     Every call computes all of its frames. Weights that are in memory alone are timed as the original's. All trials are
     of the same episodes.
     """
     filed = [(trials, _filed(trials, plan)) for trials, plan in entrants]
-    opened = [open_runtime(trials.artifact, "onnxruntime", threads, plan=plan) for trials, plan in filed]
+    opened = [open_runtime(one.artifact, one.runtime, threads, _device(one), plan) for one, plan in filed]
     timer, sample = Timer(len(filed), WARM_UP), entrants[0][0].held_out
     for number in range(WARM_UP + rounds):
         stretch, row = sample.calls[number % len(sample.calls)].tolist()
@@ -140,6 +139,11 @@ def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = T
             timer.time(i, partial(runtime.predict, obs, noise, plan))
             runtime.reset()
     return timer.times
+
+
+def _device(trials: Trials) -> str | None:
+    """Where its runtime computes: onnxruntime on the CPU, whatever the device of what is learned."""
+    return str(trials.device) if trials.runtime == "torch" and trials.device is not None else None
 
 
 def _filed(trials: Trials, plan: Plan) -> Plan:
@@ -175,10 +179,13 @@ class _Answers:
         self._trials, self._sample = trials, sample
         self._plan = plan.exact if trials.fresh else plan
         self._spec = _loop_spec(trials, self._plan)
-        if trials.fresh or (trials.device is not None and self._plan is self._plan.exact):
-            self._runtime = Runtime(trials.artifact, partial(ReferenceBackend, device=trials.device), self._plan)
-        else:
-            self._runtime = open_runtime(trials.artifact, "onnxruntime", trials.threads, plan=self._plan)
+        name, device = trials.runtime, _device(trials)
+        if trials.fresh:
+            name, device = "reference", None
+        elif trials.device is not None and self._plan is self._plan.exact:
+            name, device = "torch", str(trials.device)
+        threads = 1 if name == "reference" else trials.threads
+        self._runtime: Runtime = open_runtime(trials.artifact, name, threads, device, self._plan)
         # The scale of int8 activations is that of the whole batch, and a robot has one stream.
         self._streams = 1 if self._plan.precision else STREAMS
         self.reports: list[tuple[CallReport, int]] = []

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ..artifact.block_weights import BlockWeights
 from ..artifact.manifest import StartRecord
 from ..core.plan import DENSE, FULL, Plan
+from .held import holding
 from .judge import Score, further, judge
 from .proposer import Proposal
 from .trials import Trials
@@ -56,7 +57,7 @@ class Kept:
 
     def consider(self, proposal: Proposal) -> bool:
         """Judge a proposal on held-out episodes, and keep it if it holds."""
-        trials = self.trials.holding(proposal)
+        trials = holding(self.trials, proposal)
         score = judge(trials, proposal.plan)
         reason = proposal.refusal(score, self.scores)
         if reason is None and not proposal.beside:

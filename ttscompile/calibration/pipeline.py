@@ -252,7 +252,10 @@ def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept
     own["plans"] = {**record.get("plans", {}), **own["plans"]}
     notes = dict(kept.notes)
     steps = {name: notes[name]["steps"] for name in (SAFE, FAST) if name in notes}
-    record |= {**notes.pop(SCHEDULE, {}), **own, "named_steps": steps} if anew else {"plans": own["plans"]}
+    own["learned"] = list(dict.fromkeys([*record.get("learned", []), *own["learned"]]))
+    own["told"] = {**record.get("told", {}), **own["told"]}
+    more = {key: own[key] for key in ("plans", "learned", "told")}
+    record |= {**notes.pop(SCHEDULE, {}), **own, "named_steps": steps} if anew else more
     pruner, loop = (None, ORIGINAL) if kept.pruner is None else kept.pruner
     update_plans(
         path,

@@ -8,15 +8,14 @@ scores are of the same calls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from ..artifact.load import Artifact
-from ..artifact.manifest import WeightsRecord
 from ..artifact.view import View, view_of
 from ..core.plan import DENSE, FULL, Plan
 from ..core.spec import FloatArray, Noise, PolicySpec
@@ -31,9 +30,6 @@ from .execute import Executor
 from .progress import Bar
 from .state import StateFile
 from .targets import dense_rounds, draw_calls, with_targets
-
-if TYPE_CHECKING:
-    from .proposer import Proposal
 
 DRAWS = 4
 """Of noise for each observation."""
@@ -96,6 +92,7 @@ class Trials:
         bar: told how far it is.
         pool: where the original answers.
         device: where the network computes; None for the CPU.
+        runtime: that executes what is judged, where it can.
     """
 
     artifact: Artifact
@@ -109,6 +106,7 @@ class Trials:
     bar: Bar = field(default_factory=partial(Bar, shown=False))
     pool: Pool = field(default_factory=Here)
     device: torch.device | None = None
+    runtime: str = "onnxruntime"
     fresh: bool = False
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
     observations: int = OBSERVATIONS
@@ -185,25 +183,6 @@ class Trials:
             stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), self.observations)
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls))
         return self._samples[part]
-
-    def holding(self, proposal: Proposal) -> Trials:
-        """The same, of an artifact that holds in memory what a proposal brings."""
-        artifact, manifest, loop = self.artifact, self.artifact.manifest, proposal.plan.loop
-        added = {name: own.weights for name, own in proposal.weights.items()}
-        known = {**manifest.weights, **{name: WeightsRecord(name, {}, None, {}) for name in added}}
-        pruner, pruners = artifact.pruner, dict(artifact.loop_pruners)
-        if proposal.pruner is not None and loop in pruners:
-            pruners[loop] = proposal.pruner
-        elif proposal.pruner is not None:
-            pruner = proposal.pruner
-        held = replace(
-            artifact,
-            manifest=replace(manifest, starts={**manifest.starts, **proposal.starts}, weights=known),
-            block_weights={**artifact.block_weights, **added},
-            pruner=pruner,
-            loop_pruners=pruners,
-        )
-        return replace(self, artifact=held, fresh=self.fresh or bool(added) or proposal.pruner is not None)
 
     def view(self, plan: Plan) -> View:
         """The artifact as a plan sees it."""

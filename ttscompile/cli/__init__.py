@@ -11,13 +11,11 @@ import click
 from ttscompile import __version__
 from ttscompile.cli.bench import bench
 from ttscompile.cli.calibrate import calibrate
-from ttscompile.cli.compare import compare
 from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.push import push
-from ttscompile.cli.realtime import realtime
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
 
@@ -41,9 +39,7 @@ for _command, _what in (
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (inspect, "What is in an artifact: tables, a picture, a page."),
     (verify, "Does it do what the original did, and do its plans engage?"),
-    (bench, "Time calls, beside what they replace."),
-    (compare, "Action error against latency, of plans and strategies."),
-    (realtime, "Which plans keep up with a control loop on this machine."),
+    (bench, "How fast are calls, do they keep up, how far are they off?"),
     (push, "Upload an artifact with a model card to the hub."),
     (serve, "Drive a robot, or answer many, over a WebSocket."),
 ):

@@ -1,172 +1,212 @@
-"""``ttscompile bench``: what a call of the compiled policy takes, beside what it replaces."""
+"""``ttscompile bench``: what calls take, whether they keep up with a loop, and how far off their actions are."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.manifest import abbreviated
+from ttscompile.cli.bench_report import BenchReport, PrecisionError
+from ttscompile.cli.comparison import compare, draw_comparison
+from ttscompile.cli.contestants import Way, contestants, originals
+from ttscompile.cli.loop import Loop
 from ttscompile.cli.options import (
+    LOOP_OPTIONS,
     artifact_argument,
     count_option,
     json_option,
+    loop_options,
     names_option,
-    runs_option,
-    runtime_options,
+    number_option,
     seed_option,
     several_threads_option,
 )
-from ttscompile.cli.output import print_identity, print_json, progress, results, say, table
-from ttscompile.cli.timing import Compiled, Measurement, contestants, measure
-from ttscompile.cli.types import FOLDER, PATH, TEXT
+from ttscompile.cli.output import print_identity, print_json, progress, results, say
+from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
+from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.types import FOLDER, PATH, PICTURE, RATE, SECONDS, TEXT
+from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.measure.units import ms, share
-from ttscompile.report.facts import told_plan
-from ttscompile.runtimes.load import open_policy
-from ttscompile.runtimes.open import CPU
+from ttscompile.report.timing import Contestant, Measurement, measure
+from ttscompile.runtimes.executor import ExecutorSettings
+from ttscompile.runtimes.open import CPU, kind_of
 from ttscompile.runtimes.random_calls import random_calls
 
-RIVALS = ("original", "eager", "onnxruntime-dense", "onnxruntime")
-"""The checkpoint with the sampler it was saved with; with the artifact's; the artifact computed in full; and the same
-plan of it on the CPU, for --runtime torch."""
-
-MOST_IN_A_ROW = 100
-"""Calls of a turn, whose observations are drawn before it."""
-
+THIS = "this artifact"
+MOST_CALLS = 10_000
 COMPARED = 8
 """Dense calls on random observations, in another precision and in fp32."""
 
-WORTH = 0.1
-"""Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
+SECTIONS = (
+    Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
+    Section("In a control loop", ("control_hz", *LOOP_OPTIONS, "jitter"), ("control_hz",)),
+    Section("Action error, on recorded episodes", ("trajectories", "sources", "picture"), ("trajectories",)),
+)
 
 
-@click.command()
+@click.command(cls=SectionedCommand, sections=SECTIONS)
 @artifact_argument
-@several_threads_option(
-    "Threads that each contestant computes with. Of several, as in 1,2,4, the compiled policy is timed with each, and"
-    " its rivals with the first."
-)
-@runs_option("Calls of each contestant that are counted.")
-@count_option(
-    "--in-a-row",
-    "Calls that a contestant makes in its turn; the last one counts. Before the first, what the others did has taken"
-    " the processor's caches, as a robot's other work does.",
-    most=MOST_IN_A_ROW,
-)
-@click.option("--plan", type=TEXT, help="Plan of the compiled policy. Without this option its default plan runs.")
-@runtime_options
 @click.option(
-    "--precision",
+    "--plan",
+    "plans",
     type=TEXT,
-    help="Of the weights; on torch of the blocks' products. Without this option it is that of the artifact, or fp32.",
+    multiple=True,
+    help="Look at this plan, beside the dense one; may be repeated. NAME@fp32, NAME@int8 and NAME@bf16 are plans in"
+    " another precision. Without this option it is every plan.",
+)
+@click.option(
+    "--with",
+    "others",
+    multiple=True,
+    type=PATH,
+    metavar="DIR...",
+    help="Look at plans of these artifacts of the same checkpoint, too, which may have another sampler. Every word up"
+    " to the next option is one.",
 )
 @names_option(
-    "--against",
-    RIVALS,
-    default="onnxruntime-dense",
-    help=f"What the compiled policy is timed against, any of {', '.join(RIVALS)}. The first two run the original"
-    " network in PyTorch.",
+    "--runtime",
+    ("onnxruntime", "torch"),
+    default="onnxruntime",
+    help="Execute the plans with onnxruntime, or with torch, which needs the extra 'compile'; or with each of them:"
+    " onnxruntime,torch.",
 )
+@click.option("--device", type=TEXT, help="Have torch compute on this device, as it calls it: cpu, cuda.")
+@several_threads_option(
+    "Threads that each plan computes with. Of several, as in 1,2,4, each plan is timed with each of these, and the rest"
+    " is done with the first."
+)
+@count_option("--calls", "Count so many calls of each plan.", default=20, most=MOST_CALLS)
+@seed_option("Seed of observations and noise, and of which episodes are held out: take that of the calibration.")
+@json_option
 @click.option(
     "--checkpoint",
     type=PATH,
-    help="The checkpoint that DIRECTORY was made from. The rivals 'original' and 'eager' need it.",
+    help="Time the checkpoint that DIRECTORY was made from, in PyTorch: in the loop that it was saved with, and in the"
+    " artifact's if that is another.",
 )
 @click.option(
     "--encoders",
     type=FOLDER,
-    help="For --checkpoint: the folder that 'ttscompile convert' was given by the same name, if it was.",
+    help="Folder that 'ttscompile convert' was given by the same name, if it was.",
 )
-@seed_option("Seed of the observations and the noise.")
-@json_option
+@number_option(
+    "--control-hz",
+    RATE,
+    "Say which plans keep up with a control loop of this rate in Hz. The exit status is 1 if none does.",
+)
+@loop_options
+@number_option(
+    "--jitter",
+    SECONDS,
+    "Also run a loop of 200 Hz for so many seconds, alone and then beside the default plan, and say how late it wakes.",
+)
+@trajectories_options(
+    required=False, what="Hold the actions of the plans against those of the dense policy on these recorded episodes."
+)
+@click.option("--plot", "picture", type=PICTURE, help="Draw error against latency into this file (.png, .svg or .pdf).")
+@click.pass_context
 def bench(
+    context: click.Context,
+    /,
     directory: Path,
-    threads: tuple[int, ...],
-    runs: int,
-    in_a_row: int,
-    plan: str | None,
-    runtime: str,
+    plans: tuple[str, ...],
+    others: tuple[Path, ...],
+    runtime: tuple[str, ...],
     device: str | None,
-    precision: str | None,
-    against: tuple[str, ...],
-    checkpoint: Path | None,
-    encoders: Path | None,
+    threads: tuple[int, ...],
+    calls: int,
     seed: int,
     as_json: bool,
+    checkpoint: Path | None,
+    encoders: Path | None,
+    control_hz: float | None,
+    jitter: float | None,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    picture: Path | None,
+    **settings: Any,
 ) -> None:
-    """Time calls of the artifact DIRECTORY and of its rivals, which take turns on the same random observations.
+    """Time calls of the plans of the artifact DIRECTORY.
 
-    Every figure is of whole calls, for one robot at a time. Warm-up calls are not counted.
+    The plans take turns on the same random observations. Every figure is of whole calls, for one robot at a time.
+    Warm-up calls are not counted. With --control-hz and -t there is more to know about the same plans.
     """
-    if {"eager", "original"}.intersection(against) and checkpoint is None:
-        raise click.UsageError("--against eager or original runs the original network: give --checkpoint FILE too.")
-    if len(threads) > 1 and runtime == "torch":
+    if not runtime:
+        raise click.UsageError("--runtime: nothing was given.")
+    if len(threads) > 1 and "torch" in runtime:
         raise click.UsageError("--runtime torch has one number of threads in a process: give --threads one number.")
-    console, artifact = progress(), load_artifact(directory)
-    identity = artifact.manifest.identity
+    artifacts = _artifacts(directory, others)
+    require_recordings(trajectories)
+    artifact, console = artifacts[THIS], progress()
+    ways = [_way(one, runtime, device, number) for one in runtime for number in threads]
+    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings), jitter)
     with console.status("loading"):
-        own = Compiled(runtime, device, precision, threads[0])
-        entered = contestants(artifact, own, plan, against, checkpoint, encoders, threads[1:])
-    if entered[0].plan == "dense":
-        say(console, f"warning: {directory} runs dense: it is not calibrated, or --plan dense was given.")
+        entered = contestants(artifacts, plans, ways)
+        if loop is not None:
+            loop.require(entered)  # told before anything is measured
+        if checkpoint is not None:
+            entered = [*originals(checkpoint, encoders, threads[0], artifact), *entered]
+    default = artifact.manifest.default_plan
+    if default == DENSE:
+        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
     with console.status("timing") as status:
-        measured = measure(
-            entered,
-            runs,
-            seed,
-            lambda done, total: status.update(f"timing: round {done} of {total}"),
-            in_a_row=in_a_row,
-        )
-    error = None
-    if runtime == "torch" and precision not in (None, FP32):
-        with console.status(f"comparing actions in {precision} and {FP32}"):
-            error = _apart(artifact, str(precision), threads[0], device)
-    timed = dict(zip(threads, (m.median_ms for m in measured), strict=False))
+        measured = measure(entered, calls, seed, lambda done, of: status.update(f"timing: round {done} of {of}"))
+        status.update("judging")
+        driven = plans if plans and default not in plans else (default,)
+        judged = None if loop is None else loop.judge(entered, measured, driven)
+        error = _precision_error(artifact, plans, ways[0])
+    how = {"runtime": ways[0].runtime, "device": ways[0].device, "threads": ways[0].threads}
+    asked: dict[str, Any] = {"observation": sources, "plans": plans, "calls": calls, "seed": seed, **how}
+    compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
+    by_threads = _by_threads(entered, measured, plans[0] if plans else default)
+    report = BenchReport(measured, default, calls, by_threads, error, judged, compared)
+    identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
-        of = {"identity": identity, "machine": fingerprint(), "threads": threads[0], "runs": runs, "runtime": runtime}
-        of |= {"best_threads": fewest_threads(timed), "in_a_row": in_a_row}
-        of |= {"device": device or CPU, "precision_error": error}
-        print_json(of | {"contestants": [m.to_json() for m in measured]})
-        return
-    output, head = results(), ("", "ms a call", "quartiles", "calls/s", "speed-up", "GFLOP", "reused")
-    seeing = any(m.frames_ms for m in measured)
-    parts = ("prologue", *["of it frames"] * seeing, "pruner")
-    output.print(table(*head, *parts, rows=[_row(m, measured[0], seeing) for m in measured]))
-    say(
-        output,
-        f"Medians of {runs} calls, one stream, {threads[0]} thread{'s' * (threads[0] > 1)}; plan {entered[0].plan!r}."
-        " Speed-up: how many times faster the first row is. Prologue and pruner: their ms of the call.",
-    )
-    if in_a_row > 1:
-        say(output, f"A contestant makes {in_a_row} calls in a row, of which the last counts: its caches are warm.")
-    if len(threads) > 1:
-        best = fewest_threads(timed)
-        say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
-    say(output, f"The first row computes {told_plan(artifact.manifest, entered[0].plan.partition('@')[0])}.")
-    if seeing:
-        say(
-            output,
-            "Every call has frames of its own; frames that are known, or prepared before it, would cost nothing.",
-        )
-    if error is not None:
-        say(
-            output,
-            f"Actions of {COMPARED} dense calls in {precision} are {error['mean']:.4g} off those in {FP32} on average,"
-            f" {error['p90']:.4g} at the 90th percentile, {error['largest']:.4g} at most, in their units.",
-        )
-    print_identity(identity, output)
-    say(output, one_line(fingerprint()))
+        of = {"identity": artifact.manifest.identity, "machine": fingerprint()}
+        among = [{"path": str(path), "identity": identity} for path, identity in identities.items()]
+        print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **report.to_json()})
+    else:
+        output = results()
+        report.print(output)
+        say(output, one_line(fingerprint()))
+        print_identity(artifact.manifest.identity, output)
+        say(output, *(f"{path}: identity {abbreviated(identity)}" for path, identity in identities.items()))
+    if compared is not None and picture is not None:
+        say(console, draw_comparison(compared, directory, picture))
+    if judged is not None and not judged.keeps_up:
+        context.exit(1)
 
 
-def _apart(artifact: Artifact, precision: str, threads: int, device: str | None) -> dict[str, float]:
-    """How far executed actions of dense calls on torch are from those in fp32, with equal noise, in their units."""
+def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
+    """By name."""
+    found = {THIS: load_artifact(directory)}
+    for other in others:
+        if (name := other.resolve().name) in found:
+            raise click.UsageError(f"two artifacts are called {name!r}: they could not be told apart. Rename one.")
+        found[name] = load_artifact(other)
+    return found
+
+
+def _precision_error(artifact: Artifact, plans: Sequence[str], way: Way) -> PrecisionError | None:
+    """What fewer bits that a runtime makes itself do to dense actions: how far they are from those in fp32.
+
+    Args:
+        artifact: with the dense plan.
+        plans: of which the first in such a precision counts; None comes of none.
+        way: that they run; fp32 runs the same.
+    """
+    asked = [plan.partition("@")[2] for plan in plans]
+    if not (found := [one for one in asked if one in kind_of(way.runtime).made]):
+        return None
     actions = []
-    for each in (precision, FP32):
-        policy = open_policy(artifact, "torch", threads, plan=artifact.plan(f"dense@{each}"), device=device)
+    for each in (found[0], FP32):
+        policy = way.open(artifact, f"{DENSE}@{each}")
         made = []
         for obs, noise in random_calls(artifact.manifest.spec, COMPARED, seed=0):
             policy.reset()
@@ -174,26 +214,19 @@ def _apart(artifact: Artifact, precision: str, threads: int, device: str | None)
         actions.append(np.concatenate(made))
     apart = np.abs(actions[0] - actions[1])
     means = apart.mean((1, 2))
-    found = {"mean": means.mean(), "p90": np.quantile(means, 0.9), "largest": apart.max()}
-    return {"calls": COMPARED, **{name: float(value) for name, value in found.items()}}
+    numbers = float(means.mean()), float(np.quantile(means, 0.9)), float(apart.max())
+    return PrecisionError(found[0], COMPARED, *numbers)
 
 
-def fewest_threads(medians: Mapping[int, float]) -> int:
-    """The smallest number of threads that no other one is faster than by more than ``WORTH``; ``medians`` by number."""
-    bound = min(medians.values()) / (1 - WORTH)
-    return min(number for number, median in medians.items() if median <= bound)
+def _way(runtime: str, of: Sequence[str], device: str | None, threads: int) -> Way:
+    """The device is torch's where it is one of the runtimes."""
+    return Way(runtime, device, threads) if runtime == "torch" or "torch" not in of else Way(threads=threads)
 
 
-def _row(m: Measurement, compiled: Measurement, seeing: bool) -> tuple[str, ...]:
-    return (
-        m.label,
-        ms(m.median_ms, 4),
-        "..".join(ms(quartile, 4) for quartile in m.quartiles_ms),
-        f"{1000 / m.median_ms:.1f}",
-        "" if m is compiled else f"{m.median_ms / compiled.median_ms:.1f} x",
-        "" if m.flops is None else f"{m.flops / 1e9:.3f}",
-        share(m.sparsity),
-        "" if m.prologue_ms is None else f"{m.prologue_ms:.2f}",
-        *["" if m.frames_ms is None else f"{m.frames_ms:.2f}"] * seeing,
-        "" if m.pruner_ms is None else f"{m.pruner_ms:.2f}",
-    )
+def _by_threads(entered: Sequence[Contestant], measured: Sequence[Measurement], plan: str) -> dict[int, float]:
+    """Median of this plan of the artifact, in ms, by its number of threads."""
+    timed: dict[int, float] = {}
+    for one, m in zip(entered, measured, strict=True):
+        if one.plan == plan and one.policy is not None:
+            timed.setdefault(one.threads, m.median_ms)
+    return timed

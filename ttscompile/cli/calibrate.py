@@ -38,31 +38,32 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 @click.option(
     "--target-sparsity",
     type=SHARE,
-    help="Share of the cells to reuse; 0.95 if no budget is given, or what leaves five steps.",
+    help="Reuse this share of the cells. Without any budget it is 0.95, or what leaves five steps to compute.",
 )
 @click.option(
     "--target-flops",
     type=SHARE,
-    help="In its place: share of the FLOPs of a dense call to save, prologue and pruner counted.",
+    help="Save this share of the FLOPs of a dense call, prologue and pruner counted, in place of --target-sparsity.",
 )
 @click.option(
     "--latency-ms",
     type=MILLISECONDS,
-    help="In its place: what a call with onnxruntime may take on this machine; measured at the start.",
+    help="Have a call take no longer than this with onnxruntime on this machine, measured at the start, in place of"
+    " --target-sparsity.",
 )
 @click.option(
     "--max-action-error",
     type=ERROR,
-    help="In its place: the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is"
-    " not above this.",
+    help="Take the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is not"
+    " above this, in place of --target-sparsity.",
 )
 @click.option(
     "--max-distance",
     type=ERROR,
-    help="By how much further from the original a plan may be that costs less, in units of what other noise changes;"
-    " without this option what each that learns allows.",
+    help="Take a cheaper plan if it is no further than this from the original than a dearer one, in units of what other"
+    " noise changes; without this option it is what each that learns allows.",
 )
-@threads_option("Of calls for --latency-ms.")
+@threads_option("Threads of the calls that --latency-ms is about.")
 @click.option(
     "--strategy",
     type=click.Choice(NAMES),
@@ -75,20 +76,20 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
     is_flag=True,
     help="Fit a correction of the sampler to the schedule of a strategy that fits none: fair comparisons with tts.",
 )
-@count_option("--rank", "Of the low-rank update to each weight matrix, for weights.", default=16)
-@count_option("--updates", "Of the weights.", default=600)
-@seed_option("Of the split, the noise and the training.")
+@count_option("--rank", "Rank of the low-rank update to each weight matrix, for weights.", default=16)
+@count_option("--updates", "Train weights with so many updates.", default=600)
+@seed_option("Seed of the split, the noise and the training.")
 @click.option(
     "--max-minutes",
     type=MINUTES,
     default=15.0,
     show_default=True,
-    help="All in all, about: the best plan found by then is taken. Also decides how many calls are used.",
+    help="Take the best plan that is found in so many minutes, about. Also decides how many calls are used.",
 )
 @click.option(
     "--device",
     type=TEXT,
-    help="Device that calls compute on, as torch calls it: cuda, mps. Without this option the CPU.",
+    help="Compute calls on this device, as torch calls it: cuda, mps. Without this option it is the CPU.",
 )
 @click.option("--resume", is_flag=True, help="Go on where a calibration that was interrupted stopped.")
 @ray_option

@@ -13,6 +13,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.options import count_option, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
+from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.summary import print_summary
 from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH, PATH_OR_HUB
 from ttscompile.core.paths import on_hub, require_path
@@ -22,44 +23,54 @@ from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
 from ttscompile.report.facts import precision as told_precision
 from ttscompile.report.summary import document
 
+SECTIONS = (
+    Section("Another denoising loop", ("sampler", "steps", "spacing")),
+    Section("Precision", ("precision", "keep_fp32")),
+    Section("Policies of LeRobot", ("task", "encoders", "without_cameras")),
+)
 
-@click.command()
+
+@click.command(cls=SectionedCommand, sections=SECTIONS)
 @click.argument("checkpoint", type=PATH_OR_HUB)
-@click.option("-o", "--output", "directory", required=True, type=PATH, help="The artifact.")
+@click.option("-o", "--output", "directory", required=True, type=PATH, help="Write the artifact into this folder.")
 @click.option(
     "--format",
     type=click.Choice(FORMATS),
     default="auto",
     show_default=True,
-    help=" ".join(["Of CHECKPOINT; auto finds out.", *(f"{each.name}: {each.reads}." for each in FAMILIES)]),
+    help="Read CHECKPOINT as this format; auto finds out which it is. "
+    + " ".join(f"{each.name}: {each.reads}." for each in FAMILIES),
 )
 @click.option(
     "--sampler",
     type=click.Choice(SAMPLERS),
-    help="In place of the checkpoint's own: ddpm, ddim or dpmsolver++ of a diffusion policy, euler or rk4 of one"
-    " trained with flow matching.",
+    help="Replace the checkpoint's own sampler: by ddpm, ddim or dpmsolver++ in a diffusion policy, by euler or rk4 in"
+    " one that was trained with flow matching.",
 )
 @count_option(
     "--steps",
-    "Denoising or integration steps, in place of the checkpoint's own. rk4 evaluates the network four times a"
-    " step: K is four times this.",
+    "Take so many denoising or integration steps, in place of the checkpoint's own. rk4 evaluates the network four"
+    " times a step: K is four times this.",
     default=None,
 )
 @click.option(
     "--spacing",
     type=click.Choice(SPACINGS),
-    help="Timesteps that fewer steps visit, in place of the checkpoint's own. leading starts below the last one, where"
-    " pure noise is not what the network expects; trailing and linspace start at it, which needs a bound on the sample."
-    " Left out, dpmsolver++ in place of another sampler takes trailing; ddim takes leading.",
+    help="Rule for the timesteps that fewer steps visit, in place of the checkpoint's own. leading starts below the"
+    " last one, where pure noise is not what the network expects; trailing and linspace start at it, which needs a"
+    " bound on the sample. Without this option dpmsolver++ in place of another sampler takes trailing, and ddim"
+    " leading.",
 )
 @click.option(
-    "--task", type=ANY_TEXT, help="LeRobot: compile this instruction in; without it, its tokens are an observation."
+    "--task",
+    type=ANY_TEXT,
+    help="Compile this instruction in; without it, its tokens are an observation.",
 )
 @click.option(
     "--encoders",
     type=FOLDER,
-    help="LeRobot: folder with config.json of CLIP or of the language model (and tokenizer.json, for --task), if not in"
-    " or beside CHECKPOINT. Nothing is downloaded.",
+    help="Find config.json of CLIP or of the language model (and tokenizer.json, for --task) in this folder, if they"
+    " are not in or beside CHECKPOINT. Nothing is downloaded.",
 )
 @click.option(
     "--without-camera",
@@ -67,7 +78,7 @@ from ttscompile.report.summary import document
     type=ANY_TEXT,
     multiple=True,
     callback=lambda context, option, given: given or None,
-    help="LeRobot's vision-language-action models: a camera of the checkpoint that the robot lacks; may be repeated.",
+    help="Leave out a camera of a vision-language-action model that the robot lacks; may be repeated.",
 )
 @count_option(
     "--prediction-horizon",
@@ -80,14 +91,14 @@ from ttscompile.report.summary import document
     type=click.Choice(PRECISIONS),
     default=FP32,
     show_default=True,
-    help="Precision of the weights of residual blocks and prologue. int8 is faster on processors with VNNI;"
+    help="Keep the weights of residual blocks and prologue in this precision. int8 is faster on processors with VNNI;"
     " 'ttscompile calibrate --learn precision' measures what it does, and leaves out the parts where that is much.",
 )
 @click.option(
     "--keep-fp32",
     type=ANY_TEXT,
     multiple=True,
-    help="A part that stays fp32 beside int8: blocks; prologue, or a piece of it (frame_00, condition, step). May be"
+    help="Leave this part in fp32 beside int8: blocks; prologue, or a piece of it (frame_00, condition, step). May be"
     " repeated.",
 )
 @click.option(

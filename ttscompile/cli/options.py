@@ -7,14 +7,13 @@ from typing import Any
 
 import click
 
-from ttscompile.cli.types import ANY_TEXT, PATH, RATE, TEXT
+from ttscompile.cli.types import ANY_TEXT, PATH, RATE, TEXT, NumberOption
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 MOST = 1_000_000
 """Of whatever is counted: none of it is of use beyond, and all of it fits a machine."""
 
-MOST_RUNS = 10_000
 MOST_THREADS = 1024
 """onnxruntime makes as many as it is told."""
 MOST_SEED = 2**63 - 1
@@ -28,8 +27,13 @@ json_option = click.option(
 
 def count_option(name: str, help: str, *, default: int | None = 1, least: int = 1, most: int = MOST) -> Decorator:
     """An option that takes a whole number from ``least`` to ``most``."""
-    kind = click.IntRange(least, most)
-    return click.option(name, type=kind, default=default, show_default=default is not None, help=help)
+    return number_option(name, click.IntRange(least, most), help, default=default)
+
+
+def number_option(name: str, kind: click.ParamType[Any], help: str, **settings: Any) -> Decorator:
+    """An option that takes a number of this kind; see ``click.option`` for the settings."""
+    shown = settings.get("default") is not None
+    return click.option(name, cls=NumberOption, type=kind, metavar="NUMBER", show_default=shown, help=help, **settings)
 
 
 def threads_option(help: str) -> Decorator:
@@ -45,11 +49,6 @@ def several_threads_option(help: str) -> Decorator:
         return tuple(dict.fromkeys(number(part.strip(), option, context) for part in value.split(",")))
 
     return click.option("--threads", type=ANY_TEXT, default="1", show_default=True, callback=parsed, help=help)
-
-
-def runs_option(help: str, default: int = 20) -> Decorator:
-    """``--runs``."""
-    return count_option("--runs", help, default=default, most=MOST_RUNS)
 
 
 def together(*options: Decorator) -> Decorator:
@@ -69,9 +68,11 @@ runtime_options = together(
         type=click.Choice(["onnxruntime", "torch"]),
         default="onnxruntime",
         show_default=True,
-        help="What executes the policy. torch needs the extra 'compile'.",
+        help="Runtime that executes the policy; torch needs the extra 'compile'.",
     ),
-    click.option("--device", type=TEXT, help="Device that --runtime torch computes on, as torch calls it: cpu, cuda."),
+    click.option(
+        "--device", type=TEXT, help="Have --runtime torch compute on this device, as torch calls it: cpu, cuda."
+    ),
 )
 """Of commands that run an artifact in a runtime of choice."""
 
@@ -102,10 +103,10 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
 
 
 loop_options = together(
-    click.option(
+    number_option(
         "--policy-hz",
-        type=RATE,
-        help="Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
+        RATE,
+        "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
         " --control-hz.",
     ),
     count_option(

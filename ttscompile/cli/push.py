@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 import ttscompile
-from ttscompile.cli.options import artifact_argument, runs_option
+from ttscompile.cli.options import artifact_argument
 from ttscompile.cli.output import only_results_on_stdout, progress, results, say
 from ttscompile.cli.types import FILE, TEXT
 
@@ -20,17 +20,16 @@ from ttscompile.cli.types import FILE, TEXT
     "evaluations",
     type=FILE,
     multiple=True,
-    help="What examples/evaluation/evaluate.py --json printed of this artifact: success figures for the card. May be"
-    " repeated.",
+    help="Put the success figures on the card that examples/evaluation/evaluate.py --json printed of this artifact into"
+    " this file. May be repeated.",
 )
 @click.option(
     "--license",
     "licence",
     type=TEXT,
-    help="Licence of the base, as the hub writes it (apache-2.0), where the base did not say one to convert.",
+    help="Name this licence of the base, as the hub writes it (apache-2.0), where the base did not say one to convert.",
 )
-@click.option("--private", is_flag=True, help="A repository that is made now is private.")
-@runs_option("Counted calls of each plan, for the times on the card.", default=10)
+@click.option("--private", is_flag=True, help="Make the repository private, if it is made now.")
 @click.option("--dry-run", is_flag=True, help="Print the card, and upload nothing.")
 def push(
     directory: Path,
@@ -38,7 +37,6 @@ def push(
     evaluations: tuple[Path, ...],
     licence: str | None,
     private: bool,
-    runs: int,
     dry_run: bool,
 ) -> None:
     """Upload the artifact DIRECTORY to REPOSITORY (org/name) on the Hugging Face hub, with a model card.
@@ -54,7 +52,6 @@ def push(
             evaluations=evaluations,
             licence=licence,
             private=private,
-            runs=runs,
             dry_run=dry_run,
             progress=status.update,
         )

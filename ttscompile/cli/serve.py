@@ -17,6 +17,7 @@ from ttscompile.cli.options import (
     artifact_argument,
     count_option,
     loop_options,
+    number_option,
     runtime_options,
     threads_option,
 )
@@ -45,7 +46,7 @@ SECTIONS = (
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)
 @artifact_argument
-@click.option("--control-hz", type=RATE, help="Drive one robot, whose control loop has this rate in Hz.")
+@number_option("--control-hz", RATE, "Drive one robot, whose control loop has this rate in Hz.")
 @count_option(
     "--copies", "Answer many robots, with so many copies of the policy, which run on Ray.", default=None, most=4096
 )
@@ -68,14 +69,14 @@ SECTIONS = (
     type=click.Choice(SEAMS),
     default="replace",
     show_default=True,
-    help="How a chunk of actions joins the one before it.",
+    help="Way in which a chunk of actions joins the one before it.",
 )
 @click.option(
     "--interpolation",
     type=click.Choice(INTERPOLATIONS),
     default="hold",
     show_default=True,
-    help="What is between two actions where the control loop is faster than the policy.",
+    help="Way from one action to the next, where the control loop is faster than the policy.",
 )
 @runtime_options
 @click.option(
@@ -86,12 +87,11 @@ SECTIONS = (
     show_default=True,
     help="Run the copies on this Ray cluster, or on cores of this machine.",
 )
-@click.option(
+@number_option(
     "--wait-ms",
-    type=Number(0, 10_000),
+    Number(0, 10_000),
+    "Let a request wait so many milliseconds for others of its plan, to be one call with them.",
     default=5.0,
-    show_default=True,
-    help="Let a request wait so many milliseconds for others of its plan, to be one call with them.",
 )
 @server_options
 def serve(

@@ -53,13 +53,7 @@ server_options = together(
         help="Listen on this IP address of this machine, or on localhost. One that other machines may reach needs a"
         " token and a certificate.",
     ),
-    click.option(
-        "--port",
-        type=click.IntRange(0, 65535),
-        default=8765,
-        show_default=True,
-        help="Listen on this port; 0 takes any that is free.",
-    ),
+    count_option("--port", "Listen on this port; 0 takes any that is free.", default=8765, least=0, most=65535),
     click.option(
         "--token-file",
         type=FILE,
@@ -72,8 +66,8 @@ server_options = together(
         multiple=True,
         metavar="CERTIFICATE [KEY]...",
         callback=_papers,
-        help="Have clients use wss:// with this certificate in PEM format, which those between it and its authority's"
-        " follow in the same file; then its private key, if that is in a file of its own.",
+        help="Certificate of the server in PEM format, with those between it and its authority's in the same file; then"
+        " its private key, if that is in a file of its own. Clients use wss:// then.",
     ),
     click.option(
         "--insecure",

@@ -58,23 +58,24 @@ def print_summary(artifact: Artifact, console: Console) -> None:
     about = table("artifact", summary["path"], rows=rows)
     about.columns[1].justify = "left"
     console.print(about)
-    _print_facts(console, facts.block_table(manifest))
+    print_facts(console, facts.block_table(manifest))
     costs = [(name.replace("_", " "), flops(n), share(n / captured)) for name, n in summary["flops"].items()]
     console.print(table("FLOPs a call, one stream", "", "of the captured policy", rows=costs))
-    _print_facts(console, facts.plan_table(artifact))
-    _print_facts(console, usage.usage_table(artifact))
+    print_facts(console, facts.plan_table(artifact))
+    print_facts(console, usage.usage_table(artifact))
     console.print(Padding(usage.told_unused(artifact), (0, 0, 0, 2)))
     record = manifest.calibration
     if record is None:
         console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
         return
-    _print_facts(console, facts.score_table(record))
+    print_facts(console, facts.score_table(record))
     for line in facts.remarks(record):
         console.print(Padding(line, (0, 0, 0, 2)))  # as a row it would squeeze the figures
-    _print_facts(console, facts.record_table(record, most=90))
+    print_facts(console, facts.record_table(record, most=90))
 
 
-def _print_facts(console: Console, made: Table) -> None:
+def print_facts(console: Console, made: Table) -> None:
+    """A table of the page; nothing if it has no rows."""
     if made.rows:
         console.print(table(*made.head, rows=made.rows))
 

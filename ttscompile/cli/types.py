@@ -19,6 +19,16 @@ from ttscompile.errors import OutputError
 from ttscompile.plots.figure import require_picture_name
 
 
+class NumberOption(click.Option):
+    """Shows no range in the help: nobody has a use for its ends, and the message about a number beyond says it."""
+
+    def get_help_extra(self, ctx: click.Context) -> Any:
+        """See ``click.Option``."""
+        extra = super().get_help_extra(ctx)
+        extra.pop("range", None)
+        return extra
+
+
 class Number(click.FloatRange):
     """A finite number between two others.
 
@@ -27,6 +37,8 @@ class Number(click.FloatRange):
         most: the largest.
         above: whether ``least`` itself is refused.
     """
+
+    name = "number"
 
     def __init__(self, least: float, most: float, *, above: bool = False) -> None:
         super().__init__(least, most, min_open=above)

@@ -21,7 +21,7 @@ from ttscompile.report.verified import figure
 @click.command(cls=FilesCommand)
 @artifact_argument
 @trajectories_options(required=False, what="Check what the plans do on these recorded episodes, too.")
-@count_option("--calls", "Recorded calls to check at least; whole episodes are taken.", default=24)
+@count_option("--calls", "Check so many recorded calls at least; whole episodes are taken.", default=24)
 @threads_option("Threads that onnxruntime computes with.")
 @click.option(
     "--plot",

@@ -67,7 +67,7 @@ from ..core.lattice import Source
 from ..core.spec import ORIGINAL, PolicySpec
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
-from ..ir.pieces import ADVANCE, USE_PRUNER, of_loop
+from ..ir.pieces import ADVANCE, PRUNER, USE_PRUNER, of_loop
 from ..ir.program import Program
 from .call_interface import condition_numbers, write_interface
 from .contexts import Contexts
@@ -97,8 +97,10 @@ def lower_single_file(
         LoweringError: an observation has the name of another input or output; the residual stream changes its type; a
             context cannot be repeated for a batch; or the file would have 2 GB.
     """
+    weights = {**weights, **program.loop_weights.get(loop, {})}
+    own = {piece: models.get(of_loop(piece, loop)) for piece in (ADVANCE, PRUNER)}
+    models = {**models, **{piece: model for piece, model in own.items() if model is not None}}
     program = program.in_loop(loop)
-    models = {**models, ADVANCE: models.get(of_loop(ADVANCE, loop), models[ADVANCE])}
     spec, types = program.spec, sorted({str(block.type) for block in program.blocks})
     stream = program.blocks[0].type
     if len(types) != 1 or stream.dtype != "float32" or stream.batch_axis is None:

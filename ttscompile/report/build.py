@@ -12,12 +12,13 @@ from ..artifact.load import Artifact
 from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
-from ..measure.units import flops, ms, share
+from ..measure.units import ms, share
 from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
-from .measure import Course, Latency, measure_parts, run_episode
+from .measure import Course, run_episode
 from .page import Page, Picture, Section, Table, require_packages
+from .timing import Measurement, measure_plans, timing_remarks, timing_table
 from .verified import NOT_RUN
 
 MOST_PICTURES = 6
@@ -33,14 +34,14 @@ class Given:
         comparison: points of one; None for none.
         verification: what was found; see ``verified``.
         threads: of the calls that are timed.
-        runs: counted calls of each plan.
+        calls: counted ones of each plan.
     """
 
     episode: Episode | None = None
     comparison: tuple[Point, ...] | None = None
     verification: Section = NOT_RUN
     threads: int = 1
-    runs: int = 10
+    calls: int = 10
 
 
 def build(
@@ -60,7 +61,7 @@ def build(
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")
-    latencies = measure_parts(policy, manifest.spec, (DENSE, *manifest.plans), given.runs)
+    measured = measure_plans(policy, manifest.spec, (DENSE, *manifest.plans), given.calls)
     course = None
     if given.episode is not None:
         progress("running an episode")
@@ -73,8 +74,8 @@ def build(
         facts.blocks(manifest),
         _plans(artifact, course),
         *(() if course is None else (_episode(course),)),
-        _latency(latencies, given, manifest.default_plan),
-        _frontier(artifact, latencies, given.comparison),
+        _latency(measured, given, manifest.default_plan),
+        _frontier(artifact, measured, given.comparison),
         _calibration(manifest.calibration),
         given.verification,
         facts.limits(artifact),
@@ -83,21 +84,21 @@ def build(
     return Page(
         title=f"Report on artifact {manifest.short_identity}",
         lead=", ".join(f"{value}" for value in manifest.spec.source.values()) or "A policy of the user's own network",
-        figures=_figures(artifact, latencies),
+        figures=_figures(artifact, measured),
         sections=sections,
         foot=f"Made by ttscompile {machine.get('ttscompile', '')} from identity {manifest.identity}. Times: medians of"
-        f" {given.runs} calls on {one_line(machine)}.",
+        f" {given.calls} calls on {one_line(machine)}.",
     )
 
 
-def _figures(artifact: Artifact, latencies: Sequence[Latency]) -> tuple[tuple[str, str], ...]:
+def _figures(artifact: Artifact, measured: Sequence[Measurement]) -> tuple[tuple[str, str], ...]:
     manifest = artifact.manifest
-    by_name = {latency.plan: latency for latency in latencies}
+    by_name = {one.plan: one for one in measured}
     own, dense = by_name[manifest.default_plan], by_name[DENSE]
     made = [
-        ("a call now", f"{ms(own.total)} ms"),
-        ("faster than dense", f"{dense.total / own.total:.1f} x"),
-        ("FLOPs saved", share(1 - own.flops / manifest.flops.dense)),
+        ("a call now", f"{ms(own.median_ms)} ms"),
+        ("faster than dense", f"{dense.median_ms / own.median_ms:.1f} x"),
+        ("FLOPs saved", share(1 - (own.flops or 0) / manifest.flops.dense)),
         ("denoising steps", str(manifest.steps)),
         ("residual blocks", str(len(manifest.blocks))),
     ]
@@ -150,48 +151,28 @@ def _episode(course: Course) -> Section:
     return Section("Episode", (text,), pictures=(Picture(pictures.sparsity_picture(course), caption, alt),))
 
 
-def _latency(latencies: Sequence[Latency], given: Given, default: str) -> Section:
-    seeing = any(one.parts["frames"] for one in latencies)
-    rows = tuple(
-        (
-            one.plan + (" (default)" if one.plan == default else ""),
-            ms(one.total),
-            "..".join(map(ms, one.quartiles)),
-            f"{one.parts['prologue']:.2f}",
-            *[f"{one.parts['frames']:.2f}"] * seeing,
-            f"{one.parts['pruner']:.2f}",
-            f"{one.parts['wait_pruner']:.2f}",
-            ms(one.parts["decode"]),
-            flops(one.flops),
-        )
-        for one in latencies
-    )
-    parts = ("prologue", *["of it frames"] * seeing, "pruner", "wait for it", "denoising loop")
-    head = ("plan", "ms a call", "quartiles", *parts, "FLOPs")
+def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Section:
     text = (
-        f"Medians of {given.runs} calls of each plan, which took turns; one stream,"
-        f" {given.threads} thread{'s' * (given.threads != 1)}, onnxruntime. The pruner runs beside step 0: only the"
-        " wait for it lengthens a call."
+        timing_remarks(measured, given.calls),
+        f"{given.threads} thread{'s' * (given.threads != 1)}; {one_line(fingerprint())}",
     )
-    if seeing:
-        text += " Every call computes all of its frames here; those that are known, or prepared before, cost nothing."
     alt = "Bars: what the calls of each plan spend their time on. The table has the figures."
-    drawn = Picture(pictures.latency_picture(latencies), "What the calls of each plan spend their time on.", alt)
-    return Section("Latency", (text, one_line(fingerprint())), (Table(head, rows),), (drawn,))
+    drawn = Picture(pictures.latency_picture(measured), "What the calls of each plan spend their time on.", alt)
+    return Section("Latency", text, (timing_table(measured, default),), (drawn,))
 
 
-def _frontier(artifact: Artifact, latencies: Sequence[Latency], compared: tuple[Point, ...] | None) -> Section:
+def _frontier(artifact: Artifact, measured: Sequence[Measurement], compared: tuple[Point, ...] | None) -> Section:
     manifest = artifact.manifest
     if compared is not None:
         points = compared
-        text = "As ttscompile compare measured it, on the machine and the calls that its document names."
+        text = "As ttscompile bench measured it, on the machine and the calls that its document names."
     else:
         judged = facts.scores(manifest.calibration, ("distance",))
-        known = [one for one in latencies if one.plan in judged]
+        known = [one for one in measured if one.plan in judged]
         points = tuple(
-            Point("this artifact", p.plan, max(float(judged[p.plan]["distance"]), 0.0), p.total) for p in known
+            Point("this artifact", p.plan, max(float(judged[p.plan]["distance"]), 0.0), p.median_ms) for p in known
         )
-        text = "Distances from the calibration record, latencies measured now. ttscompile compare measures more of it."
+        text = "Distances from the calibration record, latencies measured now. ttscompile bench -t measures both."
     if not any(point.error > 0 for point in points):
         return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)

@@ -18,8 +18,8 @@ from ..hub.name import HubName, read_name
 from ..measure.machine import fingerprint, one_line
 from ..measure.units import flops, ms, share
 from . import facts
-from .measure import Latency
 from .page import Section, Table
+from .timing import Measurement
 
 BASE, BASE_LICENCE = "base", "base_licence"
 """Entries of ``PolicySpec.source`` that ``convert`` writes of a checkpoint from the hub."""
@@ -99,14 +99,18 @@ def licence_of(manifest: Manifest, given: str | None) -> str | None:
 
 
 def card(
-    artifact: Artifact, repository: str, latencies: Sequence[Latency], success: Sequence[Success], licence: str | None
+    artifact: Artifact,
+    repository: str,
+    measured: Sequence[Measurement],
+    success: Sequence[Success],
+    licence: str | None,
 ) -> str:
     """The text of ``README.md``.
 
     Args:
         artifact: loaded.
         repository: ``org/name``.
-        latencies: of calls with its default plan and with the dense one, measured now.
+        measured: calls with its default plan and with the dense one, measured now.
         success: what was evaluated; may be empty.
         licence: from ``licence_of``.
     """
@@ -130,7 +134,7 @@ def card(
         _what(manifest, base, licence),
         _errors(manifest),
         _success(success),
-        _speed(latencies, manifest),
+        _speed(measured, manifest),
         _made(manifest, base),
         facts.limits(artifact),
     ):
@@ -194,16 +198,16 @@ def _shown(figure: tuple[float, float, float]) -> str:
     return "{:.3f} [{:.3f}, {:.3f}]".format(*figure)
 
 
-def _speed(latencies: Sequence[Latency], manifest: Manifest) -> Section:
+def _speed(measured: Sequence[Measurement], manifest: Manifest) -> Section:
     rows = tuple(
         (
             one.plan + " (default)" * (one.plan == manifest.default_plan),
-            ms(one.total),
-            "..".join(map(ms, one.quartiles)),
-            flops(one.flops),
-            share(one.flops / manifest.flops.dense),
+            ms(one.median_ms),
+            "..".join(map(ms, one.quartiles_ms)),
+            flops(one.flops or 0),
+            share((one.flops or 0) / manifest.flops.dense),
         )
-        for one in latencies
+        for one in measured
     )
     head = ("plan", "ms a call", "quartiles", "FLOPs a call", "of the captured policy")
     text = f"Medians of calls of one stream on one thread of {one_line(fingerprint())}. Yours is another machine."
@@ -229,11 +233,10 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
         asked = {k: budget[k] for k in goals if isinstance(budget, Mapping) and isinstance(budget.get(k), int | float)}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
+        learned = record.get("learned")
+        if isinstance(learned, list) and learned not in ([], ["schedule"]):
+            words += f" --learn {','.join(map(_word, learned[:8]))}"
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
-    if manifest.weights:
-        trained = facts.distillation(record)
-        words = " ".join(f"--{key} {_word(trained[key])}" for key in ("plan", "rank", "updates") if key in trained)
-        lines.append(f"ttscompile distill DIR --trajectories CALLS {words}".rstrip())
     lines.append("ttscompile verify DIR")
     text = (
         f"With ttscompile {manifest.ttscompile_version}, by commands like these, from what the artifact records;"

@@ -1,4 +1,4 @@
-"""Points of distance from the original against latency, from what ``ttscompile compare --json`` printed."""
+"""Points of distance from the original against latency, from what ``ttscompile bench -t --json`` printed."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..errors import ReportError
 from ..measure.points import Point
 
 MAX_BYTES = 16 * 2**20
-_REMEDY = "Give what 'ttscompile compare ... --json' printed."
+_REMEDY = "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed."
 
 
 def read_comparison(path: Path) -> tuple[Point, ...]:
     """Points of a comparison.
 
     Raises:
-        ReportError: the file is not what ``ttscompile compare --json`` prints.
+        ReportError: the file is not what ``ttscompile bench -t --json`` prints.
     """
     require_path(path, ReportError, _REMEDY)
     try:
@@ -27,6 +27,7 @@ def read_comparison(path: Path) -> tuple[Point, ...]:
             document: Any = parse_json(file.read(MAX_BYTES + 1), MAX_BYTES)
     except (OSError, ValueError) as error:
         raise ReportError(f"{path}: no JSON document: {error}. {_REMEDY}") from error
+    document = document.get("comparison") if isinstance(document, dict) else None
     document = document if isinstance(document, dict) else {}
     points: Any = document.get("points")
     good = isinstance(points, list) and all(
@@ -34,7 +35,7 @@ def read_comparison(path: Path) -> tuple[Point, ...]:
     )
     if not good:
         raise ReportError(
-            f"{path}: expected an object with 'points', which have distance and latency_ms; found"
+            f"{path}: expected a 'comparison' with 'points', which have distance and latency_ms; found"
             f" {sorted(map(str, document))[:8]}. {_REMEDY}"
         )
     return tuple(

@@ -20,8 +20,7 @@ from ..measure.units import flops, plain, share
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
-_DISTILLED = "distilled"
-_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", _DISTILLED)
+_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", "told")
 _ERRORS = ("error", "error_p90")
 
 
@@ -236,26 +235,17 @@ def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
 
 def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What the figures of a calibration mean, in words."""
-    return (*other_noise(record), *own_weights(record), *left_out(record))
+    return (*other_noise(record), *learned(record), *left_out(record))
 
 
-def own_weights(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """That a plan is another network, and what that gained."""
-    told = distillation(record)
-    if not told:
-        return ()
-    before, after = (_mapping(told.get(key)).get("error") for key in ("before", "after"))
-    trained = (
-        f"Plan {_DISTILLED!r} has the schedule of plan {plain(told.get('plan'))!r} and weights of its own:"
-        f" {plain(told.get('matrices'))} matrices of blocks were trained, which took its error from {plain(before)} to"
-        f" {plain(after)}. So its errors say less about it than those of other plans: evaluate it on your task."
+def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """What became of what was learned, in the words of what learns it; and that a plan is another network."""
+    told = {str(name): one for name, one in _mapping(record.get("told")).items() if isinstance(one, str) and one}
+    network = (
+        "A plan with weights of its own is another network. So its errors say less about it than those of other plans:"
+        " evaluate it on your task."
     )
-    return (trained,)
-
-
-def distillation(record: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """What a distillation noted down; empty if there was none."""
-    return _mapping((record or {}).get(_DISTILLED))
+    return (*(f"Learned, {name}: {one}." for name, one in told.items()), *[network] * ("weights" in told))
 
 
 def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:

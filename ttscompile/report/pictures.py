@@ -19,8 +19,9 @@ from ..measure.units import ms
 from ..plots.figure import STEPS_AXIS, beside, new_figure, plain_powers
 from ..plots.frontier import plot_frontier
 from ..plots.maps import COLOURS, plot_plan
-from .measure import Course, Latency
+from .measure import Course
 from .page import Picture
+from .timing import Measurement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,7 +31,7 @@ _PARTS = {
     "wait_pruner": ("#cc79a7", "wait for the pruner"),
     "decode": ("#d55e00", "denoising loop"),
 }
-"""Colour and name of each of ``PARTS``."""
+"""Colour and name of the parts of a call that add up to nearly all of it."""
 
 _DWARFS = 4.0
 """A bar is cut off where it is so many times as long as the next."""
@@ -97,24 +98,24 @@ def sparsity_picture(course: Course) -> bytes:
     return _png(figure)
 
 
-def latency_picture(latencies: Sequence[Latency]) -> bytes:
+def latency_picture(measured: Sequence[Measurement]) -> bytes:
     """A bar a plan, cut into what its calls spend their time on; a bar that would dwarf the others is cut off."""
-    figure = new_figure(6.0, 1.5 + 0.45 * len(latencies))
+    figure = new_figure(6.0, 1.5 + 0.45 * len(measured))
     axes = figure.add_subplot()
-    rows = np.arange(len(latencies))[::-1]
-    left = np.zeros(len(latencies))
+    rows = np.arange(len(measured))[::-1]
+    left = np.zeros(len(measured))
     for part, (colour, name) in _PARTS.items():
-        widths = np.array([latency.parts[part] for latency in latencies])
+        widths = np.array([one.parts_ms[part] for one in measured])
         axes.barh(rows, widths, left=left, height=0.6, color=colour, label=name)
         left += widths
     ends = sorted(left)
     cut = len(ends) > 1 and ends[-1] > _DWARFS * ends[-2]
     limit = 1.35 * (ends[-2] if cut else ends[-1])
     axes.set_xlim(0, limit)
-    axes.set_yticks(rows, [plain(latency.plan, 24) for latency in latencies])
-    for row, end, latency in zip(rows, left, latencies, strict=True):
+    axes.set_yticks(rows, [plain(one.plan, 24) for one in measured])
+    for row, end, one in zip(rows, left, measured, strict=True):
         inside = bool(end > limit)
-        told = f"{ms(latency.total)} ms" + ", cut off" * inside
+        told = f"{ms(one.median_ms)} ms" + ", cut off" * inside
         place, shift, side, colour = (limit, -6, "right", "white") if inside else (end, 4, "left", "black")
         moved: dict[str, Any] = {"xytext": (shift, 0), "textcoords": "offset points", "va": "center", "ha": side}
         axes.annotate(told, (place, row), color=colour, **moved)

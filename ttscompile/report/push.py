@@ -15,7 +15,7 @@ from ..hub.name import require_repository
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from .card import card, licence_of, read_success
-from .measure import measure_parts
+from .timing import measure_plans
 
 
 def push(
@@ -63,7 +63,7 @@ def push(
     progress("timing calls")
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     plans = tuple(dict.fromkeys((manifest.default_plan, DENSE)))
-    text = card(artifact, repository, measure_parts(policy, artifact.manifest.spec, plans, runs), success, licence)
+    text = card(artifact, repository, measure_plans(policy, artifact.manifest.spec, plans, runs), success, licence)
     if dry_run:
         return text
     progress("uploading")

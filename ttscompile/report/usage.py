@@ -49,7 +49,9 @@ def uses(artifact: Artifact) -> tuple[Use, ...]:
     for loop in (ORIGINAL, *manifest.spec.loops):
         if (loop == ORIGINAL and PRUNER in manifest.pieces) or of_loop(PRUNER, loop) in manifest.pieces:
             deciding = (name for name, plan in manifest.plans.items() if plan.pruned and plan.loop == loop)
-            found.append(Use(HEAD, f"the pruner of loop {loop!r}", tuple(deciding)))
+            found.append(
+                Use(HEAD, "the pruner" if loop == ORIGINAL else f"the pruner of loop {loop!r}", tuple(deciding))
+            )
     for source in Source:
         for b in range(len(manifest.blocks)):
             plans = tuple(name for name, cells in sources.items() if cells[:, b, source].any())

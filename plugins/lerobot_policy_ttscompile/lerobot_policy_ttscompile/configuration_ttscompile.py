@@ -16,8 +16,9 @@ class TtscompileConfig(PreTrainedConfig):
         n_action_steps: actions of a chunk that are executed.
         runtime: ``onnxruntime``, ``torch``, or ``reference``, which is slow.
         threads: threads of arithmetic.
-        plan: name of a plan of the artifact, ``dense`` among them; None for the artifact's default.
-        precision: of the weights, ``fp32`` or the artifact's own; None for the latter.
+        plan: name of a plan of the artifact, ``dense`` among them, or ``NAME@fp32`` for one in another precision; None
+            for the artifact's default.
+        precision: of older configurations, in which it was not part of the plan's name; the policy moves it there.
     """
 
     n_action_steps: int = 1

@@ -17,6 +17,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 import ttscompile
+from ttscompile.artifact.load import read_manifest
 
 from .configuration_ttscompile import TtscompileConfig
 
@@ -56,9 +57,10 @@ class TtscompilePolicy(PreTrainedPolicy):
                 " convert wrote"
             )
         self._directory = Path(directory)
-        self._policy = ttscompile.load(
-            directory, config.runtime, config.threads, plan=config.plan, precision=config.precision
-        )
+        if config.precision is not None:
+            config.plan = f"{config.plan or read_manifest(self._directory).default_plan}@{config.precision}"
+            config.precision = None
+        self._policy = ttscompile.load(directory, config.runtime, config.threads, plan=config.plan)
         observed = {key for key in self._policy.info.observation if not key.startswith(_LANGUAGE)}
         if set(config.input_features or {}) != observed:
             raise ValueError(
@@ -170,7 +172,7 @@ class TtscompilePolicy(PreTrainedPolicy):
         first = torch.randn(shape) if initial is None else initial.cpu()
         if not info.stochastic:
             return ttscompile.Noise(first[:, :predicted].numpy())
-        steps = torch.stack([torch.randn(shape) for _ in range(info.K - 1)] + [torch.zeros(shape)])
+        steps = torch.stack([torch.randn(shape) for _ in range(info.noise_steps - 1)] + [torch.zeros(shape)])
         return ttscompile.Noise(first[:, :predicted].numpy(), steps[:, :, :predicted].numpy())
 
 

@@ -14,6 +14,7 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
@@ -115,13 +116,13 @@ def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatc
 
 def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
     few, many = (begun(trials.base, n, dense_plan(n, len(trials.artifact.manifest.blocks))) for n in (1, 4))
-    scores = [judge(trials.holding(one), one.plan, LEARNED) for one in (few, many)]
+    scores = [judge(holding(trials, one), one.plan, LEARNED) for one in (few, many)]
     assert scores[0].distance > max(scores[1].distance, 0.1)
 
 
 def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
     warm = begun(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
-    found = first(Start(request(margin=1e6)), trials.holding(warm), warm.plan)
+    found = first(Start(request(margin=1e6)), holding(trials, warm), warm.plan)
     assert found.plan.otherwise is trials.base
     assert described(found) == (1, [0])
 
@@ -145,10 +146,11 @@ def test_what_is_learned_is_written_and_loaded(folder: Path, tmp_path: Path) -> 
     assert loops == [LOOP, f"{LOOP}-last-1"]
 
 
-def test_what_is_far_off_changes_nothing(folder: Path, tmp_path: Path) -> None:
+def test_what_is_far_off_changes_nothing(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start, "MARGIN", -9.0)
     before = (folder / "manifest.json").read_bytes()
     with pytest.raises(CalibrationFailedError, match="is allowed"):
-        calibrate(folder, recorded(tmp_path / "calls.npz"), learn=("start",), max_distance=1e-9, progress=False)
+        calibrate(folder, recorded(tmp_path / "calls.npz"), learn=("start",), progress=False)
     assert (folder / "manifest.json").read_bytes() == before
 
 

@@ -15,6 +15,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import prepare_calls
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.held import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers.student import Array, Lesson, Student, trainable
 from ttscompile.calibration.proposers.weights import NAME, Weights
@@ -35,7 +36,7 @@ PLAN = Plan(cells=whole_steps_plan(policies.STEPS, 2 * policies.LAYERS, [0, 5]),
 
 
 def with_weights(trials: Trials, weights: dict[str, Array]) -> Executor:
-    held = trials.holding(Proposal(NAME, PLAN, weights={NAME: BlockWeights(weights, {})}))
+    held = holding(trials, Proposal(NAME, PLAN, weights={NAME: BlockWeights(weights, {})}))
     return Executor(held.view(PLAN))
 
 

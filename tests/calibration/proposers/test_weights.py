@@ -34,6 +34,8 @@ from ttscompile.core.correction import no_correction
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
+from ttscompile.report import facts
+from ttscompile.report.card import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -93,6 +95,17 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     record = artifact.manifest.calibration
     assert record is not None
     assert record["plans"][NAME]["distance"] == result.plans[NAME].distance
+
+
+def test_people_are_told_that_it_is_another_network(distilled: Trained, scheduled: Path) -> None:
+    artifact = load_artifact(distilled[0])
+    record = artifact.manifest.calibration
+    assert record is not None
+    remarks = facts.remarks(record)
+    assert f"Learned, weights: 9 matrices of blocks were trained in {UPDATES} updates." in remarks
+    assert any("is another network" in remark for remark in remarks)
+    assert "--learn schedule,weights`" in card(artifact, "org/name", [], [], None)
+    assert "--learn" not in card(load_artifact(scheduled), "o/n", [], [], None)
 
 
 def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: Trained) -> None:
@@ -174,6 +187,7 @@ def exchange_weights(directory: Path) -> None:
     (directory / MANIFEST).write_bytes(codec.encode(replace(manifest, identity=identity, model_identity=model)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("saves", [1, 4])
 def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     distilled: Trained, copied: Path, recording: Path, saves: int
@@ -186,6 +200,7 @@ def test_a_distillation_that_was_killed_goes_on_to_the_same_bytes(
     assert contents(copied) == contents(distilled[0])
 
 
+@pytest.mark.slow
 def test_the_rate_of_a_distillation_that_goes_on_is_not_what_it_began_with(
     copied: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,6 +233,7 @@ def test_what_was_interrupted_is_not_taken_for_something_else(copied: Path, reco
         train(copied, recording, rank=2, resume=True)
 
 
+@pytest.mark.slow
 def test_the_outcome_does_not_depend_on_the_number_of_threads(
     distilled: Trained, copied: Path, recording: Path
 ) -> None:
@@ -282,6 +298,7 @@ def test_calibrating_again_drops_it(distilled: Trained, recording: Path, tmp_pat
     assert not list(directory.glob("blocks-*"))
 
 
+@pytest.mark.slow
 def test_in_eight_bits(once: Once, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "compiled"))
     train(policies.whole_steps(directory, recording), recording)

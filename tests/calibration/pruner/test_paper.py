@@ -42,6 +42,7 @@ def task(make_task: MakeTask, monkeypatch: pytest.MonkeyPatch) -> Task:
     return replace(task, calls=in_windows(task, 12))
 
 
+@pytest.mark.slow
 def test_training_lowers_the_error_and_keeps_the_budget(task: Task) -> None:
     search = trained(task, 1, begin=[0, 1, 2])
     before, after = search.loss, trained(task, 20, begin=[0, 1, 2])
@@ -119,6 +120,7 @@ def test_nothing_is_tried_before_the_first_update(task: Task) -> None:
     assert not clock.cut
 
 
+@pytest.mark.slow
 def test_going_on_equals_not_stopping(task: Task) -> None:
     whole, stopped = trained(task, 12), trained(task, 5)
     resumed = Paper(task)
@@ -129,6 +131,7 @@ def test_going_on_equals_not_stopping(task: Task) -> None:
         np.testing.assert_array_equal(resumed.state()[name], value, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correct", [False, True])
 def test_an_artifact_executes_it(
     compiled: Path, tmp_path: Path, correct: bool, monkeypatch: pytest.MonkeyPatch

@@ -17,6 +17,7 @@ from ...core.plan import Plan
 from ...core.start import rest_of
 from ...errors import CalibrationFailedError, SpecError
 from ..clock import Clock
+from ..held import holding
 from ..judge import further, judge
 from ..proposer import Proposal, Proposals, Request
 from ..trials import LEARNED, Trials, base_of
@@ -57,7 +58,7 @@ class Start:
         trials.bar.stage("numbers of steps", len(found))
         for number, one in enumerate(found):
             (steps,) = (record.steps for record in one.starts.values())
-            off, limits[steps] = further(judge(trials.holding(one), one.plan, LEARNED), score)
+            off, limits[steps] = further(judge(holding(trials, one), one.plan, LEARNED), score)
             trials.bar.update(number + 1, f"{steps} steps: {off:.3g} further", clock.left())
             if limits[steps] <= self._margin:
                 self.told = f"calls but an episode's first begin with the chunk before, in the last {steps} steps"

@@ -21,6 +21,7 @@ from ...lower.precision import quantize_model
 from ..clock import Clock
 from ..execute import Executor
 from ..fit_correction import fit_correction
+from ..held import holding
 from ..proposer import Proposal, Proposals, Request
 from ..trials import Trials
 from .student import Student, trainable
@@ -63,7 +64,7 @@ class Weights:
         first, original = corrected(trials.executor), {name: trials.artifact.weights[name] for name in names}
         if plan.correction is None and first.correction is not None:  # what that alone does is no merit of the weights
             yield Proposal(trials.name, replace(plan, correction=first.correction))
-        held = trials.holding(Proposal(NAME, first, weights={NAME: BlockWeights(original, {})}))
+        held = holding(trials, Proposal(NAME, first, weights={NAME: BlockWeights(original, {})}))
         student = Student(
             Executor(held.view(first.exact), trials.device), first, self._rank, trials.seed, self._updates
         )

@@ -1,4 +1,4 @@
-"""``ttscompile realtime``."""
+"""``ttscompile bench --control-hz``."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ from ttscompile.core.lattice import dense_plan, uniform_plan
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(main, ["realtime", *map(str, arguments)])
+    result = CliRunner().invoke(main, ["bench", *map(str, arguments)])
     return result.exit_code, result.stdout, result.stderr
 
 
 def test_it_says_what_is_feasible_with_the_arithmetic(toy_compiled: Path) -> None:
     """The toy has two actions a chunk: without a margin they last for a frame and two short calls."""
-    code, out, _ = run(toy_compiled, "--control-hz", 5, "--margin-ticks", 0, "--runs", 3, "--json")
+    code, out, _ = run(toy_compiled, "--control-hz", 5, "--margin-ticks", 0, "--calls", 3, "--json")
     assert code == 0
     document = json.loads(out)
-    (name,) = document["plans"]
-    dense = document["plans"][name]
-    assert name == "dense"
+    (name,) = document["loop"]["plans"]
+    dense = document["loop"]["plans"][name]
+    (timed,) = document["contestants"]
+    assert name == timed["label"] == "dense"
     assert dense["feasible"]
     assert (dense["play"], dense["predicted"]) == pytest.approx((0.4, 0.4))
     assert dense["needed"] == pytest.approx(0.2 + 2 * dense["latency"])
-    assert dense["latency"] * 1e3 >= dense["median_ms"]
-    assert document["jitter"] is None
+    assert dense["latency"] * 1e3 == pytest.approx(max(timed["times_ms"]))
+    assert dense["latency"] * 1e3 >= timed["median_ms"]
+    assert document["loop"]["jitter"] is None
 
 
 def test_what_is_not_feasible_is_exit_status_1(toy_compiled: Path) -> None:
-    code, out, _ = run(toy_compiled, "--control-hz", 5, "--runs", 3)
+    code, out, _ = run(toy_compiled, "--control-hz", 5, "--calls", 3)
     assert code == 1
     assert "too slow" in out
     assert "ms > 400 ms = 2 actions at 5 Hz" in out
 
 
 def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
-    code, out, _ = run(toy_compiled, "--control-hz", 10, "--margin-ticks", 0, "--runs", 2, "--jitter", 0.3)
+    code, out, _ = run(toy_compiled, "--control-hz", 10, "--margin-ticks", 0, "--calls", 2, "--jitter", 0.3)
     assert code == 0
     assert "200 Hz loop" in out
     assert "alone" in out
@@ -54,7 +56,7 @@ def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path
     calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
     plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one
     store_schedules(calibrated, None, plans, "schedule", {"strategy": "tts"})
-    loop = ("--control-hz", 10, "--margin-ticks", 0, "--runs", 3, "--jitter", 0.1)
+    loop = ("--control-hz", 10, "--margin-ticks", 0, "--calls", 3, "--jitter", 0.1)
     assert "beside plan 'schedule'" in run(calibrated, *loop)[1]
     told = run(calibrated, *loop, "--plan", "uniform")[1]
     assert "beside plan 'uniform'" in told
@@ -67,7 +69,8 @@ def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path
         (["--control-hz", 25, "--policy-hz", 10], "no multiple of policy_hz"),
         (["--control-hz", 10, "--plan", "quick"], "no plan 'quick'"),
         (["--control-hz", 10, "--horizon", 9], "Give at most 2"),
-        ([], "--control-hz"),
+        (["--margin-ticks", 1], "--margin-ticks is for --control-hz: give it too"),
+        (["--jitter", 1], "--jitter is for --control-hz: give it too"),
     ],
 )
 def test_bad_usage_is_exit_status_2(toy_compiled: Path, arguments: list[object], message: str) -> None:

@@ -1,0 +1,125 @@
+"""What accuracy costs with published strategies: each finds a plan for each share of reused cells, now.
+
+    python examples/benchmark/strategies.py compiled/ -t calls.npz --strategies tts,bac,interval --plot frontier.png
+
+Their plans take part beside those of the artifact, and of other artifacts, in what ``ttscompile bench -t`` measures:
+held-out action error and latency. Until the end, what searches found is kept in a file beside the artifact's own, for
+``--resume``; nothing else is written there.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.strategies import NAMES
+from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
+from ttscompile.cli.options import (
+    artifact_argument,
+    count_option,
+    json_option,
+    names_option,
+    ray_option,
+    seed_option,
+    threads_option,
+)
+from ttscompile.cli.output import print_json, progress, results, run, say
+from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.types import PATH, PICTURE, TEXT, Number
+from ttscompile.measure.machine import fingerprint, one_line
+
+
+def default_sparsities(steps: int) -> tuple[float, ...]:
+    """Shares of the cells that a policy of ``steps`` steps can reuse, from safe to daring.
+
+    Of less than 50 steps, what leaves five, three and two to compute: a single one is more than 0.98 leaves. Of two
+    steps one can be left, and of a single one nothing.
+    """
+    if steps <= 2:
+        return (0.5,) * (steps - 1)
+    return (0.9, 0.95, 0.98) if steps >= 50 else tuple(1 - left / steps for left in (5, 3, 2) if left < steps)
+
+
+def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    if value is None:
+        return None
+    try:
+        found = tuple(dict.fromkeys(float(part) for part in value.split(",") if part.strip()))
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; expected numbers, such as 0.9,0.95.") from error
+    if wrong := [one for one in found if not 0 < one < 1]:
+        raise click.BadParameter(f"{wrong[0]:g} is not above 0 and below 1.")
+    return found
+
+
+@click.command(cls=FilesCommand)
+@artifact_argument
+@trajectories_options()
+@names_option("--strategies", NAMES, default="tts,bac,interval", help="Have each of these find plans.")
+@click.option(
+    "--sparsities",
+    type=TEXT,
+    callback=_sparsities,
+    help="Find a plan for each of these shares of reused cells; 0.9,0.95,0.98 if not given, or, of less than 50 steps,"
+    " what leaves five, three and two.",
+)
+@click.option(
+    "--with", "others", multiple=True, type=PATH, metavar="DIR...", help="Let these artifacts take part, too."
+)
+@count_option("--calls", "Judge on so many held-out calls, at most.", default=32)
+@count_option("--learned-calls", "Learn from so many calls, at most.", default=256, least=2)
+@threads_option("Threads that onnxruntime computes with.")
+@click.option(
+    "--max-minutes",
+    type=Number(0, 1e6),
+    default=3.0,
+    show_default=True,
+    help="End each search after so many minutes, about; there is one for each strategy and sparsity.",
+)
+@click.option(
+    "--correct",
+    is_flag=True,
+    help="Let plans of strategies that fit no correction take part a second time, with one that is fitted to them.",
+)
+@count_option("--intervals", "End each search after so many intervals; for a quick look.", default=None)
+@seed_option("Seed of the split, the noise and the searches.")
+@ray_option
+@click.option("--resume", is_flag=True, help="Go on after the searches that an interrupted run had done.")
+@click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")
+@json_option
+def main(
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    strategies: tuple[str, ...],
+    sparsities: tuple[float, ...] | None,
+    others: tuple[Path, ...],
+    learned_calls: int,
+    picture: Path | None,
+    as_json: bool,
+    **search: Any,  # ttscompile.calibration.compare takes them by the same names
+) -> None:
+    """Hold plans that strategies find now against those of the artifact DIRECTORY."""
+    artifacts = {str(path): load_artifact(path) for path in (directory, *others)}
+    of = artifacts[str(directory)].manifest
+    wished = (sparsities or default_sparsities(of.steps)) if strategies else ()
+    how = {"observation": sources, "learned": learned_calls, **search}
+    found = compare(directory, artifacts, others, trajectories, strategies, wished, **how)
+    if as_json:
+        compared = [{"path": str(path), "identity": artifacts[str(path)].manifest.identity} for path in others]
+        machine = fingerprint()
+        print_json({"identity": of.identity, "with": compared, "machine": machine, "comparison": found.to_json()})
+    else:
+        output = results()
+        print_comparison(found, output)
+        say(output, one_line(fingerprint()))
+        say(output, *(f"{path}: identity {one.manifest.short_identity}" for path, one in artifacts.items()))
+    if picture is not None:
+        say(progress(), draw_comparison(found, directory, picture))
+
+
+if __name__ == "__main__":
+    run(main)

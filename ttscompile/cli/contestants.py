@@ -1,0 +1,204 @@
+"""What ``ttscompile bench`` times: plans of artifacts in several ways, and the original network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.manifest import marked
+from ttscompile.artifact.view import view_of
+from ttscompile.core.plan import DENSE, Plan
+from ttscompile.core.spec import Affine, Noise, PolicySpec
+from ttscompile.errors import RuntimeUnavailableError, SpecError
+from ttscompile.report.timing import Contestant, plan_contestant
+from ttscompile.runtimes.liveness import reads_earlier_calls
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.open import require_able
+from ttscompile.runtimes.policy import CompiledPolicy
+from ttscompile.runtimes.random_calls import Observation, normalized
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from ttscompile.frontends.eager import EagerPolicy
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a compiled policy runs.
+
+    Attributes:
+        runtime: ``onnxruntime`` or ``torch``.
+        device: that torch computes on; None for the CPU.
+        threads: that it computes with.
+    """
+
+    runtime: str = "onnxruntime"
+    device: str | None = None
+    threads: int = 1
+
+    @property
+    def place(self) -> str:
+        """What computes, for people."""
+        return self.runtime + f" on {self.device}" * (self.device is not None)
+
+    def open(self, artifact: Artifact, plan: str) -> CompiledPolicy:
+        """A policy of the artifact that runs so."""
+        return open_policy(artifact, self.runtime, self.threads, plan=plan, device=self.device)
+
+
+def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: Sequence[Way]) -> list[Contestant]:
+    """Plans of artifacts, each in every way; first the dense plan of the first artifact.
+
+    Every second plan shares a policy: what one reads is not in the processor's caches for the next, and there are no
+    more than two copies of the weights. A plan that goes on from an earlier call has a policy of its own.
+
+    Args:
+        artifacts: by name.
+        plans: of the first artifact, and of the others where they have one of this name; all where none is named.
+            ``NAME@PRECISION`` is one in another precision.
+        ways: how they run.
+
+    Raises:
+        ArtifactError: one cannot be run, or has no models of a plan's precision.
+        IllegalPlanError: the first has no plan of this name.
+        RuntimeUnavailableError: a runtime or device cannot be had, or cannot do what a plan asks for.
+    """
+    made: list[Contestant] = []
+    specs: dict[tuple[str, str], PolicySpec] = {}
+
+    def enter(series: str, policy: CompiledPolicy, plan: str, way: Way) -> None:
+        policy.reset()
+        label = [f"{series}: " * (len(artifacts) > 1) + marked(plan)]
+        if any(one.place != Way().place for one in ways):
+            label.append(way.place)
+        if len({one.threads for one in ways}) > 1:
+            label.append(f"{way.threads} thread{'s' * (way.threads > 1)}")
+        found = artifacts[series].plan(plan)
+        if "@" not in plan:
+            label += dict.fromkeys(found.precision.values())
+        found = found.otherwise or found  # whose loop the noise is for
+        spec = specs.setdefault((series, found.loop), view_of(artifacts[series], found).manifest.spec)
+        one = plan_contestant(", ".join(label), policy, plan, spec)
+        made.append(replace(one, threads=way.threads))
+
+    for series, artifact in artifacts.items():
+        known = list(artifact.plans)
+        if not made:
+            known = list(dict.fromkeys(plans or known))
+        elif plans:
+            known = [name for name in dict.fromkeys(plans) if name.partition("@")[0] in known]
+        for way in ways:
+            wanted = known if made else list(dict.fromkeys((DENSE, *known)))
+            for plan in wanted:
+                require_able(way.runtime, artifact, artifact.plan(plan))
+            pair = [way.open(artifact, plan) for plan in wanted[:2]]
+            for plan in wanted:
+                own = _goes_on(artifact, artifact.plan(plan))
+                enter(series, way.open(artifact, plan) if own else pair[len(made) % len(pair)], plan, way)
+    return made
+
+
+def _goes_on(artifact: Artifact, plan: Plan) -> bool:
+    """Whether what a call of it computes depends on the calls before."""
+    return plan.otherwise is not None or plan.tokens is not None or reads_earlier_calls(view_of(artifact, plan), plan)
+
+
+def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
+    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
+
+    Args:
+        checkpoint: as ``convert`` took it.
+        encoders: the folder that ``convert`` was given with it, if it was.
+        threads: of PyTorch.
+        artifact: that was made from it.
+
+    Raises:
+        RuntimeUnavailableError: there is no torch.
+        SpecError: the checkpoint is of another policy.
+    """
+    try:
+        import torch
+
+        from ttscompile.frontends.eager import eager_policy
+        from ttscompile.frontends.encoded import parts
+    except ModuleNotFoundError as error:
+        raise RuntimeUnavailableError(
+            f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
+            " or leave --checkpoint out."
+        ) from error
+    module, saved = original_policy(checkpoint, artifact.manifest.spec, encoders)
+    torch.set_num_threads(threads)
+    manifest, found = artifact.manifest, artifact.default.otherwise or artifact.default
+    own = replace(manifest.spec.whole_horizon, sampler=manifest.sampler_of(found.loop), loops={})
+    made: list[Contestant] = []
+    for spec in (saved, own):
+        sampler = spec.sampler
+        if made and sampler.name == saved.sampler.name and np.array_equal(sampler.timesteps, saved.sampler.timesteps):
+            continue
+        # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
+        same = sampler.steps == manifest.steps or parts(module).encoder is None
+        flops = manifest.flops.dense / manifest.steps * sampler.steps if same else None
+        label = f"original, {sampler.name} {sampler.steps}"
+        made.append(network_contestant(label, eager_policy(module, spec), spec, flops))
+    return made
+
+
+def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = None) -> tuple[nn.Module, PolicySpec]:
+    """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
+
+    Args:
+        checkpoint: as ``convert`` took it.
+        spec: specification of the policy in the artifact.
+        encoders: see ``originals``.
+
+    Raises:
+        SpecError: the checkpoint is of another policy.
+    """
+    from ttscompile.frontends import load_checkpoint_policy
+    from ttscompile.frontends.families import as_converted
+
+    module, original = load_checkpoint_policy(checkpoint, options=as_converted(spec.source, encoders))
+    wrong = f"{checkpoint}: expected the policy that the artifact was made from"
+    found, expected = _interface(original), _interface(spec)
+    if found != expected:
+        raise SpecError(f"{wrong}, {expected}; found {found}. Give that policy's checkpoint.")
+    if different := ", ".join(_different_statistics(original, spec)):
+        told = f"found another one of the same shapes: the normaliser of {different} differs"
+        raise SpecError(f"{wrong}; {told}. Give that policy's checkpoint.")
+    return module, original
+
+
+def network_contestant(label: str, run: EagerPolicy, spec: PolicySpec, dense_flops: float | None) -> Contestant:
+    """The whole network in PyTorch, once a step; ``dense_flops`` as in ``Contestant``."""
+    import torch
+
+    def call(obs: Observation, noise: Noise) -> object:
+        return run({key: torch.from_numpy(array) for key, array in normalized(spec, obs).items()}, noise)
+
+    return Contestant(label, "dense", call, lambda: None, spec, dense_flops)
+
+
+def _interface(spec: PolicySpec) -> str:
+    observations = ", ".join(f"{key} {observation.shape}" for key, observation in spec.observations.items())
+    return f"sample {spec.whole_horizon.sample}, observations {observations}"
+
+
+def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
+    """What is normalised with other numbers: the statistics of the training data tell policies of one task apart."""
+    pairs = {
+        f"observation {k!r}": (o.normalizer, expected.observations[k].normalizer) for k, o in found.observations.items()
+    }
+    pairs["the action"] = (found.chunk.normalizer, expected.chunk.normalizer)
+    return [name for name, (left, right) in pairs.items() if not _same(left, right)]
+
+
+def _same(left: Affine | None, right: Affine | None) -> bool:
+    if left is None or right is None:
+        return left is right
+    return np.array_equal(left.scale, right.scale) and np.array_equal(left.offset, right.offset)
