@@ -204,5 +204,5 @@ def test_converting_keeps_the_original_beside_the_loop_that_is_asked_for(
     assert told["record_original"] == ("20 of 20 steps, 2 streams", "ddim-4: 4 of 4")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     shapes = {value.name: value.shape for value in session.get_inputs()}
-    assert shapes["plan"] == [4, len(program.blocks)] and "step_noise" not in shapes
+    assert shapes["plan"] == ["P", 4, len(program.blocks)] and "step_noise" not in shapes
     assert ttscompile.verify(tmp_path / "compiled").passed

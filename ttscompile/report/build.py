@@ -102,7 +102,7 @@ def _figures(artifact: Artifact, measured: Sequence[Measurement]) -> tuple[tuple
         ("denoising steps", str(manifest.steps)),
         ("residual blocks", str(len(manifest.blocks))),
     ]
-    if (score := facts.scores(manifest.calibration).get(manifest.default_plan)) is not None:
+    if (score := facts.scores(manifest.calibration, ("error",)).get(manifest.default_plan)) is not None:
         made.append(("held-out action error", f"{score['error']:.3g}"))
     return tuple(made)
 
