@@ -33,9 +33,6 @@ CALLS_A_FEATURE = 3
 """Calls to learn from at least, for each number that a correction reads. On Push-T (97 of them, 95 %) one that is
 fitted on 30 calls does harm, on 64 it lowers the held-out error from 19 to 6 px, on 128 to 2.7."""
 
-JUDGED = 128
-"""Calls of the held-out episodes at most that plans are judged on."""
-
 
 def require_limits(validation_fraction: float, max_minutes: float) -> None:
     """Raise unless some episodes are held out, others are not, and there is time.

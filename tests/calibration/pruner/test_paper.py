@@ -15,6 +15,7 @@ from tests.calibration.tasks import MakeTask, in_windows
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import judge, schedule
 from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.proposer import Proposal
@@ -185,7 +186,7 @@ def test_a_head_is_kept_if_it_is_nearer_than_the_schedule_and_its_plans_differ(
     consider = Kept.consider
 
     def seen(self: Kept, proposal: Proposal) -> bool:
-        score = judge.judge(self.trials.holding(proposal), proposal.plan)
+        score = judge.judge(holding(self.trials, proposal), proposal.plan)
         considered.append((proposal.name, consider(self, proposal), score))
         return considered[-1][1]
 
