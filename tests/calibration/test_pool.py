@@ -120,7 +120,7 @@ def test_a_cluster_that_goes_leaves_a_state_from_which_this_process_goes_on(
 def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four parts of the dense calls, then two of the four searches; the other two are done here."""
+    """Four parts of the dense calls, then two of the four searches; the others come next, and the held-out calls."""
 
     def compared(pool: Elsewhere | Here, **options: Any) -> Any:
         monkeypatch.setattr("ttscompile.calibration.compare.opened_pool", lambda address: nullcontext(pool))
@@ -131,8 +131,10 @@ def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
         compared(Elsewhere(3, 6))
     rest = Elsewhere(1)
     found, expected = compared(rest, resume=True), compared(Here())
-    assert rest.done == 2
-    here, there = ([(p.series, p.name, p.sparsity, p.error) for p in one.points] for one in (found, expected))
+    assert rest.done == 2 + 1  # searches, and the part of what the original answers
+    here, there = (
+        [(p.series, p.name, p.sparsity, p.error, p.distance) for p in one.points] for one in (found, expected)
+    )
     assert len(here) == 5
     assert here == there
 
