@@ -54,6 +54,7 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
     assert kwargs == {
         "trajectories": [Path("a.npz"), Path("b.npz")],
         "observation": {},
+        "learn": ("schedule",),
         "target_sparsity": None,
         "strategy": "tts",
         "correct": False,
@@ -62,6 +63,9 @@ def test_every_file_up_to_the_next_option_is_taken(arguments: list[str], asked: 
         "target_flops": None,
         "latency_ms": None,
         "max_action_error": None,
+        "max_distance": None,
+        "rank": 16,
+        "updates": 600,
         "threads": 1,
         "max_minutes": 15.0,
         "device": None,
