@@ -26,7 +26,8 @@ from tests.calibration import policies, tasks
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.once import Once
 from tests.passes.modules import MODULES, spec
-from ttscompile.calibration import strategies
+from ttscompile.calibration import proposer, strategies
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.cli import main
 from ttscompile.frontends import families
 from ttscompile.runtimes import open as open_module
@@ -337,6 +338,26 @@ def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monk
     test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
     for budget in test.test_a_budget_of_one_step_leaves_step_0.pytestmark[0].args[1]:
         test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
+
+
+@pytest.mark.slow
+def test_the_proposer_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module, its row and its test as they stand in the guide."""
+    written, row, its_test = guide("proposer")
+    contributed(written, "ttscompile.calibration.proposers.fewer", tmp_path, monkeypatch)
+    rows = (*proposer.PROPOSERS, eval(row, vars(proposer)))
+    monkeypatch.setattr(proposer, "PROPOSERS", rows)
+    monkeypatch.setattr(proposer, "NAMES", tuple(one.name for one in rows))
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    directory = shutil.copytree(policies.compiled(once), tmp_path / "compiled")
+    recording = policies.record(tmp_path / "calls.npz")
+    test.test_the_step_that_matters_least_is_left_out(directory, recording)
+    test.test_of_step_0_alone_nothing_is_left_out(directory, recording)
+    learned = ("schedule", "fewer")
+    result = calibrate(directory, [recording], 0.6, learn=learned, max_distance=9.0, progress=False)
+    assert result.default_plan == "fewer"
+    assert result.plans["fewer"].sparsity == pytest.approx(result.plans["schedule"].sparsity + 0.1)
+    assert result.told["fewer"].endswith("is left out")
 
 
 @pytest.mark.slow

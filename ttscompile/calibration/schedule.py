@@ -105,6 +105,10 @@ class Schedule:
             found, budget = task.whole_steps(best.steps), replace(budget, cells=more * blocks)
         if not kept:
             return
+        told = f"{self.intervals} interval{'s' * (self.intervals != 1)}"
+        self.told = (
+            f"{budget.cells} of {steps * blocks} cells may be computed; strategy {request.strategy!r} took {told}"
+        )
         if found.pruner is not None:
             yield self._of_pruner(plan, found)
         named, self.skipped = named_plans(crowded, task, self._strategy, budget.cells)
