@@ -65,6 +65,7 @@ def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: 
     assert artifact.manifest.default_plan == result.default_plan
 
 
+@pytest.mark.slow
 def test_what_it_measured_is_what_the_artifact_does(
     calibrated: tuple[Path, CalibrationResult], recording: Path
 ) -> None:

@@ -120,6 +120,7 @@ def test_a_plan_that_cannot_be_corrected_is_left_out_with_the_reason(
     assert ("interval", "0.5") in points(found)
 
 
+@pytest.mark.slow
 def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Comparison) -> None:
     assert len(frontier.warnings) == 1
     assert frontier.warnings[0].startswith(
@@ -284,6 +285,7 @@ def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(pla
     assert "computes at least 24 of the 10 x 6 cells" in found.skipped["deepcache 0.8"]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(
     planned: Path, linear_policy: Path, recording: Path, tmp_path: Path
 ) -> None:

@@ -62,6 +62,7 @@ def test_an_artifact_has_the_plans_that_there_can_be(tiny: tuple[Path, dict[floa
     assert (plans[0.0] == Source.COMPUTE).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_floor_runs_every_block_as_often_as_it_says(
     tiny: tuple[Path, dict[float, np.ndarray]], threads: int, monkeypatch: pytest.MonkeyPatch

@@ -79,6 +79,7 @@ def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: 
         assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_tokens_of_both_cameras_may_be_reused(compiled: Path) -> None:
     """SigLIP and the connector behind it are one piece, whose tokens are found."""
     manifest = load_artifact(compiled).manifest
@@ -126,6 +127,7 @@ def test_the_text_of_a_task_in_place_of_its_tokens(
         ttscompile.load(compiled, tokenizer=compiled)
 
 
+@pytest.mark.slow
 def test_verify_names_a_broken_layer(compiled: Path, tmp_path: Path) -> None:
     shutil.copytree(compiled, tmp_path / "compiled")
     with edited(tmp_path / "compiled", "weights") as arrays:

@@ -176,6 +176,7 @@ def _first(graph: Graph, inputs: dict[str, Tensor]) -> Tensor:
     return value if isinstance(value, Tensor) else value[0]
 
 
+@pytest.mark.slow
 def test_elementwise_is_elementwise() -> None:
     """Numbers that change places together give results that change places."""
     for graph, node in _nodes("elementwise"):

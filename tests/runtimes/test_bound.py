@@ -122,6 +122,7 @@ def test_every_way_to_make_a_call_bounds_it_alike(corrected: Corrected) -> None:
         assert (np.abs(sample[:, 0]) < 1).any(), "what is within the range is left there"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_committed_actions_stay_what_they_are(corrected: Corrected, runtime: str) -> None:
     """Those of a prefix may be beyond the range of training: they are executed already."""

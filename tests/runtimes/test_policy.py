@@ -53,6 +53,7 @@ def test_load_is_what_the_package_offers() -> None:
     assert ttscompile.load is load
 
 
+@pytest.mark.slow
 def test_actions_are_normalised_in_and_out_and_cut(policy: CompiledPolicy, toy_artifact: Artifact) -> None:
     out = policy.predict_action({"obs": OBS}, noise=some_noise(), plan="dense")
     runtime = open_runtime(toy_artifact)

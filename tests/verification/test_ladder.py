@@ -46,6 +46,7 @@ def failure(artifact: Path, *recordings: Path) -> Rung:
     return found.first_failure
 
 
+@pytest.mark.slow
 def test_a_sound_artifact_holds(sound: Path) -> None:
     """Whether its plans save time is no matter here, which other work may hide."""
     found = ttscompile.verify(sound)
