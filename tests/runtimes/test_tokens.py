@@ -120,6 +120,7 @@ def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> 
     assert sizes_of(37) == (5, 10, 19, 37)
 
 
+@pytest.mark.slow
 def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(compiled / "artifact", tmp_path / "own")
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))

@@ -97,6 +97,7 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     assert record["plans"][NAME]["distance"] == result.plans[NAME].distance
 
 
+@pytest.mark.slow
 def test_people_are_told_that_it_is_another_network(distilled: Trained, scheduled: Path) -> None:
     artifact = load_artifact(distilled[0])
     record = artifact.manifest.calibration
