@@ -94,6 +94,7 @@ def test_what_it_measured_is_what_the_artifact_does(
     assert apart == pytest.approx(result.other_noise, rel=0.35)
 
 
+@pytest.mark.slow
 def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult]) -> None:
     directory, result = calibrated
     manifest = load_artifact(directory).manifest

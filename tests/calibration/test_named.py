@@ -56,6 +56,7 @@ def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
     assert record["skipped"] == {}
 
 
+@pytest.mark.slow
 def test_a_plan_is_chosen_when_loading_or_calling(calibrated: tuple[Path, CalibrationResult]) -> None:
     artifact, result = calibrated
     policy = ttscompile.load(artifact, plan="safe", seed=0)

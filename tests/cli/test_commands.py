@@ -78,6 +78,7 @@ def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None
             assert first[:1].isupper() and first not in ("Of", "In", "To", "Its"), f"{name} {word}: {option.help}"
 
 
+@pytest.mark.slow
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
     result = run("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
@@ -106,12 +107,14 @@ def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
     assert plans["uniform"]["flops"] == pytest.approx(plans["dense"]["flops"] - 0.95 * flops["blocks"])
 
 
+@pytest.mark.slow
 def test_inspect_tells_the_same_in_tables(scheduled: Path) -> None:
     text = run("inspect", scheduled).stdout
     for expected in ("K = 100", "self_attention", "cross_attention", "feed_forward", "uniform (default)", "95.0%"):
         assert expected in text
 
 
+@pytest.mark.slow
 def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None:
     result = run("inspect", scheduled, "--plot", tmp_path / "plan.png", "--json")
     json.loads(result.stdout)
@@ -146,6 +149,7 @@ def test_an_observation_that_does_not_fit(arrays: dict[str, Any], reason: str, p
     assert reason in result.stderr
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path, tmp_path: Path) -> None:
     arguments = ["inspect", str(scheduled), "--plot", str(tmp_path / "plan.png"), "--plan", "best"]
     result = CliRunner().invoke(main, arguments)
@@ -184,6 +188,7 @@ def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_wo
     assert fewest_threads({4: 8.0, 2: 9.9, 1: 12.0}) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

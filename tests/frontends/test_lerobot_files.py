@@ -66,6 +66,7 @@ def test_they_say_what_the_robot_gives_and_normalise_nothing(folder: Path) -> No
     assert read(folder / "compiled", "policy_postprocessor.json") == {"name": "policy_postprocessor", "steps": [device]}
 
 
+@pytest.mark.slow
 def test_the_artifact_is_the_same_without_them(folder: Path, tmp_path: Path) -> None:
     """They are no part of it: load, its identity and calibration leave them alone, and a zip may lack them."""
     whole, bare = shutil.copytree(folder / "compiled", tmp_path / "whole"), tmp_path / "bare"
@@ -110,6 +111,7 @@ def test_convert_says_that_there_are_none(tmp_path: Path) -> None:
     assert not {path.name for path in (tmp_path / "compiled").iterdir()} & set(BESIDE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["auto", "lerobot"])
 def test_a_compiled_policy_is_not_taken_for_one_that_lerobot_trained(folder: Path, tmp_path: Path, format: str) -> None:
     with pytest.raises(CheckpointError, match="an artifact that is compiled already"):

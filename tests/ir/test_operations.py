@@ -146,6 +146,7 @@ def test_an_operation_without_a_row_is_refused(op: str) -> None:
         graph_flops(graph)
 
 
+@pytest.mark.slow
 def test_a_network_with_an_operation_without_a_row_is_refused_at_capture() -> None:
     class Uncommon(Uses):
         def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
@@ -192,6 +193,7 @@ def test_elementwise_is_elementwise() -> None:
         torch.testing.assert_close(_first(bare, moved), expected, equal_nan=True, msg=of(node))
 
 
+@pytest.mark.slow
 def test_linear_is_linear() -> None:
     """What is affine gives for a sum of inputs, less one, the sum of what it gives, less one."""
     for graph, node in _nodes("linear"):

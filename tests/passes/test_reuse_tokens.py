@@ -51,6 +51,7 @@ def test_some_tokens_give_what_they_literally_give(kind: str, tokens: int, fixed
     assert (whole - value).abs().max() > 1e-3, "tokens that were not computed keep what they gave"
 
 
+@pytest.mark.slow
 def test_a_second_run_changes_nothing() -> None:
     assert ReuseTokens()(compiled("clip")).program is compiled("clip")
 

@@ -94,6 +94,7 @@ def variant(name: str) -> Program:
     return replace(program, spec=replace(program.spec, sampler=random_sampler(6, 3, memories=1, clip=0.3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 @pytest.mark.parametrize("streams", [1, 3])
 def test_episodes_of_its_plans(tmp_path: Path, name: str, streams: int) -> None:
@@ -105,6 +106,7 @@ def test_episodes_of_its_plans(tmp_path: Path, name: str, streams: int) -> None:
     assert len(plans) > 4 * streams
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 def test_exported_it_computes_the_same(tmp_path: Path, name: str) -> None:
     """For two streams, whose plans differ."""
@@ -131,6 +133,7 @@ def exported(plain: tuple[Program, PrunedCall, CompiledPolicy, float]) -> torch.
         return torch.export.export(plain[1], draw(plain[0], 1, np.random.default_rng(9)))
 
 
+@pytest.mark.slow
 def test_without_a_rollout_cache_every_call_is_the_first_of_an_episode(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram
 ) -> None:
@@ -151,6 +154,7 @@ def test_without_a_rollout_cache_every_call_is_the_first_of_an_episode(
     assert repaired > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["as it stands", "exported"])
 def test_a_block_that_is_reused_is_not_evaluated(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram, form: str
@@ -181,6 +185,7 @@ def called(graph: GraphModule, name: str) -> list[torch.fx.Node]:
     return [node for node in graph.graph.nodes if node.op == "call_function" and str(node.target) == name]
 
 
+@pytest.mark.slow
 def test_the_head_and_the_branches_are_in_the_exported_program(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram
 ) -> None:
@@ -228,6 +233,7 @@ def test_what_is_exported_can_be_compiled_and_run_without_python(
         assert_equal_but_for_rounding(actions, wanted, terms)
 
 
+@pytest.mark.slow
 def test_a_broken_pruner_is_said(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram
 ) -> None:
@@ -248,6 +254,7 @@ def test_a_broken_pruner_is_said(
     assert all(call(*given)[0].isfinite().all() for call in both)
 
 
+@pytest.mark.slow
 def test_a_rollout_cache_of_other_streams_is_refused(plain: tuple[Program, PrunedCall, CompiledPolicy, float]) -> None:
     program, module, _, _ = plain
     given = draw(program, 1, np.random.default_rng(0))
