@@ -159,6 +159,7 @@ def test_without_resume_it_begins_anew_and_the_same_seed_gives_the_same_bytes(
     assert contents(artifact) == contents(calibrated[0])
 
 
+@pytest.mark.slow
 def test_a_damaged_state_is_refused(artifact: Path, recording: Path) -> None:
     (artifact / FILE).write_bytes(b"no state")
     with pytest.raises(CalibrationError, match="without --resume"):

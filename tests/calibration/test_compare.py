@@ -38,6 +38,8 @@ from ttscompile.plots.frontier import plot_frontier
 
 from . import policies
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="session")
 def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -69,7 +71,6 @@ def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
-@pytest.mark.slow
 def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
     assert list(found) == [
@@ -99,7 +100,6 @@ def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     assert frontier.calls == 8
 
 
-@pytest.mark.slow
 def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
     found = points(compare(planned, [recording], ["interval"], [0.5], calls=8, learned=400, correct=True))
     plain, corrected = found["interval", "0.5"], found["interval, corrected", "0.5"]
@@ -108,7 +108,6 @@ def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recordin
     assert corrected.distance < 0.7 * plain.distance
 
 
-@pytest.mark.slow
 def test_a_plan_that_cannot_be_corrected_is_left_out_with_the_reason(
     planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,7 +120,6 @@ def test_a_plan_that_cannot_be_corrected_is_left_out_with_the_reason(
     assert ("interval", "0.5") in points(found)
 
 
-@pytest.mark.slow
 def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: Path, frontier: Comparison) -> None:
     assert len(frontier.warnings) == 1
     assert frontier.warnings[0].startswith(
@@ -129,7 +127,6 @@ def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: 
     )
 
 
-@pytest.mark.slow
 def test_nothing_is_written(planned: Path, recording: Path) -> None:
     before = {path.name: path.read_bytes() for path in planned.iterdir()}
     compare(planned, [recording], ["interval"], [0.5], calls=1)
@@ -154,7 +151,6 @@ def interrupted_after(searches: int, monkeypatch: pytest.MonkeyPatch) -> list[st
     return begun
 
 
-@pytest.mark.slow
 def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     planned: Path, frontier: Comparison, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,7 +183,6 @@ def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     assert not (planned / "comparison-state.safetensors").exists()
 
 
-@pytest.mark.slow
 def test_without_resume_it_begins_anew(planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     interrupted_after(1, monkeypatch)
     with pytest.raises(Gone):
@@ -197,7 +192,6 @@ def test_without_resume_it_begins_anew(planned: Path, recording: Path, monkeypat
     assert begun == ["interval", "interval"]
 
 
-@pytest.mark.slow
 def test_why_there_is_no_plan_is_kept_too_and_a_damaged_state_is_refused(
     planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,7 +236,6 @@ def test_a_state_that_was_forged_is_refused(tmp_path: Path, searches: Any) -> No
         resumed()
 
 
-@pytest.mark.slow
 def test_a_zipped_artifact_is_compared_and_keeps_nothing(planned: Path, recording: Path, tmp_path: Path) -> None:
     zipped = Path(shutil.make_archive(str(tmp_path / "compiled"), "zip", planned))
     found = compare(zipped, [recording], ["interval"], [0.5], calls=1)
@@ -250,7 +243,6 @@ def test_a_zipped_artifact_is_compared_and_keeps_nothing(planned: Path, recordin
     assert [path.name for path in tmp_path.iterdir()] == ["compiled.zip"]
 
 
-@pytest.mark.slow
 def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Path, recording: Path) -> None:
     found = compare(planned, [recording], ["tts", "interval", "teacache"], [0.8], calls=1, learned=8, max_minutes=0)
     assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts", "interval"]
@@ -259,7 +251,6 @@ def test_it_says_when_a_search_had_too_little_time_or_too_few_calls(planned: Pat
     assert "tts fits corrections of 48 features from at most 8 calls" in found.warnings[2]
 
 
-@pytest.mark.slow
 def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path) -> None:
     found = compare(planned, [recording], ["tts-paper"], [0.5], calls=1, learned=8, intervals=1)
     assert [point.series for point in found.points] == ["this artifact"] * 2 + ["tts-paper"]
@@ -268,7 +259,6 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
 
 
-@pytest.mark.slow
 def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     """With a threshold that nothing passes the newest of two frames is taken for the one before."""
 
@@ -286,14 +276,12 @@ def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     assert whole.distance < reusing.distance
 
 
-@pytest.mark.slow
 def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:
     found = compare(planned, [recording], ["deepcache"], [0.8], calls=1)
     assert {point.series for point in found.points} == {"this artifact"}
     assert "computes at least 24 of the 10 x 6 cells" in found.skipped["deepcache 0.8"]
 
 
-@pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(
     planned: Path, linear_policy: Path, recording: Path, tmp_path: Path
 ) -> None:
@@ -309,7 +297,6 @@ def test_what_cannot_be_compared_is_refused(
         compare(planned, [policies.record(tmp_path / "one.npz", episodes=1)], [], [])
 
 
-@pytest.mark.slow
 def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Path) -> None:
     artifact = load_artifact(planned)
     manifest, (steps, channels) = artifact.manifest, artifact.manifest.spec.sample
@@ -340,7 +327,6 @@ def test_the_frontier_is_what_nothing_beats() -> None:
     assert [point["efficient"] for point in frontier.to_json()["points"]] == [True, False, True, True]
 
 
-@pytest.mark.slow
 def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp_path: Path) -> None:
     path = tmp_path / "f.png"
     arguments: tuple[Any, ...] = [p.point for p in frontier.points], [p.point for p in frontier.efficient()]
@@ -352,7 +338,6 @@ def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp
         plot_frontier(*arguments, tmp_path / "none" / "f.png", "title")
 
 
-@pytest.mark.slow
 def test_bench_prints_the_same_as_a_table_and_as_json(
     planned: Path, other_sampler: Path, recording: Path, tmp_path: Path
 ) -> None:
@@ -387,7 +372,6 @@ def test_bench_prints_the_same_as_a_table_and_as_json(
     assert f"five: identity {other[:12]}" in shown.stdout
 
 
-@pytest.mark.slow
 def test_bench_judges_the_plans_that_are_named(planned: Path, other_sampler: Path, recording: Path) -> None:
     twins = shutil.copytree(planned, planned.parent / "three")
     store_schedules(twins, None, {name: uniform_plan(10, 6, 5) for name in ("half", "same")}, "half", {})

@@ -22,6 +22,8 @@ from ttscompile.runtimes import open_runtime
 from ..families.support import record, stored_program
 from ..runtimes.agreement import call_terms, largest_difference
 
+pytestmark = pytest.mark.slow
+
 STATE, IMAGE = "observation.state", "observation.images.top"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 
@@ -82,7 +84,6 @@ def compiled(golden: Golden, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.mark.slow
 def test_single_evaluation(golden: Golden) -> None:
     """The denoiser alone."""
     module: Any = golden.module
@@ -92,7 +93,6 @@ def test_single_evaluation(golden: Golden) -> None:
     assert_equal_but_for_rounding(found, golden.numbers["probe_out"], counted.terms, counted.angle)
 
 
-@pytest.mark.slow
 def test_condition(golden: Golden) -> None:
     """Normalisers, crop and both CLIP encoders give LeRobot's condition vector."""
     module: Any = golden.module
@@ -102,7 +102,6 @@ def test_condition(golden: Golden) -> None:
     assert_equal_but_for_rounding(found, golden.numbers["condition"], counted.terms)
 
 
-@pytest.mark.slow
 def test_whole_call(golden: Golden) -> None:
     """The loop from the stored noise gives the stored chunk, normalised and not."""
     spec, numbers = golden.spec, golden.numbers
@@ -115,7 +114,6 @@ def test_whole_call(golden: Golden) -> None:
     assert np.abs(spec.chunk.normalizer.unnormalize(executed) - numbers["action"]).max() < 1e-4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_compiled_call(golden: Golden, compiled: Path, runtime: str) -> None:
     """The artifact from raw observations to the action in its units, within 1e-4."""
@@ -125,7 +123,6 @@ def test_compiled_call(golden: Golden, compiled: Path, runtime: str) -> None:
     assert np.abs(found["action"] - golden.numbers["action"]).max() < 1e-4
 
 
-@pytest.mark.slow
 def test_select_action_is_lerobots(golden: Golden, compiled: Path) -> None:
     """Frames one by one: the window is [first, second], and the chunk LeRobot's, action after action."""
     policy, expected = ttscompile.load(compiled), golden.numbers["action"]
@@ -141,7 +138,6 @@ def test_select_action_is_lerobots(golden: Golden, compiled: Path) -> None:
     assert policy.last_report is not first
 
 
-@pytest.mark.slow
 def test_encoders_and_modulations_leave_the_loop(golden: Golden, compiled: Path) -> None:
     """CLIP runs once a call; of the modulations only an addition is left of each step; K blocks of each kind."""
     program = stored_program(load_artifact(compiled))
@@ -158,7 +154,6 @@ def test_encoders_and_modulations_leave_the_loop(golden: Golden, compiled: Path)
     assert kinds == ["self_attention", "feed_forward"] * 4
 
 
-@pytest.mark.slow
 def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     """Episodes of random legal plans, several streams."""
     artifact = load_artifact(compiled)
@@ -167,7 +162,6 @@ def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=3) < bound(call_terms(artifact))
 
 
-@pytest.mark.slow
 def test_a_task_that_is_compiled_in(golden: Golden) -> None:
     """The tokenizer's files beside the policy make LeRobot's tokens; the instruction is no observation any more."""
     module, spec = load_checkpoint_policy(golden.directory, options=LoadOptions(task=str(golden.numbers["task"])))

@@ -27,6 +27,8 @@ from . import originals
 from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
+pytestmark = pytest.mark.slow
+
 SIZE = (96, 128)
 """Of the golden images, height and width."""
 
@@ -68,7 +70,6 @@ def eager(directory: Path, given: Mapping[str, Array], batch: Mapping[str, Array
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(given["noise"])).numpy())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
     policy = ttscompile.load(compiled, runtime=runtime)
@@ -79,7 +80,6 @@ def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: 
         assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
 
 
-@pytest.mark.slow
 def test_tokens_of_both_cameras_may_be_reused(compiled: Path) -> None:
     """SigLIP and the connector behind it are one piece, whose tokens are found."""
     manifest = load_artifact(compiled).manifest
@@ -127,7 +127,6 @@ def test_the_text_of_a_task_in_place_of_its_tokens(
         ttscompile.load(compiled, tokenizer=compiled)
 
 
-@pytest.mark.slow
 def test_verify_names_a_broken_layer(compiled: Path, tmp_path: Path) -> None:
     shutil.copytree(compiled, tmp_path / "compiled")
     with edited(tmp_path / "compiled", "weights") as arrays:

@@ -210,6 +210,7 @@ def test_linear_is_linear() -> None:
             torch.testing.assert_close(_first(graph, total), expected, msg=of(node))
 
 
+@pytest.mark.slow
 def test_movements_move() -> None:
     for graph, node in _nodes("movement"):
         ((name, type_),) = list(graph.inputs.items())[:1]

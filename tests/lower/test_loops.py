@@ -16,8 +16,9 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.ir.pieces import is_of_loop, part_of
 from ttscompile.lower.single_file import lower_single_file
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_models_that_differ_between_loops_have_the_loops_name() -> None:
     """A loop that clips, draws and remembers as the original does, in as many steps, has none of its own."""
     further = {name for name in models_of() if is_of_loop(name)}
@@ -32,7 +33,6 @@ def test_models_that_differ_between_loops_have_the_loops_name() -> None:
     assert {part_of(name) for name in further} == {None}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["ddim-3", "ddim-6-trailing"])
 def test_a_model_of_a_loop_is_that_of_its_own_program(loop: str) -> None:
     whole, alone = models_of(), models_of(loop)
@@ -48,7 +48,6 @@ def test_a_model_of_a_loop_is_that_of_its_own_program(loop: str) -> None:
             assert mine == its
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["original", "ddim-3"])
 def test_a_single_file_is_of_one_loop(loop: str) -> None:
     """To the byte that of the program that has no other."""

@@ -38,6 +38,8 @@ from .agreement import call_terms, random_inputs
 from .plans import random_correction
 from .toys import toy_program
 
+pytestmark = pytest.mark.slow
+
 STEPS, BLOCKS, HORIZON, STREAMS = 6, 3, 4, 2
 RUNTIMES = ("onnxruntime", "torch", "reference")
 
@@ -98,7 +100,6 @@ def normalized(artifact: Artifact, predicted: np.ndarray) -> np.ndarray:
     return chunk.normalizer.normalize(predicted)
 
 
-@pytest.mark.slow
 def test_every_way_to_make_a_call_bounds_it_alike(corrected: Corrected) -> None:
     artifact, correction, plan, file = corrected
     obs, noise = random_inputs(artifact, np.random.default_rng(1), STREAMS)
@@ -122,7 +123,6 @@ def test_every_way_to_make_a_call_bounds_it_alike(corrected: Corrected) -> None:
         assert (np.abs(sample[:, 0]) < 1).any(), "what is within the range is left there"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_committed_actions_stay_what_they_are(corrected: Corrected, runtime: str) -> None:
     """Those of a prefix may be beyond the range of training: they are executed already."""

@@ -33,6 +33,8 @@ from ttscompile.samplers.flow import flow_matching_table
 from .agreement import call_terms, random_inputs
 from .plans import random_correction, random_plan
 
+pytestmark = pytest.mark.slow
+
 STEPS = {"original": 6, "euler-4": 4}
 STARTS = {"original-last-2": StartRecord("original", 2), "euler-4-last-3": StartRecord("euler-4", 3)}
 
@@ -95,7 +97,6 @@ def with_cells(rng: np.random.Generator, artifact: Artifact, fields: Mapping[str
     return plan
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_any_combination_runs_in_every_runtime_that_can_do_its_parts(artifact: Artifact, seed: int) -> None:
     """Episodes in which every call has a plan of its own: nothing of one variant may be read by another."""
@@ -134,7 +135,6 @@ def test_any_combination_runs_in_every_runtime_that_can_do_its_parts(artifact: A
     assert len(ran) >= 4
 
 
-@pytest.mark.slow
 def test_the_cells_of_a_matrix_are_those_of_the_loop_that_was_loaded(artifact: Artifact) -> None:
     policy = ttscompile.load(artifact.path, plan="four")
     obs = {key: np.concatenate([one.draw(np.random.default_rng(0))]) for key, one in policy.info.observation.items()}
@@ -147,7 +147,6 @@ def test_the_cells_of_a_matrix_are_those_of_the_loop_that_was_loaded(artifact: A
     assert (policy.last_report.loop, policy.last_report.plan.shape) == ("original", (1, 6, 6))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -169,7 +168,6 @@ def test_a_plan_that_names_what_is_not_there_is_refused_by_its_name(
         policy.predict_action(obs, plan=Plan(cells=np.zeros((6, 6), np.int8), **fields))
 
 
-@pytest.mark.slow
 def test_a_copy_is_the_same(artifact: Artifact, tmp_path: Path) -> None:
     """Plans, loops and weights come back from disk as they were."""
     shutil.copytree(artifact.path, tmp_path / "copy")

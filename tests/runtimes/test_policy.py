@@ -67,6 +67,7 @@ def test_actions_are_normalised_in_and_out_and_cut(policy: CompiledPolicy, toy_a
     assert out["action"].flags.owndata
 
 
+@pytest.mark.slow
 def test_info_is_the_artifacts(quick: CompiledPolicy, toy_artifact: Artifact) -> None:
     info = quick.info
     assert (info.K, info.sample, info.stochastic, info.dense_flops) == (5, (3, 2), True, 1000)

@@ -30,6 +30,8 @@ from .agreement import call_terms
 from .pruners import calibrated, random_pruner
 from .toys import random_sampler, toy_program, written_artifact
 
+pytestmark = pytest.mark.slow
+
 NO_COMPILER = "NO C++ COMPILER: the exported module was not compiled; install g++"
 
 Inputs = tuple[dict[str, Tensor], Tensor, Tensor]
@@ -94,7 +96,6 @@ def variant(name: str) -> Program:
     return replace(program, spec=replace(program.spec, sampler=random_sampler(6, 3, memories=1, clip=0.3)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 @pytest.mark.parametrize("streams", [1, 3])
 def test_episodes_of_its_plans(tmp_path: Path, name: str, streams: int) -> None:
@@ -106,7 +107,6 @@ def test_episodes_of_its_plans(tmp_path: Path, name: str, streams: int) -> None:
     assert len(plans) > 4 * streams
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 def test_exported_it_computes_the_same(tmp_path: Path, name: str) -> None:
     """For two streams, whose plans differ."""
@@ -133,7 +133,6 @@ def exported(plain: tuple[Program, PrunedCall, CompiledPolicy, float]) -> torch.
         return torch.export.export(plain[1], draw(plain[0], 1, np.random.default_rng(9)))
 
 
-@pytest.mark.slow
 def test_without_a_rollout_cache_every_call_is_the_first_of_an_episode(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram
 ) -> None:
@@ -154,7 +153,6 @@ def test_without_a_rollout_cache_every_call_is_the_first_of_an_episode(
     assert repaired > 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["as it stands", "exported"])
 def test_a_block_that_is_reused_is_not_evaluated(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram, form: str
@@ -185,7 +183,6 @@ def called(graph: GraphModule, name: str) -> list[torch.fx.Node]:
     return [node for node in graph.graph.nodes if node.op == "call_function" and str(node.target) == name]
 
 
-@pytest.mark.slow
 def test_the_head_and_the_branches_are_in_the_exported_program(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram
 ) -> None:
@@ -212,7 +209,6 @@ def test_the_head_and_the_branches_are_in_the_exported_program(
     assert sum(len(called(one, "aten.tanh.default")) for one in graphs(whole)) == 5
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float],
@@ -233,7 +229,6 @@ def test_what_is_exported_can_be_compiled_and_run_without_python(
         assert_equal_but_for_rounding(actions, wanted, terms)
 
 
-@pytest.mark.slow
 def test_a_broken_pruner_is_said(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram
 ) -> None:
@@ -254,7 +249,6 @@ def test_a_broken_pruner_is_said(
     assert all(call(*given)[0].isfinite().all() for call in both)
 
 
-@pytest.mark.slow
 def test_a_rollout_cache_of_other_streams_is_refused(plain: tuple[Program, PrunedCall, CompiledPolicy, float]) -> None:
     program, module, _, _ = plain
     given = draw(program, 1, np.random.default_rng(0))

@@ -26,6 +26,8 @@ from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError,
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel, noise_tensors
 
+pytestmark = pytest.mark.slow
+
 STEPS, LAST, EXECUTED = 8, 3, 8
 SHAPE = (2, 16, 2)
 WARM = "warm"
@@ -93,7 +95,6 @@ def last_steps(policy: CompiledPolicy, obs: dict[str, Any], noise: Noise, plan: 
     return np.asarray(spec.chunk.unnormalized(made.sample.numpy()))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
 def test_calls_after_the_first_are_the_last_steps_of_the_loop(whole: Path, runtime: str) -> None:
     both, cold = ttscompile.load(whole, runtime, seed=0), ttscompile.load(whole, runtime, seed=0, plan="full")
@@ -114,7 +115,6 @@ def test_calls_after_the_first_are_the_last_steps_of_the_loop(whole: Path, runti
             assert (report.plan.shape[1], report.plan_name, report.loop) == (LAST, WARM, "ddpm-8-last-3")
 
 
-@pytest.mark.slow
 def test_a_plan_that_is_sparse_and_corrected_begins_so_too(whole: Path, tmp_path: Path) -> None:
     """What two arguments of load could not have together is two fields of a plan."""
     shutil.copytree(whole, tmp_path / "own")
@@ -132,7 +132,6 @@ def test_a_plan_that_is_sparse_and_corrected_begins_so_too(whole: Path, tmp_path
         assert policy.last_report.computed == (2 * blocks,) * 2
 
 
-@pytest.mark.slow
 def test_it_says_what_it_is(warm: CompiledPolicy, whole: Path) -> None:
     cold = ttscompile.load(whole, plan="full").info
     assert (warm.info.K, cold.K) == (LAST, STEPS)
@@ -140,14 +139,12 @@ def test_it_says_what_it_is(warm: CompiledPolicy, whole: Path) -> None:
     assert warm.info.default_plan == WARM
 
 
-@pytest.mark.slow
 def test_the_weights_are_there_once(warm: CompiledPolicy) -> None:
     sessions = [one.backend.sessions for one in warm._runtime._opened.values()]  # type: ignore[attr-defined]
     assert len(sessions) == 2
     assert all(one is sessions[0][name] for name, one in sessions[1].items())
 
 
-@pytest.mark.slow
 def test_the_arithmetic_of_the_last_steps_is_counted(warm: CompiledPolicy, whole: Path) -> None:
     artifact = load_artifact(whole)
     all_steps, own = (view_of(artifact, name).manifest.flops for name in ("full", WARM))
@@ -160,7 +157,6 @@ def test_the_arithmetic_of_the_last_steps_is_counted(warm: CompiledPolicy, whole
     assert own.dense == all_steps.dense == artifact.manifest.flops.dense, "of the original, whatever the loop"
 
 
-@pytest.mark.slow
 def test_an_update_in_fewer_groups_than_the_last_steps_would_have(
     one_layer_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,7 +172,6 @@ def test_an_update_in_fewer_groups_than_the_last_steps_would_have(
     assert np.isfinite(made).all()
 
 
-@pytest.mark.slow
 def test_actions_one_by_one_begin_chunks_in_turn(warm: CompiledPolicy, whole: Path) -> None:
     again = ttscompile.load(whole, seed=0)
     rng = np.random.default_rng(5)
@@ -187,7 +182,6 @@ def test_actions_one_by_one_begin_chunks_in_turn(warm: CompiledPolicy, whole: Pa
     np.testing.assert_array_equal(np.stack(one_by_one, 1), np.concatenate([first, second[:, :1]], 1))
 
 
-@pytest.mark.slow
 def test_a_call_that_is_early_moves_the_chunk_by_less_and_one_that_is_late_begins_with_noise(
     warm: CompiledPolicy,
 ) -> None:
@@ -204,7 +198,6 @@ def test_a_call_that_is_early_moves_the_chunk_by_less_and_one_that_is_late_begin
         warm.follow(-1)
 
 
-@pytest.mark.slow
 def test_a_refused_call_leaves_the_chunk_and_one_that_fails_ends_the_episode(
     warm: CompiledPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,7 +229,6 @@ def test_a_refused_call_leaves_the_chunk_and_one_that_fails_ends_the_episode(
     assert report.plan.shape[1:2] == (STEPS,), "a new episode, of any number of streams"
 
 
-@pytest.mark.slow
 def test_nobody_prepares_a_frame_during_a_call(warm: CompiledPolicy) -> None:
     warm.predict_action(*drawn(0))
     frame = {"obs": drawn(1)[0]["obs"][:, 0]}
@@ -247,7 +239,6 @@ def test_nobody_prepares_a_frame_during_a_call(warm: CompiledPolicy) -> None:
         warm.forget_frames()
 
 
-@pytest.mark.slow
 def test_what_cannot_go_together_is_refused(whole: Path, warm: CompiledPolicy, tmp_path: Path) -> None:
     obs, noise = drawn(0)
     warm.predict_action(obs, noise)

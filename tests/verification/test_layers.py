@@ -28,6 +28,8 @@ from ttscompile.verification.rung import Rung
 
 from .broken import edit_manifest, edited
 
+pytestmark = pytest.mark.slow
+
 
 def spec() -> PolicySpec:
     """With more steps than those at which layers are recorded."""
@@ -60,7 +62,6 @@ def weighted(program: Program) -> list[str]:
     return [name for name in map("{}.weight".format, layers(program)) if program.weights[name].nbytes > EMBEDDED_BYTES]
 
 
-@pytest.mark.slow
 def test_every_layer_of_the_network_is_recorded(made: tuple[Path, Program]) -> None:
     directory, program = made
     found = layers(program)
@@ -82,7 +83,6 @@ def test_every_layer_of_the_network_is_recorded(made: tuple[Path, Program]) -> N
             assert relative(project(result, None)[0], one) < RESIDUAL / 10
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("place", [0, -1])
 def test_the_weights_of_one_layer(place: int, artifact: Path, made: tuple[Path, Program]) -> None:
     name = weighted(made[1])[place]
@@ -93,7 +93,6 @@ def test_the_weights_of_one_layer(place: int, artifact: Path, made: tuple[Path, 
     assert f"Inside it {name.removesuffix('.weight')!r} is the first layer that differs, at step 0" in rung.told
 
 
-@pytest.mark.slow
 def test_weights_of_two_layers_exchanged(artifact: Path, made: tuple[Path, Program]) -> None:
     weights = made[1].weights
     names = weighted(made[1])
@@ -103,7 +102,6 @@ def test_weights_of_two_layers_exchanged(artifact: Path, made: tuple[Path, Progr
     assert failure(artifact).details["layer"] == one.removesuffix(".weight")
 
 
-@pytest.mark.slow
 def test_a_fault_that_is_in_no_layer(artifact: Path) -> None:
     """The table of one step that is not among those at which layers are recorded."""
     manifest, golden = read_manifest(artifact), load_golden(load_artifact(artifact))
@@ -118,7 +116,6 @@ def test_a_fault_that_is_in_no_layer(artifact: Path) -> None:
     assert f"Each of its {golden.layers.shape[1]} layers is right at steps 0, 1, " in rung.told
 
 
-@pytest.mark.slow
 def test_a_record_of_other_layers_is_refused(artifact: Path) -> None:
     path = artifact / "golden.safetensors"
     arrays = tensors.read(path)
@@ -128,7 +125,6 @@ def test_a_record_of_other_layers_is_refused(artifact: Path) -> None:
         ttscompile.verify(artifact)
 
 
-@pytest.mark.slow
 def test_no_call_opens_the_layers(artifact: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: set[str] = set()
     original = sessions._open_file

@@ -19,13 +19,14 @@ from ttscompile.errors import ArtifactError
 from ttscompile.lower.program import lower_program
 from ttscompile.verification.record_golden import record_original
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def record(kind: str, loop: str | None = None) -> Golden:
     return record_original(module_of(kind), program_of(kind, loop))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tokens", "skip"])
 def test_the_originals_record_is_that_of_a_policy_without_further_loops(kind: str) -> None:
     """Array by array; and what is of another loop has its name before it."""
@@ -81,7 +82,6 @@ def artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
     return load_artifact(folder)
 
 
-@pytest.mark.slow
 def test_a_record_comes_back(artifact: Artifact) -> None:
     found = load_golden(artifact)
     assert list(found.loops) == ["ddim-6-trailing"]
@@ -93,7 +93,6 @@ def test_a_record_comes_back(artifact: Artifact) -> None:
             np.testing.assert_array_equal(mine[name], array)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -27,6 +27,8 @@ from ttscompile.errors import CalibrationError, CalibrationFailedError
 
 from .trying import proposed, request, trials_of
 
+pytestmark = pytest.mark.slow
+
 STEPS, LOOP = 8, "ddim-8"
 
 
@@ -72,7 +74,6 @@ def described(proposal: Proposal) -> tuple[int, list[int]]:
     return len(cells), np.flatnonzero((cells == Source.COMPUTE).all(axis=1)).tolist()
 
 
-@pytest.mark.slow
 def test_candidates_are_dense_rests_and_those_of_the_schedule_by_what_they_compute(trials: Trials) -> None:
     """By hand: of the steps 0, 4 and 6 of 8 the last 2, 3 and 5 have 6, and of half of the loop all is tried."""
     dense = [(1, [0]), (2, [0, 1]), (3, [0, 1, 2])]
@@ -115,14 +116,12 @@ def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatc
         proposed(Start(request(margin=0.9)), trials, plan)
 
 
-@pytest.mark.slow
 def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
     few, many = (begun(trials.base, n, dense_plan(n, len(trials.artifact.manifest.blocks))) for n in (1, 4))
     scores = [judge(holding(trials, one), one.plan, LEARNED) for one in (few, many)]
     assert scores[0].distance > max(scores[1].distance, 0.1)
 
 
-@pytest.mark.slow
 def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
     warm = begun(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
     found = first(Start(request(margin=1e6)), holding(trials, warm), warm.plan)
@@ -130,7 +129,6 @@ def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
     assert described(found) == (1, [0])
 
 
-@pytest.mark.slow
 def test_what_is_learned_is_written_and_loaded(folder: Path, tmp_path: Path) -> None:
     files = recorded(tmp_path / "calls.npz")
     result = calibrate(folder, files, learn=("start",), max_distance=1e6, progress=False)
@@ -150,7 +148,6 @@ def test_what_is_learned_is_written_and_loaded(folder: Path, tmp_path: Path) -> 
     assert loops == [LOOP, f"{LOOP}-last-1"]
 
 
-@pytest.mark.slow
 def test_what_is_far_off_changes_nothing(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(start, "MARGIN", -9.0)
     before = (folder / "manifest.json").read_bytes()
@@ -165,7 +162,6 @@ def test_too_little_is_refused(folder: Path, tmp_path: Path) -> None:
         proposed(Start(request()), trials, trials.base)
 
 
-@pytest.mark.slow
 def test_a_loop_of_two_steps_has_half(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     ttscompile.convert(one_layer_checkpoint, tmp_path / "two", sampler="ddim", steps=2)
     artifact = load_artifact(tmp_path / "two")
@@ -173,7 +169,6 @@ def test_a_loop_of_two_steps_has_half(one_layer_checkpoint: Path, tmp_path: Path
     assert [described(one) for one in candidates(artifact, artifact.default)] == [(1, [0])]
 
 
-@pytest.mark.slow
 def test_a_loop_of_one_step_and_one_whose_table_does_not_tell_are_refused(
     compiled: Path, one_layer_checkpoint: Path, tmp_path: Path
 ) -> None:
