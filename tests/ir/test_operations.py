@@ -226,6 +226,7 @@ def test_movements_move() -> None:
                 assert movement is Movement.REPEAT or y.numel() <= x.numel(), node
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fact", ["along", "mixes"])
 def test_what_lies_across_is_treated_alike(fact: str) -> None:
     """To turn around an axis that an operation does not work along is to turn around its result."""
@@ -240,6 +241,7 @@ def test_what_lies_across_is_treated_alike(fact: str) -> None:
             torch.testing.assert_close(turned, y.flip(after), msg=of(node))
 
 
+@pytest.mark.slow
 def test_filled_is_filled() -> None:
     for graph, node in _nodes("filled"):
         row = operation(node.op)
@@ -249,6 +251,7 @@ def test_filled_is_filled() -> None:
             assert torch.equal(_first(graph, values(dict(graph.inputs))), torch.full(node.type.at(2), float(value)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "flops"),
     [

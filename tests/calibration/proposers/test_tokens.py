@@ -25,6 +25,8 @@ from ttscompile.verification import verify
 
 from .trying import proposed, request, trials_of
 
+pytestmark = pytest.mark.slow
+
 SIDE = cameras.SIDE
 
 
@@ -55,7 +57,6 @@ def tried(folder: Path, recordings: list[Path], **fields: float) -> tuple[Trials
     return trials, found
 
 
-@pytest.mark.slow
 def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_path: Path) -> None:
     trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
     assert found.plan.tokens is not None and found.shared == {"tokens": found.plan.tokens}
@@ -68,7 +69,6 @@ def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_
     assert found.plan.cells is trials.base.cells and found.plan.precision == trials.base.precision
 
 
-@pytest.mark.slow
 def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
     files = recorded(tmp_path / "calls.npz")
     result = calibrate(folder, files, learn=("tokens",), progress=False)
@@ -89,7 +89,6 @@ def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
     assert (folder / "manifest.json").read_bytes() == before
 
 
-@pytest.mark.slow
 def test_what_does_not_pay_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CalibrationFailedError, match=r"does not pay: \d+% of the tokens would be computed"):
         tried(folder, recorded(tmp_path / "calls.npz", shaking=0.5))
@@ -97,7 +96,6 @@ def test_what_does_not_pay_is_refused(folder: Path, tmp_path: Path) -> None:
         tried(folder, recorded(tmp_path / "calls.npz"), margin=-1.0)
 
 
-@pytest.mark.slow
 def test_what_computes_too_much_on_other_episodes_is_refused_there(folder: Path, tmp_path: Path) -> None:
     trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
     score = judge(trials, found.plan, HELD_OUT)
@@ -139,7 +137,6 @@ def test_a_larger_threshold_than_one_that_is_far_off_is_not_tried(
     assert tried(folder, recorded(tmp_path / "calls.npz"))[1].plan.tokens == TokenReuse(0.0, 6)
 
 
-@pytest.mark.slow
 def test_an_encoder_without_tokens_is_refused(once: Once) -> None:
     folder = once.folder("seeing", cameras.compile_seeing) / "artifact"
     told = Tokens(request()).applies(load_artifact(folder))
