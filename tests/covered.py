@@ -60,7 +60,10 @@ def measured() -> dict[Path, Counts]:
 
 def main() -> int:
     """Print the table."""
-    text, reached = table(by_room(measured()), FLOOR)
+    files = measured()
+    if not files:
+        sys.exit("error: nothing was measured. Run make pytest, or pytest --cov.")
+    text, reached = table(by_room(files), FLOOR)
     print(text)
     return 0 if reached else 1
 

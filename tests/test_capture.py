@@ -141,6 +141,7 @@ def test_a_module_that_cannot_be_copied_is_refused() -> None:
         capture(module, toy_spec())
 
 
+@pytest.mark.slow
 def test_state_that_changes_is_refused() -> None:
     class Counter(nn.Module):
         def __init__(self) -> None:

@@ -53,6 +53,7 @@ def test_the_wheel_runs_an_artifact(built: tuple[Path, Path], tmp_path: Path) ->
     assert Path(done.stdout.strip()).is_relative_to(target)
 
 
+@pytest.mark.slow
 def test_a_file_that_is_forgotten_is_found(built: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(release, "HOMES", {**release.HOMES, "docs": "ttscompile/docs"})
     assert "ttscompile/docs/design.md" in release.missing_or_more(built[1])

@@ -42,6 +42,7 @@ def test_nothing_asked_for_is_the_default_and_one_thing_is_itself() -> None:
     assert goal_of(max_action_error=3).record() == {"max_action_error": 3.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked", "message"),
     [

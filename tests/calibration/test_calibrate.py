@@ -65,6 +65,7 @@ def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: 
     assert artifact.manifest.default_plan == result.default_plan
 
 
+@pytest.mark.slow
 def test_what_it_measured_is_what_the_artifact_does(
     calibrated: tuple[Path, CalibrationResult], recording: Path
 ) -> None:
@@ -93,6 +94,7 @@ def test_what_it_measured_is_what_the_artifact_does(
     assert apart == pytest.approx(result.other_noise, rel=0.35)
 
 
+@pytest.mark.slow
 def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult]) -> None:
     directory, result = calibrated
     manifest = load_artifact(directory).manifest
@@ -157,6 +159,7 @@ def test_without_resume_it_begins_anew_and_the_same_seed_gives_the_same_bytes(
     assert contents(artifact) == contents(calibrated[0])
 
 
+@pytest.mark.slow
 def test_a_damaged_state_is_refused(artifact: Path, recording: Path) -> None:
     (artifact / FILE).write_bytes(b"no state")
     with pytest.raises(CalibrationError, match="without --resume"):

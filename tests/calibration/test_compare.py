@@ -38,6 +38,8 @@ from ttscompile.plots.frontier import plot_frontier
 
 from . import policies
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="session")
 def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -69,7 +71,6 @@ def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
     return {(point.series, point.name): point for point in frontier.points}
 
 
-@pytest.mark.slow
 def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
     assert list(found) == [
@@ -99,7 +100,6 @@ def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     assert frontier.calls == 8
 
 
-@pytest.mark.slow
 def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
     found = points(compare(planned, [recording], ["interval"], [0.5], calls=8, learned=400, correct=True))
     plain, corrected = found["interval", "0.5"], found["interval, corrected", "0.5"]
@@ -151,7 +151,6 @@ def interrupted_after(searches: int, monkeypatch: pytest.MonkeyPatch) -> list[st
     return begun
 
 
-@pytest.mark.slow
 def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     planned: Path, frontier: Comparison, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,7 +259,6 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
 
 
-@pytest.mark.slow
 def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
     """With a threshold that nothing passes the newest of two frames is taken for the one before."""
 

@@ -189,6 +189,7 @@ def warm(trials: Trials, last: int) -> Proposal:
     return Proposal("warm", plan, starts={"rest": StartRecord("original", last)})
 
 
+@pytest.mark.slow
 def test_a_plan_that_begins_with_the_chunk_before_is_judged_in_both_ways(
     flowing: Path, recording: Path, tmp_path: Path
 ) -> None:
@@ -216,6 +217,7 @@ def executed(samples: np.ndarray) -> np.ndarray:
     return samples[:, :, 1:5].reshape(*samples.shape[:2], -1).astype(np.float64)
 
 
+@pytest.mark.slow
 def test_of_single_calls_nothing_begins_with_the_chunk_before(flowing: Path, tmp_path: Path) -> None:
     path = tmp_path / "short.npz"
     np.savez(path, obs=np.arange(18, dtype=np.float32).reshape(3, 2, 3), episode_ends=[1, 2, 3])

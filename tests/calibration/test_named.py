@@ -16,6 +16,8 @@ from ttscompile.calibration.result import CalibrationResult
 from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def calibrated(
@@ -33,7 +35,6 @@ def computed(artifact: Path, name: str) -> list[int]:
     return [int(k) for k in np.flatnonzero(rows)]
 
 
-@pytest.mark.slow
 def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
     calibrated: tuple[Path, CalibrationResult],
 ) -> None:
@@ -74,7 +75,6 @@ def test_a_plan_is_chosen_when_loading_or_calling(calibrated: tuple[Path, Calibr
         ttscompile.load(artifact, plan="swift")
 
 
-@pytest.mark.slow
 def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     result = calibrate(artifact, [recording], 0.8, progress=False, max_minutes=1)
     assert result.skipped == {"fast": "the target computes 2 whole steps: half of that is too little"}
@@ -91,7 +91,6 @@ def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     assert set(load_artifact(artifact).plans) == {"dense", "schedule", "uniform"}
 
 
-@pytest.mark.slow
 def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

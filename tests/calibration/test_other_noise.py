@@ -48,6 +48,7 @@ def trials_of(directory: Path, recording: Path, state: Path, seed: int, most: in
     return Trials.of(artifact, episodes, StateFile(state, {}), seed=seed, observations=most)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [2, 5, 32])
 def test_the_distance_of_known_answers(constant: Path, recording: Path, tmp_path: Path, most: int) -> None:
     trials = trials_of(constant, recording, tmp_path, 7, most)

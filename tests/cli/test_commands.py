@@ -19,6 +19,8 @@ from ttscompile.cli import main
 from ttscompile.cli.bench_report import fewest_threads
 from ttscompile.core.lattice import uniform_plan
 
+pytestmark = pytest.mark.slow
+
 
 def run(*arguments: object) -> Any:
     result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
@@ -62,7 +64,6 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
     assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]
 
 
-@pytest.mark.slow
 def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None:
     for name, command in main.commands.items():
         options = [one for one in command.params if isinstance(one, click.Option)]
@@ -94,7 +95,6 @@ def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_chec
     assert json.loads(run("inspect", tmp_path / "compiled", "--json").stdout) == made
 
 
-@pytest.mark.slow
 def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
     made = json.loads(run("inspect", scheduled, "--json").stdout)
     flops, plans = made["flops"], made["plans"]
@@ -118,7 +118,6 @@ def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
 def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> None:
     picture = tmp_path / "plan.png"
     result = CliRunner().invoke(main, ["inspect", str(pruned), "--plot", str(picture)])
@@ -153,7 +152,6 @@ def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path
     assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr
 
 
-@pytest.mark.slow
 def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_checkpoint: Path) -> None:
     arguments = ("--calls", 2, "--checkpoint", one_layer_checkpoint, "--json")
     made = json.loads(run("bench", scheduled, *arguments).stdout)
@@ -167,7 +165,6 @@ def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_chec
     assert compiled["flops"] < dense["flops"] < original["flops"]
 
 
-@pytest.mark.slow
 def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_worth_it(scheduled: Path) -> None:
     arguments = ("--calls", 2, "--threads", "2,1,2")
     made = json.loads(run("bench", scheduled, *arguments, "--json").stdout)
@@ -199,7 +196,6 @@ def test_threads_that_bench_cannot_time(arguments: tuple[str, ...], told: str, s
     assert told in result.stderr
 
 
-@pytest.mark.slow
 def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:
     result = run("bench", compiled_layer, "--calls", 1)
     assert "dense (default)" in result.stdout

@@ -36,6 +36,7 @@ def converted(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFacto
     return directory, json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_convert_and_inspect_say_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
     directory, told = converted
     stage = next(stage for stage in told.pop("stages") if stage["stage"] == "lower_precision")
@@ -50,6 +51,7 @@ def test_convert_and_inspect_say_the_precision(converted: tuple[Path, dict[str, 
     assert "int8 weights in 3 of 3 blocks" in text
 
 
+@pytest.mark.slow
 def test_it_is_the_reference_within_the_tolerance_of_eight_bits(converted: tuple[Path, dict[str, Any]]) -> None:
     directory, _ = converted
     rng = np.random.default_rng(100)
@@ -96,6 +98,7 @@ def test_a_part_cannot_stay_fp32_beside_fp32(tmp_path: Path) -> None:
     assert not (tmp_path / "compiled").exists()
 
 
+@pytest.mark.slow
 def test_bench_times_the_dense_plan_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
     result = run("bench", converted[0], "--calls", 2, "--json")
     labels = [contestant["label"] for contestant in json.loads(result.stdout)["contestants"]]

@@ -124,6 +124,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page: str) -> None:
     assert policy.startswith("default-src 'none'")
 
 
+@pytest.mark.slow
 def test_the_page_can_be_read_on_a_phone_and_in_the_dark(page: str) -> None:
     reader = Reader(page)
     assert any("width=device-width" in m.get("content", "") for m in reader.of("meta"))

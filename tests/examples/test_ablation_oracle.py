@@ -13,6 +13,7 @@ from ttscompile.errors import CalibrationError
 from ttscompile.rivals.choosing import SINGLE
 
 
+@pytest.mark.slow
 def test_it_prints_a_table_or_json(once: Once, tmp_path: Path) -> None:
     calls = policies.record(tmp_path / "calls.npz")
     asked = [str(policies.compiled(once)), "--trajectories", str(calls)]

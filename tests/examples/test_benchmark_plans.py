@@ -62,6 +62,7 @@ def test_an_artifact_has_the_plans_that_there_can_be(tiny: tuple[Path, dict[floa
     assert (plans[0.0] == Source.COMPUTE).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_floor_runs_every_block_as_often_as_it_says(
     tiny: tuple[Path, dict[float, np.ndarray]], threads: int, monkeypatch: pytest.MonkeyPatch
@@ -83,6 +84,7 @@ def test_the_floor_runs_every_block_as_often_as_it_says(
     assert floor.floor_ms(plans[0.5], artifact, blocks) == pytest.approx(16.0)
 
 
+@pytest.mark.slow
 def test_the_floors_blocks_compute_numbers(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
     view = view_of(load_artifact(tiny[0]))
     sessions = Sessions(1).of(view)
@@ -93,6 +95,7 @@ def test_the_floors_blocks_compute_numbers(tiny: tuple[Path, dict[float, np.ndar
         assert bound._arrays[-1].std() > 0
 
 
+@pytest.mark.slow
 def test_tails_take_every_step(tiny: tuple[Path, dict[float, np.ndarray]], monkeypatch: pytest.MonkeyPatch) -> None:
     directory, plans = tiny
     steps: list[int] = []
@@ -134,6 +137,7 @@ def test_passes_are_pooled_and_every_group_has_its_threads() -> None:
     assert len(ticks) == rounds.rounds_of(groups, rounds.Effort(2, 3))
 
 
+@pytest.mark.slow
 def test_eager_and_compiled_agree(tiny: tuple[Path, dict[float, np.ndarray]]) -> None:
     network = random_network(16, "ddim", 8, layers=1)
     ((obs, noise),) = random_calls(network.spec, 1, seed=0)

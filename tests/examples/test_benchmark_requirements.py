@@ -26,6 +26,8 @@ from rounds import DENSE, EAGER, Effort
 import ttscompile
 from ttscompile.report.timing import Measurement
 
+pytestmark = pytest.mark.slow
+
 MET = {"p50_ms": 20.0, "p99_ms": 24.0, "calls": 2000, "rss_mb": [100.0, 100.0], "before_load_mb": 60.0}
 MET |= {"growth_kb_a_call": 0.01, "repeatable": True}
 
@@ -96,7 +98,6 @@ def test_the_profile_adds_up(tiny: Subject) -> None:
     assert parts["rest"] == pytest.approx(20.0 - 18.0 - 1.0 - 0.5)
 
 
-@pytest.mark.slow
 def test_all_of_it_runs(tiny: Subject, capsys: pytest.CaptureFixture[str]) -> None:
     settings = Settings(threads=(1,), effort=Effort(runs=1, passes=1), warm_calls=80, soak_calls=80)
     status = judge_and_tell(tiny, settings, as_json=True)
@@ -119,7 +120,6 @@ def test_the_plan_is_the_one_that_a_warm_call_executes(tiny: Subject) -> None:
     assert dense.plan.sum() == 0
 
 
-@pytest.mark.slow
 def test_the_checkpoint_has_to_be_the_artifacts(tiny: Subject, pusht_checkpoint: Path) -> None:
     with pytest.raises(ttscompile.TtscompileError, match="expected the policy that the artifact was made from"):
         subject(tiny.directory, pusht_checkpoint, None)

@@ -26,6 +26,7 @@ def run(*words: str) -> Any:
     return result
 
 
+@pytest.mark.slow
 def test_it_prints_the_same_as_a_table_and_as_json(arguments: list[str], tmp_path: Path) -> None:
     asked = [*arguments, "--strategies", "interval", "--sparsities", "0.5,0.8"]
     told = run(*asked, "--json", "--plot", str(tmp_path / "f.svg"))

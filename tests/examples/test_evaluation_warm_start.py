@@ -32,6 +32,7 @@ def test_it_measures_a_policy_of_one_layer(one_layer_checkpoint: Path) -> None:
     assert warm != [episode["score"] for episode in told[2]["episodes"]]
 
 
+@pytest.mark.slow
 def test_a_plan_that_begins_with_a_chunk_has_the_noise_of_its_whole_loop(
     one_layer_checkpoint: Path, tmp_path: Path
 ) -> None:

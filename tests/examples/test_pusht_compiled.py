@@ -14,6 +14,8 @@ from variants import open_variant, seeded_noise
 
 from tests.rounding import PROMISED
 
+pytestmark = pytest.mark.slow
+
 SCRIPTS = Path(__file__).parents[2] / "examples" / "evaluation"
 
 
@@ -34,7 +36,6 @@ def windows() -> np.ndarray:
     return np.stack([frames, frames], axis=1)
 
 
-@pytest.mark.slow
 def test_dense_compiled_is_the_eager_policy(compiled_pusht: Path, pusht_checkpoint: Path, windows: np.ndarray) -> None:
     eager = EagerPolicy(pusht_checkpoint, threads=1)
     dense = open_variant(f"{compiled_pusht}:dense", "onnxruntime", 1)
@@ -47,7 +48,6 @@ def test_dense_compiled_is_the_eager_policy(compiled_pusht: Path, pusht_checkpoi
         np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=PROMISED * 512)
 
 
-@pytest.mark.slow
 def test_eager_policy_has_no_plans(pusht_checkpoint: Path, windows: np.ndarray) -> None:
     eager = EagerPolicy(pusht_checkpoint, threads=1)
     noise = seeded_noise(eager.noise, [0, 1], call=0)
@@ -55,7 +55,6 @@ def test_eager_policy_has_no_plans(pusht_checkpoint: Path, windows: np.ndarray) 
         eager.predict_action({"obs": windows}, noise=noise, plan=np.zeros((100, 24), np.int8))
 
 
-@pytest.mark.slow
 def test_contestants_of_the_benchmark(
     compiled_pusht: Path, pusht_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,7 +72,6 @@ def test_contestants_of_the_benchmark(
     assert sum(fixed_shares(compiled_pusht).values()) <= 0.03
 
 
-@pytest.mark.slow
 def test_scripts_run_as_they_stand(compiled_layer: Path, tmp_path: Path) -> None:
     calls = tmp_path / "calls.npz"
     told = run("record.py", compiled_layer, "-o", calls, "--episodes", 1)

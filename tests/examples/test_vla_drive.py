@@ -14,6 +14,7 @@ from ttscompile.trajectories import load_trajectories
 from .recipes import script
 
 
+@pytest.mark.slow
 def test_it_drives_and_records(
     once: Once, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -227,6 +227,7 @@ def test_the_exit_status_is_the_programs_though_a_call_is_under_way(
     assert done.stderr.splitlines()[-1:] == ([last] if last else [])
 
 
+@pytest.mark.slow
 def test_control_loops_on_other_threads_go_on_after_the_main_thread_or_end_with_it(toy_compiled: Path) -> None:
     body = """
     def loop(ticks):

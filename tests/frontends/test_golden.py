@@ -61,6 +61,7 @@ def test_single_evaluations(golden: Loaded) -> None:
         assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
 
 
+@pytest.mark.slow
 def test_module_is_the_network_with_the_observation_in_place(golden: Loaded) -> None:
     """Inpainting overwrites exactly the first To rows of the observation channels, whatever was there."""
     module, spec, numbers = golden

@@ -145,6 +145,7 @@ def test_the_encoder_is_a_piece_of_its_own(compiled: tuple[Program, Path]) -> No
     )
 
 
+@pytest.mark.slow
 def test_batch_norm_is_lowered() -> None:
     """What the compiled policy above does not hold, in onnxruntime as in torch, for another batch size."""
     torch.manual_seed(0)

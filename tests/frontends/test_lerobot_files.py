@@ -19,6 +19,8 @@ from ttscompile.frontends.lerobot_files import lerobot_files
 from . import lerobot_unets, pis
 from .lerobot_tiny import DA, DS, SIDE, change_json, save_policy
 
+pytestmark = pytest.mark.slow
+
 STATE, TOP = "observation.state", "observation.images.top"
 
 
@@ -42,7 +44,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_they_say_what_the_robot_gives_and_normalise_nothing(folder: Path) -> None:
     assert read(folder / "compiled", "config.json") == {
         "type": "ttscompile",
@@ -81,7 +82,6 @@ def test_the_artifact_is_the_same_without_them(folder: Path, tmp_path: Path) -> 
     assert read(whole, "config.json")["threads"] == 2
 
 
-@pytest.mark.slow
 def test_they_are_the_same_bytes_again_and_go_with_an_artifact_that_is_replaced(folder: Path, tmp_path: Path) -> None:
     spec, again = load_artifact(folder / "compiled").manifest.spec, tmp_path / "again"
     made = lerobot_files(folder / "policy", spec)
@@ -102,7 +102,6 @@ def test_there_are_none_where_the_instruction_holds_the_state(tmp_path: Path, ki
     assert set(files_beside(directory, spec)) == (set(BESIDE) if kind == "pi0" else set())
 
 
-@pytest.mark.slow
 def test_convert_says_that_there_are_none(tmp_path: Path) -> None:
     said: dict[str, tuple[str, ...]] = {}
     ttscompile.convert(pis.save("pi05", tmp_path / "policy"), tmp_path / "compiled", explain=said.__setitem__)

@@ -22,6 +22,8 @@ from ttscompile.runtimes import open_runtime
 from ..families.support import record, stored_program
 from ..runtimes.agreement import call_terms, largest_difference
 
+pytestmark = pytest.mark.slow
+
 STATE, IMAGE = "observation.state", "observation.images.top"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 
@@ -112,7 +114,6 @@ def test_whole_call(golden: Golden) -> None:
     assert np.abs(spec.chunk.normalizer.unnormalize(executed) - numbers["action"]).max() < 1e-4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_compiled_call(golden: Golden, compiled: Path, runtime: str) -> None:
     """The artifact from raw observations to the action in its units, within 1e-4."""
@@ -153,7 +154,6 @@ def test_encoders_and_modulations_leave_the_loop(golden: Golden, compiled: Path)
     assert kinds == ["self_attention", "feed_forward"] * 4
 
 
-@pytest.mark.slow
 def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     """Episodes of random legal plans, several streams."""
     artifact = load_artifact(compiled)

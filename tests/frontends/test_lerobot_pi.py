@@ -80,6 +80,7 @@ def test_what_is_compiled_gives_them_too(
         assert np.abs(found - golden[f"{kind}.{call}"][:, :4]).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", [0, 1])
 @pytest.mark.parametrize(("value", "message"), [(200.0, "Divide by 255"), (np.inf, "must be finite")])
 def test_images_are_checked_before_they_are_resized(

@@ -181,6 +181,7 @@ TOO_LARGE: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", TOO_LARGE)
 def test_a_configuration_larger_than_its_weights(tmp_path: Path, case: str) -> None:
     """Refused before anything of its size is made; with the memory limited, torch would fail with another error."""

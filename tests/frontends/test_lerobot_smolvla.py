@@ -27,6 +27,8 @@ from . import originals
 from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
+pytestmark = pytest.mark.slow
+
 SIZE = (96, 128)
 """Of the golden images, height and width."""
 
@@ -68,7 +70,6 @@ def eager(directory: Path, given: Mapping[str, Array], batch: Mapping[str, Array
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(given["noise"])).numpy())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
     policy = ttscompile.load(compiled, runtime=runtime)

@@ -123,6 +123,7 @@ def test_spacings_of_the_solver(payload: Build, save: Save) -> None:
         load_checkpoint_policy(path, options=LoadOptions(sampler="dpmsolver++", steps=20, spacing="leading"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "names"),
     [
@@ -187,6 +188,7 @@ def test_where_the_own_loop_has_no_table_the_one_asked_for_is_the_original(
         load_checkpoint_policy(path, options=LoadOptions(spacing="even"))
 
 
+@pytest.mark.slow
 def test_converting_keeps_the_original_beside_the_loop_that_is_asked_for(
     payload: Build, save: Save, tmp_path: Path
 ) -> None:

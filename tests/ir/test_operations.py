@@ -146,6 +146,7 @@ def test_an_operation_without_a_row_is_refused(op: str) -> None:
         graph_flops(graph)
 
 
+@pytest.mark.slow
 def test_a_network_with_an_operation_without_a_row_is_refused_at_capture() -> None:
     class Uncommon(Uses):
         def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
@@ -176,6 +177,7 @@ def _first(graph: Graph, inputs: dict[str, Tensor]) -> Tensor:
     return value if isinstance(value, Tensor) else value[0]
 
 
+@pytest.mark.slow
 def test_elementwise_is_elementwise() -> None:
     """Numbers that change places together give results that change places."""
     for graph, node in _nodes("elementwise"):
@@ -191,6 +193,7 @@ def test_elementwise_is_elementwise() -> None:
         torch.testing.assert_close(_first(bare, moved), expected, equal_nan=True, msg=of(node))
 
 
+@pytest.mark.slow
 def test_linear_is_linear() -> None:
     """What is affine gives for a sum of inputs, less one, the sum of what it gives, less one."""
     for graph, node in _nodes("linear"):
@@ -207,6 +210,7 @@ def test_linear_is_linear() -> None:
             torch.testing.assert_close(_first(graph, total), expected, msg=of(node))
 
 
+@pytest.mark.slow
 def test_movements_move() -> None:
     for graph, node in _nodes("movement"):
         ((name, type_),) = list(graph.inputs.items())[:1]
@@ -222,6 +226,7 @@ def test_movements_move() -> None:
                 assert movement is Movement.REPEAT or y.numel() <= x.numel(), node
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fact", ["along", "mixes"])
 def test_what_lies_across_is_treated_alike(fact: str) -> None:
     """To turn around an axis that an operation does not work along is to turn around its result."""
@@ -236,6 +241,7 @@ def test_what_lies_across_is_treated_alike(fact: str) -> None:
             torch.testing.assert_close(turned, y.flip(after), msg=of(node))
 
 
+@pytest.mark.slow
 def test_filled_is_filled() -> None:
     for graph, node in _nodes("filled"):
         row = operation(node.op)
@@ -245,6 +251,7 @@ def test_filled_is_filled() -> None:
             assert torch.equal(_first(graph, values(dict(graph.inputs))), torch.full(node.type.at(2), float(value)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "flops"),
     [

@@ -22,6 +22,7 @@ def moves(graph: Graph) -> int:
     return sum(node.op in ("aten.permute.default", "aten.transpose.int", "aten.clone.default") for node in graph.nodes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_same_function_no_more_moves_and_nothing_left_to_do(name: str) -> None:
     _, graph, weights = captured(name)

@@ -16,6 +16,8 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.ir.pieces import is_of_loop, part_of
 from ttscompile.lower.single_file import lower_single_file
 
+pytestmark = pytest.mark.slow
+
 
 def test_models_that_differ_between_loops_have_the_loops_name() -> None:
     """A loop that clips, draws and remembers as the original does, in as many steps, has none of its own."""

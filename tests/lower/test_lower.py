@@ -44,6 +44,7 @@ def test_parity(name: str) -> None:
     assert_parity(graph, weights)
 
 
+@pytest.mark.slow
 def test_heads_are_left_where_they_are() -> None:
     _, graph, _ = captured("SelfAttention")
     operations = [node.op_type for node in lower_graph(graph, "p").graph.node]

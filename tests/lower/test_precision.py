@@ -65,6 +65,7 @@ def test_a_matrix_is_within_half_a_step_of_its_column(rows: int, columns: int, s
     assert (np.abs(values).max(axis=0)[used] == 127).all(), "a column does not use its range"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SelfAttention", "CrossAttention", "FeedForward", "AdaptiveNorm", "SequenceFirst"])
 def test_real_modules_stay_what_they_were(name: str) -> None:
     _, graph, tensors = captured(name)

@@ -28,6 +28,7 @@ def through_text(graph: Graph) -> Graph:
     return read(json.loads(json.dumps(graph_to_json(graph), allow_nan=False)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_captured_graphs_survive(name: str) -> None:
     _, graph, _ = captured(name)

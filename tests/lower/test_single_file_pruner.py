@@ -30,6 +30,7 @@ from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes.single_file import inputs_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "corrected"),
     [

@@ -9,6 +9,7 @@ from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Binding
 
 
+@pytest.mark.slow
 def test_time_token_becomes_a_table_and_observation_tokens_are_encoded_once() -> None:
     _, program = compiled("tokens")
     pieces = program.pieces

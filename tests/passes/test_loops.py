@@ -12,6 +12,8 @@ from tests.passes.loops import BUILT, LOOPS, program_of, spec
 from ttscompile.errors import PassError
 from ttscompile.ir.verify import verify
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("kind", list(BUILT))
 @pytest.mark.parametrize("loop", ["original", "ddim-3"])

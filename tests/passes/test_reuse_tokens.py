@@ -24,13 +24,14 @@ from ttscompile.ir.verify import verify
 from ttscompile.passes.reuse_tokens import ReuseTokens
 from ttscompile.samplers.flow import flow_matching_table
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def compiled(kind: str) -> Program:
     return transform(*cameras.policy(kind))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "tokens", "fixed"), [("clip", 37, 1), ("siglip", 36, 0)])
 def test_some_tokens_give_what_they_literally_give(kind: str, tokens: int, fixed: int) -> None:
     program = compiled(kind)
@@ -55,7 +56,6 @@ def test_a_second_run_changes_nothing() -> None:
     assert ReuseTokens()(compiled("clip")).program is compiled("clip")
 
 
-@pytest.mark.slow
 def test_of_a_convolutional_tower_the_frame_is_the_unit() -> None:
     program = compiled("shared")
     assert program.pieces.tokens == {}
@@ -123,7 +123,6 @@ def found(change: str) -> object:
     return find_tokens(backward_slice(graph, (seen,), {}), weights)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "why"),
     [
@@ -143,6 +142,5 @@ def test_near_misses_are_left_whole(change: str, why: str) -> None:
     assert why in said
 
 
-@pytest.mark.slow
 def test_without_the_miss_it_is_one() -> None:
     assert not isinstance(found(""), str)

@@ -86,6 +86,7 @@ def test_features_of_another_dtype_stay_together() -> None:
     assert _parts(graph.nodes[1], graph.producers(), floats) == ["time", "count"]
 
 
+@pytest.mark.slow
 def test_runs_before_hoist_only() -> None:
     with pytest.raises(PassError, match="takes a program that is Cut; found Program"):
         SplitFeatures()(Hoist()(_program(True)).program)  # type: ignore[arg-type]

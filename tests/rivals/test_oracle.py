@@ -24,6 +24,7 @@ def test_three_parts_of_the_episodes_share_none(found: Oracle) -> None:
     assert all(parts) and sum(map(len, parts)) == len(set.union(*parts))
 
 
+@pytest.mark.slow
 def test_the_rows(found: Oracle) -> None:
     rows = {one.name: one for one in found.choices}
     known = ["the observation", "the noise", "the sample after step 0", "all of these"]

@@ -38,6 +38,8 @@ from .agreement import call_terms, random_inputs
 from .plans import random_correction
 from .toys import toy_program
 
+pytestmark = pytest.mark.slow
+
 STEPS, BLOCKS, HORIZON, STREAMS = 6, 3, 4, 2
 RUNTIMES = ("onnxruntime", "torch", "reference")
 
@@ -98,7 +100,6 @@ def normalized(artifact: Artifact, predicted: np.ndarray) -> np.ndarray:
     return chunk.normalizer.normalize(predicted)
 
 
-@pytest.mark.slow
 def test_every_way_to_make_a_call_bounds_it_alike(corrected: Corrected) -> None:
     artifact, correction, plan, file = corrected
     obs, noise = random_inputs(artifact, np.random.default_rng(1), STREAMS)

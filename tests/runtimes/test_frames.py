@@ -80,6 +80,7 @@ def test_only_new_frames_are_computed(policy: CompiledPolicy) -> None:
     assert policy.info.frames == 2
 
 
+@pytest.mark.slow
 def test_what_is_remembered_changes_no_bit(policy: CompiledPolicy) -> None:
     windows = [window(frame(i), frame(i + 1)) for i in (0, 1, 0, 3)]
     going_on = [act(policy, obs) for obs in windows]

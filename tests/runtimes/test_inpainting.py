@@ -158,6 +158,7 @@ def test_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, s
         written |= plans == Source.COMPUTE
 
 
+@pytest.mark.slow
 def test_between_steps_the_committed_actions_have_the_noise_of_the_step(artifact: Artifact) -> None:
     table, made = diffusion(DDPMScheduler)
     model = ReferenceModel.from_view(view_of(artifact))

@@ -105,6 +105,7 @@ def layouts(array: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", layouts(OBS))
 def test_how_numbers_lie_in_memory_changes_nothing(policy: CompiledPolicy, layout: str) -> None:
     noise, expected = some_noise(), actions(policy)

@@ -75,6 +75,7 @@ def test_blocks_and_dense_steps_have_it(compiled: Path) -> None:
     assert counts == {"block_00": 1, "block_01": 1, "dense_step": BLOCKS, "stem": 0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_call_is_near_to_float32_and_the_single_file_computes_it(compiled: Path, threads: int) -> None:
     policies = [ttscompile.load(compiled, plan=name, threads=threads) for name in ("full", "full@fp32")]

@@ -110,6 +110,7 @@ def test_both_runtimes_agree(made: Made) -> None:
         assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 3, calls=4) < bound(terms)
 
 
+@pytest.mark.slow
 def test_both_runtimes_agree_under_corrections_and_forget_between_calls(made: Made) -> None:
     artifact, rng = made[1], np.random.default_rng(0)
     runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "reference")]

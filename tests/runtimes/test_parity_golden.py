@@ -26,6 +26,8 @@ from ..once import Once
 from .agreement import largest_difference, random_inputs
 from .plans import random_plan
 
+pytestmark = pytest.mark.slow
+
 CHECKPOINTS = ("bert", "ddim8", "inpainting", "mlp_encoder_causal", "transformer_encoder_causal")
 EPISODES = ("timestep_95", "mixed_95", "mixed_80")
 FAMILIES = {
@@ -64,7 +66,6 @@ def call(policy: CompiledPolicy, recorded: dict[str, npt.NDArray[np.float32]], *
     return result
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", RUNTIMES)
 @pytest.mark.parametrize("name", CHECKPOINTS)
 def test_dense_is_the_original(compiled: Compiled, shared: Path, name: str, runtime: str) -> None:
@@ -75,7 +76,6 @@ def test_dense_is_the_original(compiled: Compiled, shared: Path, name: str, runt
     assert worst_of_range(out["action"], recorded["action"], policy.info) < PROMISED
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_support_table(converted: Callable[[str], tuple[Path, Program]], name: str) -> None:
     """What was found in each variant is what the README says."""
@@ -85,7 +85,6 @@ def test_support_table(converted: Callable[[str], tuple[Path, Program]], name: s
     record(FAMILIES[name], against, f"{table.name} {table.steps}", program)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runtime", RUNTIMES)
 @pytest.mark.parametrize("name", EPISODES)
 def test_an_episode_with_their_plans_is_what_the_authors_code_gives(
@@ -104,7 +103,6 @@ def test_an_episode_with_their_plans_is_what_the_authors_code_gives(
         assert report.legalised == (0,)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKPOINTS)
 def test_both_runtimes_agree_on_random_plans(compiled: Compiled, name: str) -> None:
     """An episode of three calls of two streams. Toys go through many more, of one to four streams."""
@@ -113,7 +111,6 @@ def test_both_runtimes_agree_on_random_plans(compiled: Compiled, name: str) -> N
     assert largest_difference(artifact, *runtimes, np.random.default_rng(0), streams=2, calls=3) < PROMISED
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["transformer_encoder_causal", "inpainting"])
 def test_a_batch_of_streams_is_its_streams_one_by_one(compiled: Compiled, name: str) -> None:
     artifact = load_artifact(compiled(name))

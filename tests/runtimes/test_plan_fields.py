@@ -33,6 +33,8 @@ from ttscompile.samplers.flow import flow_matching_table
 from .agreement import call_terms, random_inputs
 from .plans import random_correction, random_plan
 
+pytestmark = pytest.mark.slow
+
 STEPS = {"original": 6, "euler-4": 4}
 STARTS = {"original-last-2": StartRecord("original", 2), "euler-4-last-3": StartRecord("euler-4", 3)}
 

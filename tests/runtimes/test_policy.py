@@ -53,6 +53,7 @@ def test_load_is_what_the_package_offers() -> None:
     assert ttscompile.load is load
 
 
+@pytest.mark.slow
 def test_actions_are_normalised_in_and_out_and_cut(policy: CompiledPolicy, toy_artifact: Artifact) -> None:
     out = policy.predict_action({"obs": OBS}, noise=some_noise(), plan="dense")
     runtime = open_runtime(toy_artifact)
@@ -66,6 +67,7 @@ def test_actions_are_normalised_in_and_out_and_cut(policy: CompiledPolicy, toy_a
     assert out["action"].flags.owndata
 
 
+@pytest.mark.slow
 def test_info_is_the_artifacts(quick: CompiledPolicy, toy_artifact: Artifact) -> None:
     info = quick.info
     assert (info.K, info.sample, info.stochastic, info.dense_flops) == (5, (3, 2), True, 1000)

@@ -104,6 +104,7 @@ def test_nothing_to_lower_and_unknown_precisions_are_refused_before_anything_is_
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_converting_again_gives_the_same_bytes(int8: Path, tmp_path: Path) -> None:
     ttscompile.compile_denoiser(policies.Mixer(0).eval(), policies.spec(), tmp_path / "again", precision="int8")
     assert {p.name: p.read_bytes() for p in (tmp_path / "again").iterdir()} == {

@@ -66,6 +66,7 @@ def test_the_encoder_has_integer_products_and_convolutions_beside_the_blocks(int
     assert "DynamicQuantizeMatMul" not in operations(int8, "stem") | operations(int8, "advance")
 
 
+@pytest.mark.slow
 def test_each_part_has_its_precision_from_the_plan(int8: Path) -> None:
     artifact = load_artifact(int8)
     record, dense = artifact.manifest.precision, artifact.plans["dense"]

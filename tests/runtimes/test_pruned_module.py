@@ -30,6 +30,8 @@ from .agreement import call_terms
 from .pruners import calibrated, random_pruner
 from .toys import random_sampler, toy_program, written_artifact
 
+pytestmark = pytest.mark.slow
+
 NO_COMPILER = "NO C++ COMPILER: the exported module was not compiled; install g++"
 
 Inputs = tuple[dict[str, Tensor], Tensor, Tensor]
@@ -207,7 +209,6 @@ def test_the_head_and_the_branches_are_in_the_exported_program(
     assert sum(len(called(one, "aten.tanh.default")) for one in graphs(whole)) == 5
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float],

@@ -26,6 +26,8 @@ from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError,
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel, noise_tensors
 
+pytestmark = pytest.mark.slow
+
 STEPS, LAST, EXECUTED = 8, 3, 8
 SHAPE = (2, 16, 2)
 WARM = "warm"

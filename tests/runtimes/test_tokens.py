@@ -30,6 +30,8 @@ from ttscompile.runtimes.onnxruntime.backend import OnnxBackends
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.tokens import TokenTower, sizes_of, token_towers
 
+pytestmark = pytest.mark.slow
+
 Array = npt.NDArray[Any]
 SIDE, PATCH, TOKENS = cameras.SIDE, 4, 37
 REUSE = TokenReuse(threshold=0.0, refresh=1000)
@@ -94,7 +96,6 @@ def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) ->
     return tower
 
 
-@pytest.mark.slow
 def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> None:
     literal = LiteralTokens(artifact.graph("frame_00"), artifact.weights)
     tower, rng, image = tower_of(artifact, refresh=6), np.random.default_rng(0), picture(0)

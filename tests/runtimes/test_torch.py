@@ -85,6 +85,7 @@ def test_a_policy_that_was_saved_in_half_precision_agrees_with_the_reference(mak
     assert largest_difference(artifact, *runtimes, rng, streams=2, calls=4) < bound(call_terms(artifact))
 
 
+@pytest.mark.slow
 def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
     """Two streams follow one plan and the third another: residuals of an earlier call stay with their stream."""
     artifact = make_artifact(toy_program(normed=True, pruner=False))

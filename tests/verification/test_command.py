@@ -35,6 +35,7 @@ def test_a_sound_artifact_gives_status_0_and_a_picture(quick: Path, recording: P
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_broken_one_gives_status_1_and_says_where_and_what_to_do(artifact: Path, tmp_path: Path) -> None:
     with edited(artifact, "plans") as arrays:
         arrays["schedule"] = policy.shifted(arrays["schedule"])
@@ -84,6 +85,7 @@ COMMANDS: list[tuple[Any, ...]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: str(command[0]))
 def test_every_command_says_which_artifact_its_figures_are_of(
     command: tuple[Any, ...], sound: Path, recording: Path

@@ -46,6 +46,7 @@ def failure(artifact: Path, *recordings: Path) -> Rung:
     return found.first_failure
 
 
+@pytest.mark.slow
 def test_a_sound_artifact_holds(sound: Path) -> None:
     """Whether its plans save time is no matter here, which other work may hide."""
     found = ttscompile.verify(sound)
@@ -59,6 +60,7 @@ def test_a_sound_artifact_holds(sound: Path) -> None:
     json.dumps(found.to_json(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_an_artifact_that_is_not_calibrated_holds_and_says_what_it_lacks(compiled: Path) -> None:
     found = ttscompile.verify(compiled)
     assert found.passed

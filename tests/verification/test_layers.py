@@ -28,6 +28,8 @@ from ttscompile.verification.rung import Rung
 
 from .broken import edit_manifest, edited
 
+pytestmark = pytest.mark.slow
+
 
 def spec() -> PolicySpec:
     """With more steps than those at which layers are recorded."""
@@ -60,7 +62,6 @@ def weighted(program: Program) -> list[str]:
     return [name for name in map("{}.weight".format, layers(program)) if program.weights[name].nbytes > EMBEDDED_BYTES]
 
 
-@pytest.mark.slow
 def test_every_layer_of_the_network_is_recorded(made: tuple[Path, Program]) -> None:
     directory, program = made
     found = layers(program)

@@ -19,6 +19,8 @@ from ttscompile.errors import ArtifactError
 from ttscompile.lower.program import lower_program
 from ttscompile.verification.record_golden import record_original
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def record(kind: str, loop: str | None = None) -> Golden:

@@ -42,6 +42,7 @@ def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_plans_are_run_in_fp32_and_in_int8(int8: Path) -> None:
     found = ttscompile.verify(int8)
     exact, own = found.rung("plans"), found.rung(RUNG)
@@ -51,6 +52,7 @@ def test_plans_are_run_in_fp32_and_in_int8(int8: Path) -> None:
     assert set(own.details["errors"]) == {"schedule", "other"}
 
 
+@pytest.mark.slow
 def test_other_samples_and_other_cells_than_recorded_fail(int8: Path) -> None:
     artifact = load_artifact(int8)
     golden, runtime = load_golden(artifact), open_runtime(artifact)
@@ -91,6 +93,7 @@ def changed(directory: Path, change: Callable[[dict[str, Any]], None]) -> Rung:
     return rung
 
 
+@pytest.mark.slow
 def test_integers_are_the_weights_rounded(int8: Path, tmp_path: Path) -> None:
     """A scale that is a twentieth too large moves the largest of its column by six steps, and a call by little."""
 
@@ -106,6 +109,7 @@ def test_integers_are_the_weights_rounded(int8: Path, tmp_path: Path) -> None:
     assert "of their steps off; rounded weights are half of one" in rung.told
 
 
+@pytest.mark.slow
 def test_integers_in_another_order_make_another_call(int8: Path, tmp_path: Path) -> None:
     def turned(arrays: dict[str, Any]) -> None:
         for name, array in arrays.items():

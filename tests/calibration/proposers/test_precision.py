@@ -54,6 +54,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch, limits: Mapping[tuple[str, ...], f
     monkeypatch.setattr(precision, "further", lambda one, _: (one.distance / 2, one.distance))
 
 
+@pytest.mark.slow
 def test_all_parts_are_in_eight_bits_where_that_changes_little(trials: Trials) -> None:
     proposer = Precision(request())
     (found,) = proposed(proposer, trials, trials.base)
@@ -64,6 +65,7 @@ def test_all_parts_are_in_eight_bits_where_that_changes_little(trials: Trials) -
     assert proposer.told == "int8 in condition and blocks"
 
 
+@pytest.mark.slow
 def test_what_changes_the_actions_much_stays_fp32(tmp_path: Path) -> None:
     ttscompile.compile_denoiser(*seeing.policy(LOUD), tmp_path / "loud", precision="int8")
     trials, proposer = trials_of(tmp_path / "loud", recorded(tmp_path / "calls.npz")), Precision(request())
@@ -74,6 +76,7 @@ def test_what_changes_the_actions_much_stays_fp32(tmp_path: Path) -> None:
     assert proposer.told.startswith("int8 in blocks; condition stays fp32")
 
 
+@pytest.mark.slow
 def test_what_is_learned_is_written_for_all_plans(tmp_path: Path) -> None:
     ttscompile.compile_denoiser(*seeing.policy(LOUD), tmp_path / "loud", precision="int8")
     calibrate(tmp_path / "loud", recorded(tmp_path / "calls.npz"), learn=("precision",), progress=False)
@@ -101,6 +104,7 @@ def test_all_is_fp32_where_nothing_is_within_the_margin(trials: Trials, monkeypa
     assert proposer.told == "all parts stay fp32: int8 changes the actions more than 0.1 allows"
 
 
+@pytest.mark.slow
 def test_one_part_is_not_tried_twice(once: Once, recording: Path, tmp_path: Path) -> None:
     """A schedule of a policy that does not see keeps its cells."""
     folder = Path(shutil.copytree(policies.compiled(once, "int8"), tmp_path / "int8"))

@@ -27,6 +27,8 @@ from ttscompile.errors import CalibrationError, CalibrationFailedError
 
 from .trying import proposed, request, trials_of
 
+pytestmark = pytest.mark.slow
+
 STEPS, LOOP = 8, "ddim-8"
 
 

@@ -25,6 +25,8 @@ from ttscompile.verification import verify
 
 from .trying import proposed, request, trials_of
 
+pytestmark = pytest.mark.slow
+
 SIDE = cameras.SIDE
 
 

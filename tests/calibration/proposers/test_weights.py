@@ -83,6 +83,7 @@ def actions(policy: CompiledPolicy, plan: str, seed: int = 0) -> Any:
     return policy.predict_action(obs, noise=noise, plan=plan)["action_pred"]
 
 
+@pytest.mark.slow
 def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: Trained, scheduled: Path) -> None:
     directory, result = distilled
     artifact = load_artifact(directory)
@@ -97,6 +98,7 @@ def test_the_artifact_gets_a_plan_that_is_nearer_to_the_dense_policy(distilled: 
     assert record["plans"][NAME]["distance"] == result.plans[NAME].distance
 
 
+@pytest.mark.slow
 def test_people_are_told_that_it_is_another_network(distilled: Trained, scheduled: Path) -> None:
     artifact = load_artifact(distilled[0])
     record = artifact.manifest.calibration
@@ -108,6 +110,7 @@ def test_people_are_told_that_it_is_another_network(distilled: Trained, schedule
     assert "--learn" not in card(load_artifact(scheduled), "o/n", [], [], None)
 
 
+@pytest.mark.slow
 def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: Trained) -> None:
     before, after = ttscompile.load(scheduled), ttscompile.load(distilled[0])
     assert after.info.default_plan == NAME
@@ -118,6 +121,7 @@ def test_all_other_plans_are_what_they_were(scheduled: Path, distilled: Trained)
         np.testing.assert_array_equal(actions(after, plan), actions(before, plan))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("runtime", "threads"), [("onnxruntime", 1), ("onnxruntime", 2), ("torch", 1)])
 def test_runtimes_give_the_references_answer(distilled: Trained, runtime: str, threads: int) -> None:
     reference = ttscompile.load(distilled[0], runtime="reference")
@@ -127,6 +131,7 @@ def test_runtimes_give_the_references_answer(distilled: Trained, runtime: str, t
     assert np.abs(wanted - actions(reference, "schedule")).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_the_module_of_torch_gives_the_references_answer(distilled: Trained) -> None:
     obs, noise = call(0)
     assert noise.steps is not None
@@ -136,6 +141,7 @@ def test_the_module_of_torch_gives_the_references_answer(distilled: Trained) -> 
     np.testing.assert_allclose(made.numpy(), wanted, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_step_0_has_the_originals_weights_and_later_steps_have_not(distilled: Trained) -> None:
     artifact = load_artifact(distilled[0])
     original, own = (ReferenceModel.from_view(view_of(artifact, plan)) for plan in (DENSE, NAME))
@@ -145,6 +151,7 @@ def test_step_0_has_the_originals_weights_and_later_steps_have_not(distilled: Tr
     assert not torch.equal(own.block(1, 1, stream, contexts), original.block(1, 1, stream, contexts))
 
 
+@pytest.mark.slow
 def test_nothing_is_reused_between_calls_with_different_weights(distilled: Trained) -> None:
     artifact = load_artifact(distilled[0])
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
@@ -162,6 +169,7 @@ def test_nothing_is_reused_between_calls_with_different_weights(distilled: Train
         policy.predict_action(obs, noise=noise, plan=rollout)
 
 
+@pytest.mark.slow
 def test_verify_knows_both_sets_of_weights(distilled: Trained, recording: Path, tmp_path: Path) -> None:
     found = verify(distilled[0], [recording], calls=8)
     others = [rung for rung in found.rungs if rung.name != ENGAGED]  # which times calls
@@ -291,6 +299,7 @@ def test_what_a_correction_alone_does_is_no_merit_of_the_weights(
     np.testing.assert_array_equal(first.plan.correction.weights, plan.correction.weights)
 
 
+@pytest.mark.slow
 def test_calibrating_again_drops_it(distilled: Trained, recording: Path, tmp_path: Path) -> None:
     directory = policies.whole_steps(Path(shutil.copytree(distilled[0], tmp_path / "compiled")), recording)
     artifact = load_artifact(directory)
@@ -338,6 +347,7 @@ def test_a_rank_for_which_nothing_is_large_enough_is_refused(scheduled: Path, re
     assert contents(scheduled) == before
 
 
+@pytest.mark.slow
 def test_a_model_of_the_reference_is_there_for_weights_that_are_used(
     scheduled: Path, distilled: Trained, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -361,6 +371,7 @@ def test_arguments_that_cannot_be(scheduled: Path, recording: Path, change: dict
         train(scheduled, recording, **change)
 
 
+@pytest.mark.slow
 def test_a_record_that_does_not_fit_is_refused(distilled: Trained) -> None:
     document = json.loads((distilled[0] / MANIFEST).read_bytes())
     del document["checksum"], document["weights"][NAME]["models"]["block_00"]

@@ -66,6 +66,7 @@ def test_windows_of_one_episode_are_divided(make_task: MakeTask, windows: int) -
     assert sorted([*practised, *compared]) == list(range(2 * windows))
 
 
+@pytest.mark.slow
 def test_nothing_is_kept_that_is_worse_than_whole_steps(task: Task) -> None:
     search = trained(task, 1)
     family = spacings(10, 3)
@@ -177,6 +178,7 @@ def test_a_head_that_has_learned_nothing_says_so_and_is_no_default(
         np.testing.assert_array_equal(artifact.pruner[name], array)
 
 
+@pytest.mark.slow
 def test_a_head_is_kept_if_it_is_nearer_than_the_schedule_and_its_plans_differ(
     compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
