@@ -70,7 +70,6 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
         RuntimeUnavailableError: a runtime or device cannot be had, or cannot do what a plan asks for.
     """
     made: list[Contestant] = []
-    specs: dict[tuple[str, str], PolicySpec] = {}
 
     def enter(series: str, policy: CompiledPolicy, plan: str, way: Way) -> None:
         policy.reset()
@@ -79,12 +78,9 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
             label.append(way.place)
         if len({one.threads for one in ways}) > 1:
             label.append(f"{way.threads} thread{'s' * (way.threads > 1)}")
-        found = artifacts[series].plan(plan)
         if "@" not in plan:
-            label += dict.fromkeys(found.precision.values())
-        found = found.otherwise or found  # whose loop the noise is for
-        spec = specs.setdefault((series, found.loop), view_of(artifacts[series], found).manifest.spec)
-        one = plan_contestant(", ".join(label), policy, plan, spec)
+            label += dict.fromkeys(artifacts[series].plan(plan).precision.values())
+        one = plan_contestant(", ".join(label), policy, plan, artifacts[series].manifest.spec)
         made.append(replace(one, threads=way.threads))
 
     for series, artifact in artifacts.items():
