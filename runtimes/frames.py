@@ -146,11 +146,6 @@ def contents_of(rows: Sequence[Array], lanes: Sequence[Lane] = ()) -> list[Conte
 class FramePieces:
     """What depends on one frame alone, for the rows of all streams: only frames that are new are computed.
 
-    Args:
-        pieces: of the artifact; without frame pieces nothing is done.
-        run: executes one of them.
-        tokens: by frame piece, those of which only some tokens are computed.
-
     Attributes:
         work: what the last ``values`` did.
     """

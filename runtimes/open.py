@@ -131,13 +131,6 @@ def open_runtime(
 ) -> Runtime:
     """Make a runtime for an artifact.
 
-    Args:
-        artifact: loaded and checked.
-        runtime: a name in ``RUNTIMES``.
-        threads: see ``Options``.
-        device: see ``Options``; None for the CPU.
-        plan: see ``Runtime``.
-
     Raises:
         RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or what the plan
             asks for cannot be had.

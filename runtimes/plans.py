@@ -18,10 +18,6 @@ Lowered = TypeVar("Lowered")
 def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tuple[int, ...]]:
     """The plan of every stream without illegal reads.
 
-    Args:
-        plan: ``[K, blocks]`` or ``[B, K, blocks]``.
-        written: bool ``[B, K, blocks]``; rollout entries that exist.
-
     Returns:
         A legal plan, int8 ``[B, K, blocks]``, and the number of replaced cells of each stream.
 

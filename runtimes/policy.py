@@ -237,8 +237,6 @@ class CompiledPolicy:
         Args:
             batch: one frame of every stream by key, ``[B, ...]``, not normalised; ``reset`` forgets earlier ones. Keys
                 that are not the policy's are left alone.
-            noise: of the chunk, if this call computes one.
-            plan: the same.
 
         Returns:
             ``[B, Da]`` of the kind that came in.
@@ -269,9 +267,6 @@ class CompiledPolicy:
             batch: whole windows ``[B, To, ...]``; or one frame of every stream ``[B, ...]``, which is added to the
                 frames that this method and ``select_action`` were given since ``reset``. Keys that are not the policy's
                 are left alone.
-            noise: of the call.
-            plan: of the call.
-            prefix: of the call, as ``predict_action`` takes it.
 
         Raises:
             ObservationError: a window, a frame, noise or a prefix that does not fit; nothing was executed or kept.

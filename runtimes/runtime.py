@@ -74,11 +74,6 @@ class Runtime:
 
     A plan whose loop begins with the chunk of the call before has that of the last call of the episode, moved by what
     is executed of it. Where there is none, its ``otherwise`` is executed.
-
-    Args:
-        artifact: loaded and checked.
-        open_backend: on a view of the artifact; refuses what it cannot do.
-        plan: that most calls will have; None for the artifact's default.
     """
 
     def __init__(
@@ -185,7 +180,6 @@ class Runtime:
         Args:
             obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
             noise: see ``arrays.check_noise``; of the whole loop, also where the call begins with the chunk before.
-            plan: what to compute.
             prefix: normalised actions that are committed already, ``[B, N, Da]``; see ``inpainting``. None for none.
 
         Returns:

@@ -45,10 +45,8 @@ class Guard:
     """Checks chunks.
 
     Args:
-        limits: what actions may be.
         normalizer: of the actions; None if the policy has none that knows their range (``ChunkSpec.ranged``), and so
             no bounds but the ones in ``limits``.
-        channels: Da.
 
     Raises:
         ExecutorError: a limit has another number of channels, or the bounds leave no room.

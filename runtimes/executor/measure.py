@@ -93,10 +93,6 @@ class Jitter:
     """How late the ticks of a loop were, in milliseconds, and what the loop's own work took.
 
     Attributes:
-        hz: rate of the loop.
-        ticks: how many ticks were measured.
-        p50: median lateness.
-        p99: 99th percentile of the lateness.
         max: the latest tick.
         late: ticks that were later than half a period.
         work_us: median of the work of a tick, microseconds.

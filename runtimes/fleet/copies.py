@@ -51,11 +51,6 @@ class Copy:
     Each call is an episode of its own: the streams of a batch are other robots from call to call. An observation that
     the policy refuses fails alone.
 
-    Args:
-        artifact: its path, the same on every machine.
-        identity: of the artifact that is meant.
-        settings: see there.
-
     Raises:
         ArtifactChangedError: this machine has another artifact there.
     """
@@ -140,12 +135,6 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
     """Start copies on a cluster, and end them.
 
     No port is opened by Ray Serve: robots come through the server, and its lock.
-
-    Args:
-        address: of the cluster, as ``ray.init`` takes it; ``local`` for one of this machine's cores.
-        artifact: its path, the same on every machine.
-        identity: of the artifact.
-        settings: see there.
 
     Raises:
         RuntimeUnavailableError: Ray is not installed.

@@ -50,10 +50,6 @@ class OnnxBackends:
 class OnnxBackend:
     """A ``Backend`` on onnxruntime.
 
-    Args:
-        view: of an artifact.
-        sessions: of its models.
-
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
         frames: what depends on one frame alone.

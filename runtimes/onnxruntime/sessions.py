@@ -91,7 +91,6 @@ class Sessions:
         """What runs each ONNX piece of a view, by name: an ``InferenceSession``, or a ``JointBlock``.
 
         Args:
-            view: within its ``reading``.
             blocks: single blocks, too; else ``of_blocks`` may open them later.
 
         Raises:
@@ -238,10 +237,7 @@ class JointBlock:
 
     Attributes:
         session: an ``InferenceSession`` of the piece ``blocks``.
-        joint: its interface.
         index: number of the block.
-        piece: of the block.
-        stream: type of the residual stream.
         blanks: by number of streams, zeros for contexts that a block does not read.
     """
 

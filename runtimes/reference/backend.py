@@ -20,10 +20,6 @@ from .reuse import RolloutCache
 class ReferenceBackend:
     """A ``Backend`` on ``ReferenceModel``, without gradients; what fails is an error of the artifact.
 
-    Args:
-        view: of an artifact.
-        device: where the network computes; None for the CPU.
-
     Attributes:
         keeps: all entries of the rollout cache.
         model: what it runs.

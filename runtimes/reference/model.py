@@ -76,18 +76,12 @@ class ReferenceModel:
 
     Args:
         pieces: the denoiser cut up; the pruner may be missing.
-        spec: the policy beside its network.
-        types: type of each block's residual.
-        groups: FORWARD group of each block.
         weights: value of every constant of the pieces.
         device: where the pieces compute. Samples, and what the sampler does with them, are on the CPU wherever that is.
         first: values of constants that blocks have at step 0, where those are others.
 
     Attributes:
         device: where the pieces compute.
-        steps: K.
-        blocks: number of residual blocks.
-        groups: FORWARD group of each block.
         sampler: what moves the sample on.
         weights: every constant by name; at step 0 blocks may have others (``first``).
         pruner_weights: the pruner's tensors by name.
@@ -260,10 +254,7 @@ class ReferenceModel:
 
         Args:
             contexts: from ``prologue``.
-            initial: the sample at step 0, ``[B, T, D]``.
             noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
-            blocks: asked once a step, in order.
-            correction: of the sampler's steps; None for none.
             known: what a prefix makes known of the samples; None for nothing.
             since: a step to begin with, and what is carried to it; None for the whole loop.
         """
@@ -295,16 +286,10 @@ class ReferenceModel:
         is evaluated without recording: its own gradient would be multiplied by 0. With gates that do not, blocks are
         evaluated for the streams that compute them, and nothing else.
 
-        Args:
-            contexts: see ``steps_of``.
-            initial: see ``steps_of``.
-            noise: see ``steps_of``.
             gates: one-hot ``[B, K, blocks, 4]``, float32; or a plan, int8 ``[K, blocks]`` or ``[B, K, blocks]``.
             cache: what the previous call of the episode left; None at its start.
             write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,
                 by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
-            correction: see ``steps_of``.
-            known: see ``steps_of``.
 
         Raises:
             IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.

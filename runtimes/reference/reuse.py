@@ -48,8 +48,6 @@ class Cell:
     """One cell for all streams: block b at step k.
 
     Attributes:
-        k: the step.
-        b: the block.
         group: the block's FORWARD group.
         plan: int8 ``[B]``, the source of each stream.
         gates: float32 ``[B, 4]``, the same one-hot, with or without a gradient.

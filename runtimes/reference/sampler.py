@@ -48,16 +48,7 @@ class TorchSampler:
         correction: Correction | None = None,
         condition: Tensor | None = None,
     ) -> Carried:
-        """What is carried to step k + 1 (``core.spec.SamplerTable`` has the formula).
-
-        Args:
-            carried: to step k.
-            prediction: the network's output at step k, ``[B, T, D]``.
-            noise: the draw used at step k, ``[B, T, D]``; None if the sampler is deterministic.
-            k: step.
-            correction: of the sampler's steps; None for none.
-            condition: what the correction reads of the observation, ``[B, N]``; None if it reads nothing.
-        """
+        """What is carried to step k + 1 (``SamplerTable`` has the formula); a correction reads ``condition [B, N]``."""
         table, (sample, memory, history) = self._table, carried
         row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
         clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
@@ -121,9 +112,6 @@ def correct(
     """What is carried to step k + 1 with the correction of step k.
 
     Args:
-        carried: to step k.
-        prediction: the network's output at step k, ``[B, T, D]``.
-        following: what is carried to step k + 1 without a correction.
         weights: of the correction at step k, ``[G, 6 T, T]``.
         bias: of the correction at step k, ``[D, 1, T]``, or ``[D, B, T]`` with what it reads of the observation.
         anchor: whether step k enters the history.

@@ -60,9 +60,6 @@ class TorchBackend:
 
     Args:
         view: of an artifact; its blocks have their products in fp32, bf16 or fp16.
-        placed: constants of the artifact, where to compute.
-        threads: see ``TorchBackends``.
-        capture: see ``TorchBackends``.
 
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.

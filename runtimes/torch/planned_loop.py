@@ -98,10 +98,8 @@ def denoise_as_planned(
     """All steps of a call, in operations that ``torch.export`` takes.
 
     Args:
-        network: of the call.
         groups: FORWARD group of each block, numbered from zero.
         plan: int8 ``[B, K, blocks]``, legal.
-        advance: the sampler.
         initial: the sample at step 0, ``[B, T, D]``.
         offset: what each step adds to the sample, ``[K, D, B, (1 + S) T]``.
         read: what the correction reads of the condition, ``[B, F]``; None if it reads nothing.

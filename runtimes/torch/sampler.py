@@ -37,11 +37,6 @@ class State(NamedTuple):
 class Advance:
     """The steps of a policy's sampler with one correction.
 
-    Args:
-        spec: of the policy.
-        correction: of the sampler's steps; None for none.
-        device: where to compute.
-
     Attributes:
         horizon: T.
         memories: S.

@@ -24,11 +24,6 @@ from .sampler import Advance
 class Inlet:
     """A tensor of the device that the host writes to once a call.
 
-    Args:
-        shape: of it.
-        dtype: of it, by numpy's name.
-        device: of it.
-
     Attributes:
         array: what to write to; on the CPU the memory of the tensor itself.
         tensor: what the call reads.
@@ -50,15 +45,8 @@ class Inlet:
 class Workspace:
     """Tensors for B streams.
 
-    Args:
-        parts: of the artifact.
-        streams: B.
-
-    Attributes:
-        streams: B.
-        network: for B streams.
-        result: the denoised sample of the last call, ``[B, T, D]``.
-        rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
+    result: the denoised sample of the last call, ``[B, T, D]``.
+    rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
     """
 
     def __init__(self, parts: Parts, streams: int) -> None:

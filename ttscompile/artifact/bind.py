@@ -70,8 +70,6 @@ def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: b
 
     Args:
         model: from ``lower``; initializers that are constants of the program hold no data.
-        places: by name of the constant.
-        piece: name of the model, for messages.
         again: the model is bound already; the constants in ``places`` get new values.
 
     Raises:
@@ -104,12 +102,6 @@ def store_pieces(
     folder: Path, lowered: LoweredPieces, pieces: Mapping[str, PieceRecord], places: Mapping[str, Place]
 ) -> PrecisionRecord:
     """Write pieces beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
-
-    Args:
-        folder: of the artifact.
-        lowered: what to write.
-        pieces: of the artifact.
-        places: of the program's constants, which these models read too.
 
     Raises:
         ArtifactError: a model that does not fit its piece, or a constant that has the name of another.

@@ -118,9 +118,6 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     identity covers that, the pruner's weights, all fields of all plans by name, which of them is the default, and by
     name the weights and models that plans may take: a calibration belongs to the model with or without them. Neither
     covers what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
-
-    Returns:
-        Two sha256 of 64 digits.
     """
     document = to_json(manifest)
     hashes = {name: record.sha256 for name, record in manifest.files.items()}

@@ -27,12 +27,7 @@ def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArra
 
 
 def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:
-    """The corrections among some arrays, by the name of the plan.
-
-    Args:
-        stored: arrays; those of other names are left alone.
-        manifest: of the artifact.
-        where: for messages.
+    """The corrections among some arrays, by the name of the plan; arrays of other names are left alone.
 
     Raises:
         ArtifactError: a correction of no plan, with too few or too many fields, or that does not fit the policy.

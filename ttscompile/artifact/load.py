@@ -217,9 +217,6 @@ class Artifact:
 def load_artifact(path: str | Path) -> Artifact:
     """Open an artifact and check all of it: schema, sizes and hashes of all files, identity, plans, onnxruntime.
 
-    Args:
-        path: the directory that ``convert`` wrote, or the same zipped.
-
     Returns:
         The artifact; arrays are mapped, not read.
 

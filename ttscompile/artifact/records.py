@@ -147,10 +147,8 @@ def piece_records(
     """One record an ONNX model.
 
     Args:
-        program: in its pieces.
         models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
             ``dense_step``, and perhaps ``idle`` and ``layers``.
-        files: file name of each model.
 
     Raises:
         ArtifactError: models and pieces do not have the same names, inputs or outputs.
@@ -192,7 +190,6 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
 
     Args:
         manifest: with the loops and weights that the plans name.
-        plans: by name.
         record: of the calibration: what the plans of the pruner come to on average is in it.
 
     Raises:

@@ -91,11 +91,6 @@ class Value:
 def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
     """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
 
-    Args:
-        content: the document.
-        where: name of the file, for messages.
-        limit: largest accepted size in bytes.
-
     Raises:
         ArtifactError: not such a document.
     """

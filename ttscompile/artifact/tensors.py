@@ -140,14 +140,7 @@ def check_arrays(
     where: object,
     remedy: str = REMEDY,
 ) -> None:
-    """Raise unless these are exactly the arrays that are wanted.
-
-    Args:
-        kind: what each of them is, for messages.
-        arrays: by name.
-        wanted: dtype and shape by name.
-        where: they come from, for messages.
-        remedy: what to do.
+    """Raise unless these are exactly the arrays that are wanted, of the wanted dtypes and shapes.
 
     Raises:
         ArtifactError: names the first that is missing, too many, or of another dtype or shape.

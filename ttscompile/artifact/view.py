@@ -37,8 +37,6 @@ class View:
     """See the module. ``view_of`` makes it.
 
     Attributes:
-        artifact: loaded and checked.
-        variant: what it is a view for.
         manifest: the artifact's, with the sampler, FLOPs and pieces of this loop, and the plans of this variant.
         tables: TABLE contexts ``[K, ...]`` of this loop.
         start: how a loop begins that goes on with the chunk of the call before; None where it begins with noise.
@@ -150,7 +148,6 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
     """The view for a plan.
 
     Args:
-        artifact: loaded and checked.
         plan: a plan, or the name of one; None for the artifact's default.
 
     Raises:

@@ -85,9 +85,6 @@ def write_artifact(
         beside: files for other programs, by name, one of ``BESIDE``.
         loop: of plan ``full``.
 
-    Returns:
-        The manifest.
-
     Raises:
         ArtifactError: ``directory`` is something else than an artifact, or cannot be written; or program and models do
             not fit each other. Nothing is changed then.
@@ -144,9 +141,6 @@ def update_plans(
         golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
         held: whether the caller has the artifact ``locked``.
-
-    Returns:
-        The new manifest.
 
     Raises:
         ArtifactError: no artifact, a zipped one, one that is being updated, or arguments that do not fit it.

@@ -179,12 +179,8 @@ def prepare_calls(
     """Calls without targets: draw their noise and run the prologue.
 
     Args:
-        model: of the policy.
         spec: of the policy, with the loop of the model.
-        episodes: all recorded episodes.
         chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
-        seed: the seed of the noise.
-        window: see ``Calls``.
         pinned: whether all calls of a window have the noise of its first; else each has noise of its own.
     """
     initial, noise = draw_noise(spec, len(chosen), seed)
@@ -253,16 +249,7 @@ class Actions:
         return part.reshape(*part.shape[:-2], self.size)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:
-        """Mean absolute difference of the executed actions of each call; at most ``LARGEST``, also where they are NaN.
-
-        Args:
-            samples: ``[..., N, T, D]``.
-            targets: ``[N, T, D]``.
-            units: in the units of the actions, rather than normalised.
-
-        Returns:
-            ``[..., N]``.
-        """
+        """Mean absolute difference of the executed actions of each call, ``[..., N]``; at most ``LARGEST``, also of NaN."""
         difference = (self.executed(samples) - self.executed(targets)).abs()
         if units:
             difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)

@@ -38,9 +38,7 @@ class Executor:
             streams and residuals.
 
     Attributes:
-        view: the same.
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
-        model: of the policy.
         types: of each block's residual.
         axes: of the streams in each block's residual.
         alike: whether all blocks have residuals of one type.
@@ -91,15 +89,11 @@ class Executor:
         )
 
     def run(self, plan: PlanArray, calls: Calls) -> Tensor:
-        """The denoised sample of every call.
+        """The denoised sample of every call, ``[N, T, D]``.
 
         Args:
             plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. A cell that reads of an earlier
                 call what no earlier one of its window computed reads TIMESTEP, as legalised plans do.
-            calls: N of them.
-
-        Returns:
-            ``[N, T, D]``.
 
         Raises:
             IllegalPlanError: a plan reads the rollout cache and calls are independent, or step 0 is not dense.

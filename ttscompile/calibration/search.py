@@ -30,7 +30,6 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
     """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
 
     Args:
-        name: the name of the strategy.
         task: see ``Task``; its clock is not used.
         intervals: how many at most; None for the strategy's own number.
         seconds: after which nothing more is begun that can be left out.
@@ -57,8 +56,6 @@ def search_plan(
     """Intervals until the search is done, or the time is up; one at least.
 
     Args:
-        search: after its first ``first`` intervals.
-        clock: with the limit of the search.
         most: intervals; None for the strategy's own number.
         first: the interval to begin with.
         after: told after each interval how many are done, and how many seconds the longest took.

@@ -34,7 +34,6 @@ class StateFile:
     """The state of one calibration or comparison.
 
     Args:
-        directory: the directory of the artifact.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
         work: ``calibration`` or ``comparison``.
 

@@ -50,8 +50,6 @@ class WholeSteps:
     """Compares schedules of whole steps.
 
     Args:
-        executor: runs the policy.
-        actions: which part of the sample counts.
         calls: with what the dense policy answers to them.
         seed: decides which of the calls corrections are fitted on, and which, of other episodes, schedules are compared
             on.

@@ -52,9 +52,6 @@ class BenchReport:
     """What was found.
 
     Attributes:
-        measured: everybody's times.
-        default: name of the artifact's default plan.
-        calls: of each.
         by_threads: median of one plan in ms by its number of threads.
         error: of dense calls in a precision that a runtime makes; None if no plan asks for one.
         loop: which plans keep up; None if that was not asked.

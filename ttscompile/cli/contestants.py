@@ -59,7 +59,6 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
     more than two copies of the weights. A plan that goes on from an earlier call has a policy of its own.
 
     Args:
-        artifacts: by name.
         plans: of the first artifact, and of the others where they have one of this name; all where none is named.
             ``NAME@PRECISION`` is one in another precision.
         ways: how they run.
@@ -108,12 +107,6 @@ def _goes_on(artifact: Artifact, plan: Plan) -> bool:
 def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
     """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
 
-    Args:
-        checkpoint: as ``convert`` took it.
-        encoders: the folder that ``convert`` was given with it, if it was.
-        threads: of PyTorch.
-        artifact: that was made from it.
-
     Raises:
         RuntimeUnavailableError: there is no torch.
         SpecError: the checkpoint is of another policy.
@@ -147,11 +140,6 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
 
 def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = None) -> tuple[nn.Module, PolicySpec]:
     """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
-
-    Args:
-        checkpoint: as ``convert`` took it.
-        spec: specification of the policy in the artifact.
-        encoders: see ``originals``.
 
     Raises:
         SpecError: the checkpoint is of another policy.

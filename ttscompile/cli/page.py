@@ -32,17 +32,7 @@ def require_page(path: Path) -> None:
 def write_page(
     path: Path, artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None]
 ) -> str:
-    """Write the page; it replaces another one only when it is whole.
-
-    Args:
-        path: see ``require_page``.
-        artifact: loaded.
-        policy: the same, with a seed; its calls are timed now.
-        given: what the page shows beside the artifact.
-        progress: told what is under way.
-
-    Returns:
-        What was written, for people.
+    """Write the page; it replaces another one only when it is whole. Says what was written.
 
     Raises:
         OutputError: it cannot be written.

@@ -154,13 +154,7 @@ class Correction:
         return int(self.reading.shape[1])
 
     def require_fit(self, steps: int, sample: tuple[int, int], numbers: int, groups: int | None = None) -> None:
-        """Raise unless it is a correction for a policy of K steps, samples ``(T, D)`` and a condition of N numbers.
-
-        Args:
-            steps: K.
-            sample: ``(T, D)``.
-            numbers: N.
-            groups: of action dimensions; None for as many as ``groups_of`` has.
+        """Raise unless it is for a policy of K steps, samples ``(T, D)`` and conditions of N numbers.
 
         Raises:
             IllegalPlanError: it is not.

@@ -18,12 +18,6 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
 
     What openpi and LeRobot do: bilinear, without smoothing what becomes smaller.
 
-    Args:
-        array: ``[..., C, h, w]``.
-        spec: of the observation, of a window or of a frame.
-        what: for the message, ``observation 'obs'``.
-        error: class of the error.
-
     Raises:
         TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.
     """

@@ -90,10 +90,6 @@ def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
 def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
     """Resolve every cell of one stream's plan to the computed residual that it adds.
 
-    Args:
-        plan: int8 ``[K, blocks]``.
-        groups: for each block the number of its FORWARD group (one kind and one shape).
-
     Returns:
         The origins; cells that read nothing have ``UNWRITTEN``. Rollout cells are resolved to their own index
         whether or not the rollout cache holds them: that depends on the episode.
@@ -118,16 +114,7 @@ def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
 
 
 def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> BoolArray:
-    """Cells of one stream's plan that may not be executed.
-
-    Args:
-        plan: int8 ``[K, blocks]``.
-        groups: FORWARD group of each block.
-        written: bool ``[K, blocks]``; rollout entries that an earlier call of the episode computed.
-
-    Returns:
-        bool ``[K, blocks]``: a reuse in step 0, or a read of a residual that was never computed.
-    """
+    """Cells of one stream's plan that may not be executed, bool ``[K, blocks]``."""
     resolved = origins(plan, groups)
     illegal: BoolArray = np.where(resolved.rollout, ~written, resolved.cell == UNWRITTEN)
     illegal[0] |= plan[0] != Source.COMPUTE.value
@@ -136,11 +123,6 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
     """Raise if any stream's plan is illegal.
-
-    Args:
-        plans: int8 ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
-        written: bool ``[B, K, blocks]``.
 
     Raises:
         IllegalPlanError: names the first cell, and how many there are.
@@ -164,8 +146,6 @@ def legalize(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> tupl
     Pure: neither argument is changed. Works on one plan or on one a stream.
 
     Args:
-        plan: int8 ``[K, blocks]`` or ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
         written: bool, of the plan's shape; the rollout entries that exist.
 
     Returns:

@@ -27,11 +27,6 @@ def on_hub(path: str | os.PathLike[str]) -> bool:
 def require_path(path: str | os.PathLike[str], error: type[TtscompileError], give: str) -> None:
     """Raise unless a path leads to a file or a directory, before anything of it is opened.
 
-    Args:
-        path: links are followed.
-        error: of this kind.
-        give: what to give instead, as a sentence; ends the message.
-
     Raises:
         TtscompileError: of the kind ``error``: nothing is there, its name cannot be looked up, or it is a pipe, a
             socket or a device.

@@ -78,12 +78,6 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     Entries that are pickles of their own (``pickles``) stay the bytes they are.
 
-    Args:
-        path: the file.
-
-    Returns:
-        The dictionary that was saved.
-
     Raises:
         CheckpointError: missing, truncated, not a torch zip, or naming a global that is not known to be harmless.
     """
@@ -172,9 +166,6 @@ def plain_config(value: Any, where: str = "cfg", depth: int = 0, values: Iterato
 
     Args:
         value: what ``read_checkpoint`` found, or a part of it; plain dictionaries and lists pass as they are.
-        where: dotted name of ``value``, for messages.
-        depth: of ``value`` in the whole.
-        values: counts those of the whole.
 
     Returns:
         dict, list, str, int, float, bool or None, nested.

@@ -50,11 +50,6 @@ def encoder_settings(settings: Settings) -> Settings:
 def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> MultiImageEncoder:
     """The observation encoder with its weights; normalisers of images are part of it.
 
-    Args:
-        settings: ``cfg.policy.obs_encoder``.
-        observed: of its ``shape_meta``.
-        weights: of the policy.
-
     Raises:
         CheckpointError: settings, weights or normalisers that do not fit.
     """

@@ -134,11 +134,6 @@ def image_normalizer(weights: Weights, key: str) -> tuple[float, float]:
 def network_settings(config: Config, network: str, names: Collection[str]) -> dict[str, Any]:
     """``cfg.policy.model``, the settings of a network that the configuration describes on its own.
 
-    Args:
-        config: the whole configuration.
-        network: class that is expected.
-        names: of the settings that it knows.
-
     Raises:
         CheckpointError: it is of another class, or has other settings.
     """

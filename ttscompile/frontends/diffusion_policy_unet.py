@@ -117,11 +117,8 @@ def behind_encoder(
     """A U-Net on what an encoder makes of the observed steps.
 
     Args:
-        saved: the policy.
         encoder: observations by key to ``[B, To, width]``.
         width: of a step's features.
-        observed: what it takes.
-        action_dim: Da.
         network: settings of the U-Net, but for its channels.
         known: settings of ``cfg.policy`` that were read for encoder and network.
     """
@@ -159,11 +156,8 @@ def denoiser(
     """The network with its weights, as it is given the observation, and the shape ``(T, D)`` of its sample.
 
     Args:
-        saved: the policy.
         weights: of the policy, without those of an encoder.
-        config: of its network.
         given: how it is given the observation.
-        action_dim: Da.
         steps: name of the setting that says how many steps its sample has.
         start: the first of them that is executed.
 

@@ -54,8 +54,6 @@ def require_room(needed: Mapping[str, int], weights: Weights, where: str = "cfg.
 
     Args:
         needed: weights that the network has at least, by the setting that asks for them.
-        weights: all there are.
-        where: the settings stand, for messages.
 
     Raises:
         CheckpointError: it has not: whatever the configuration says, no more memory is taken than the file has.

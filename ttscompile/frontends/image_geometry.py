@@ -17,8 +17,6 @@ class ResizeCrop(nn.Module):
     keeps is stored.
 
     Args:
-        height: of the image.
-        width: of the image.
         resize: (height, width); None for none.
         crop: (height, width) within the resized image; None for all of it.
         antialias: whether pixels of a smaller image are averages of all that they stand for, as torchvision resizes

@@ -26,8 +26,6 @@ def task_tokens(text: str, name: str, folder: Path | None, most: int, vocabulary
     """The tokens of an instruction, without padding: nothing reads that.
 
     Args:
-        text: of the instruction.
-        name: of the tokenizer, for messages.
         folder: that has its ``tokenizer.json``; None if there is none.
         most: tokens that the policy reads; what is longer is cut, as lerobot does.
         vocabulary: tokens that the language model knows.

@@ -88,12 +88,6 @@ def _evaluate(node: ast.AST) -> Any:
 def evaluate_expression(text: str) -> Any:
     """Value of a small arithmetic expression, as in ``${eval:'2 if True else 2 + 20'}``.
 
-    Args:
-        text: the expression, without references.
-
-    Returns:
-        int, float, bool, str or None.
-
     Raises:
         CheckpointError: anything but the small language; says what of it.
     """

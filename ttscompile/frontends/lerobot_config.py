@@ -67,8 +67,6 @@ def read_lerobot_config(
     """Check what all types have.
 
     Args:
-        directory: that the policy was saved to.
-        entries: of its ``config.json``.
         horizon: lerobot's default for this type.
         n_action_steps: the same.
         environment: whether this type reads the state of the environment; if not, it is no observation.

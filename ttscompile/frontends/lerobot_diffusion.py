@@ -217,11 +217,6 @@ class Network(nn.Module):
 class ConditionEncoder(Measured):
     """Raw observations to the condition vector: each frame is [state, cameras, environment], oldest first.
 
-    Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        rgb_encoder: as ``Network`` has it.
-
     Raises:
         CheckpointError: the crop is larger than the images.
     """

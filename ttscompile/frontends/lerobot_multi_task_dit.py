@@ -290,10 +290,6 @@ class ConditionEncoder(Measured):
     """Raw observations to the condition vector: normalised, cropped and encoded.
 
     Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        geometry: resizes and crops the frames of all cameras; None without cameras.
-        observation_encoder: CLIP and the projection.
         tokens: the names of the instruction's tokens and of their mask.
         task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
             is an input.

@@ -83,13 +83,10 @@ def vla_spec(
     """The specification of a policy.
 
     Args:
-        config: of the policy.
-        processors: its own.
         image: height and width that images are resized to; None where they stay.
         fit: where the rest of a resized image is.
         sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
             absent where it is compiled in.
-        options: of the caller.
     """
     language = {}
     if "tokens" in sizes:

@@ -36,9 +36,7 @@ def loops_of(make: Make, options: LoadOptions, own: str) -> Loops:
     original, and the source says in place of what.
 
     Args:
-        make: of the checkpoint.
         options: of the caller; without sampler, steps and spacing nothing is asked for.
-        own: class of the checkpoint's scheduler, for the source.
 
     Raises:
         CheckpointError: the checkpoint describes no loop that is known, and nothing was asked for; or as ``make``.

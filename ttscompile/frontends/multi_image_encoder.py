@@ -23,8 +23,6 @@ class View:
     """How the images of one observation key are taken in.
 
     Attributes:
-        height: of the image as it comes.
-        width: of the same.
         resize: ``(height, width)`` that it is brought to; None for none.
         crop: of the centre that is looked at; None for the whole image.
         scale: of each colour, after that.

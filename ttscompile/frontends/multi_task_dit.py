@@ -154,14 +154,6 @@ class ObservationEncoder(nn.Module):
     """Window of observations and an instruction to the condition vector.
 
     Each frame is [state, class tokens of all cameras, instruction]; the frames are concatenated, oldest first.
-
-    Args:
-        cameras: how many there are.
-        vision: of the image encoder; None without cameras.
-        text: of the text encoder.
-        text_width: channels of the instruction.
-        separate: whether each camera has an encoder of its own.
-        frames: To.
     """
 
     def __init__(

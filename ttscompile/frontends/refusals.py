@@ -134,11 +134,6 @@ STATES = (
 def refuse_policy(name: str, rows: Iterable[Refusal] = POLICIES, where: str = "") -> NoReturn:
     """Refuse a checkpoint whose policy is another one than its project's that are read.
 
-    Args:
-        name: of the policy's class or type.
-        rows: of the project; the last one matches every name.
-        where: begins the message.
-
     Raises:
         CheckpointError: always.
     """

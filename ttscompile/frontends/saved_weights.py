@@ -100,7 +100,6 @@ def require_weights(
 
     Args:
         expected: by name, on any device: only shapes are looked at.
-        found: what the file has, under the same names.
         source: of the expected shapes, for messages; the configuration or a part of it.
         masks: names of what may hold infinity.
         what: is wrong where names are missing or unknown; begins the message.

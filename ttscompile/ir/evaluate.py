@@ -109,8 +109,6 @@ class Evaluator:
     flow to them and to the inputs.
 
     Args:
-        graph: what to run.
-        weights: value of each of the graph's constants, by name; others are ignored.
         device: where device arguments inside the graph point. Weights and inputs must be there.
 
     Raises:
@@ -149,9 +147,6 @@ class Evaluator:
         Args:
             inputs: value of each of the graph's inputs, by name, of its type for some number of streams B; entries
                 that are no inputs are ignored, so that one environment can be given to several graphs.
-
-        Returns:
-            The outputs in the order of ``graph.outputs``.
 
         Raises:
             ObservationError: an input is missing, or has a dtype or shape that is not its type's, or sizes

@@ -58,7 +58,6 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
     Args:
         tail: residual stream and contexts -> prediction ``[B, T, D]``.
         stem: sample ``[B, T, D]`` and contexts -> residual stream.
-        spec: gives the shape of the sample, the clip and the columns.
 
     Returns:
         A graph with the inputs ``stream``, ``sample`` and ``offset`` ``[D, B, T]``, ``history`` ``[D, B, 4 T]``,

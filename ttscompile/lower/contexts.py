@@ -18,18 +18,11 @@ class Contexts:
     """Writes the prologue of all streams into the main graph.
 
     Args:
-        main: writer of the main graph.
-        pieces: of the program.
         models: of ``condition`` and, if the program has them, ``frames``, frame pieces, ``step`` and ``pruner``.
-        weights: values of their constants.
         observations: normalised, by name.
         streams: value of B, int64 ``[1]``.
         steps: K.
 
-    Attributes:
-        pieces: of the program.
-        streams: value of B, int64 ``[1]``.
-        steps: K.
         conditions: condition values by name.
         rows: tables ``[K, ...]`` by name.
         by_step: step values ``[K * B, ...]`` by name, step-major, whatever their axis of streams is.

@@ -31,8 +31,6 @@ def name_model(exported: ModelProto, name: str, inputs: Values, constants: Value
 
     Args:
         exported: its inputs are the inputs and then the constants, by position.
-        name: of the ONNX graph.
-        inputs: name and type of each input of the model.
         constants: name and type of each weight. Each becomes an initializer of this name with dtype and dims and *no
             data*; the writer of the artifact gives it a place in a weights file (``artifact.bind``).
         outputs: name and type of each output; an output may be an input or a constant.

@@ -111,7 +111,6 @@ def lower_precision(
 
     Args:
         models: from ``lower_program``; those of the parts are taken, but for the models that hold all blocks.
-        weights: constants of the program, by name.
         precision: ``int8``; the models have ``fp32`` already.
         parts: from ``parts_to_lower``.
 

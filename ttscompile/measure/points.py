@@ -29,8 +29,6 @@ class MeasuredPoint:
     """One plan on the held-out calls of a comparison.
 
     Attributes:
-        series: see ``Point``.
-        name: see ``Point``.
         distance: of its actions from the original's (``calibration.judge``).
         interval: 95 % interval of that, over episodes.
         error: mean absolute difference of the executed actions from the original's with the same noise, in their units;

@@ -28,11 +28,6 @@ _CHARACTER = 0.012
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
     """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
 
-    Args:
-        width: in inches.
-        height: in inches.
-        told: what it will show, and ``--json`` says too; for the error.
-
     Raises:
         RuntimeUnavailableError: matplotlib is not installed.
     """
@@ -66,16 +61,7 @@ def plain_powers(axis: Axis) -> None:
 
 
 def beside(place: float, name: str, shift: float = 0.0) -> dict[str, Any]:
-    """How to write a name beside its point: to its right, or where that would leave the frame, to its left.
-
-    Args:
-        place: of the point between the first and the last, 0..1.
-        name: to write.
-        shift: upwards, in points.
-
-    Returns:
-        Arguments for ``Axes.annotate``.
-    """
+    """How to write a name beside its point: to its right, or where that would leave the frame, to its left."""
     left = place + _CHARACTER * len(name) > 1
     return {"xytext": (-5 if left else 5, shift), "textcoords": "offset points", "ha": "right" if left else "left"}
 

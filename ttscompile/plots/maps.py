@@ -29,12 +29,6 @@ _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward
 def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: str = "") -> None:
     """Draw one plan and write the picture.
 
-    Args:
-        plan: int8 ``[K, blocks]`` of ``Source``.
-        kinds: kind of each block, in order of execution.
-        path: see ``write_picture``.
-        title: over the picture; the sparsity is added to it.
-
     Raises:
         IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
         RuntimeUnavailableError: matplotlib is not installed.
@@ -78,13 +72,8 @@ def plot_errors(
 
     Args:
         errors: ``[A, blocks]``.
-        steps: number of each of the A steps.
-        kinds: kind of each block, in order of execution.
         tolerance: errors above it are framed.
-        path: see ``write_picture``.
-        title: over the picture.
         cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
-        plan: its name.
 
     Raises:
         RuntimeUnavailableError: matplotlib is not installed.

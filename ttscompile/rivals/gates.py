@@ -49,7 +49,6 @@ class Gates(NothingAfter):
     """Gradient steps on the scores of the cells; see ``Search``.
 
     Args:
-        task: see ``Task``.
         reuse: what cells that are not computed read.
         whole: every how many steps all cells are computed; 0 for step 0 only.
 

@@ -194,9 +194,7 @@ def fit_threshold(
     """The criterion with the lowest threshold that keeps the budget, as far as bisection finds it.
 
     Args:
-        task: see ``Task``.
         criterion: with any threshold.
-        calls: whose computed cells are counted.
         low: a threshold that is probably too low.
         high: one that probably is not; doubled until it is not.
         probes: as many as there is time for.

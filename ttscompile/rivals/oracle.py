@@ -76,7 +76,6 @@ def oracle(
     """Measure what choosing a schedule for each call could gain. Nothing is written.
 
     Args:
-        path: the artifact.
         trajectories: recorded episodes, see ``ttscompile.trajectories``; three at least.
         budget: computed steps of a call.
         observation: see ``ttscompile.calibrate``.
@@ -84,7 +83,6 @@ def oracle(
         calls: observations to judge on, and as many to learn from, at most.
         draws: of noise for each observation, two at least.
         seed: the seed of the division of the episodes, the calls, the noise and the schedules.
-        progress: told how far it is.
 
     Raises:
         CalibrationError: arguments out of range, or too few episodes.

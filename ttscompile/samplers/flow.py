@@ -47,8 +47,6 @@ def flow_matching_table(
         steps: N, number of steps of equal length; or the N + 1 times themselves, from ``start`` to ``end``, which then
             are not to be given.
         method: ``euler`` or ``rk4``.
-        start: time at which the sample is noise.
-        end: time at which it is the action.
         timestep_scale: the network is given ``time * timestep_scale``, as a float32.
         clip: bound on the sample that the velocity leads to from where it is, ``x + (end - t) v``; Euler only.
 

@@ -93,9 +93,6 @@ def multistep_table(scheduler: Any, steps: int, name: str, step_arguments: Mappi
 
     Args:
         scheduler: a configured ``DPMSolverMultistepScheduler`` after ``set_timesteps``, which is called again.
-        steps: K.
-        name: of the table.
-        step_arguments: further keyword arguments of ``step``.
 
     Raises:
         SpecError: noise levels that repeat, or a step that has not the form of ``SamplerTable``.

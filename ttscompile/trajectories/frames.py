@@ -65,10 +65,6 @@ def observation_frames(
 ) -> dict[str, Array]:
     """The frames of each key of the observation.
 
-    Args:
-        path: of the file, for messages.
-        frames: what the file holds.
-        observations: what the policy observes, by key.
         sources: by key, the arrays that it is made of where they are called otherwise: flattened frame by frame and
             joined; ``NAME:N`` are the first N numbers of one.
 

@@ -63,8 +63,6 @@ def verify(
         trajectories: recorded episodes, see ``ttscompile.trajectories``. None: errors of reuse are not judged.
         sources: by key of the observation, the arrays of a recording that it is made of.
         calls: recorded calls to go through at least, in whole episodes.
-        threads: threads that onnxruntime computes with.
-        progress: told what is being done.
 
     Returns:
         What every rung found. Nothing is raised for a rung that fails.
