@@ -24,11 +24,7 @@ _MISSING = object()
 
 
 def check_seed(seed: int | None) -> int | None:
-    """The seed as Python's integer, or None for none.
-
-    Raises:
-        TtscompileError: not a whole number of at least 0.
-    """
+    """The seed as Python's integer, or None for none. Raises TtscompileError: not a whole number of at least 0."""
     return None if seed is None else integer(seed, "seed", TtscompileError, more=", or None for another sequence")
 
 
@@ -44,6 +40,7 @@ def read_observation(
 ) -> tuple[dict[str, Array], Any]:
     """The arrays of an observation by key, each taken from the mapping once: it may give something else the next time.
 
+    Args:
         others: leave keys alone that are not the policy's, rather than refuse them.
 
     Returns:

@@ -89,9 +89,6 @@ class Backend(Protocol[Lowered]):
     def other_steps(self, plans: Sequence[Lowered]) -> FloatArray:
         """The rest of the call.
 
-        Args:
-            plans: of each stream.
-
         Returns:
             The denoised sample, float32 ``[B, T, D]``: an array that no later call changes.
         """

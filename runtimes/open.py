@@ -112,11 +112,7 @@ def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
 
 
 def kind_of(runtime: str) -> Kind:
-    """The kind of this name.
-
-    Raises:
-        RuntimeUnavailableError: there is none.
-    """
+    """The kind of this name. Raises RuntimeUnavailableError: there is none."""
     if runtime not in RUNTIMES:
         raise RuntimeUnavailableError(f"no runtime is called {runtime!r}; expected one of {', '.join(RUNTIMES)}.")
     return RUNTIMES[runtime]

@@ -68,11 +68,7 @@ class CompiledPolicy:
         self._exit = weakref.finalize(self, _end_calls, self._lock, self._process)
 
     def __getstate__(self) -> None:
-        """Refuse to be copied, and to be sent to another process.
-
-        Raises:
-            TtscompileError: always.
-        """
+        """Refuse to be copied, and to be sent to another process. Raises TtscompileError: always."""
         remedy = "Load it again, where it is called: ttscompile.load(DIR)."
         raise TtscompileError(f"a compiled policy cannot be copied, nor sent to another process. {remedy}")
 
@@ -216,9 +212,6 @@ class CompiledPolicy:
 
         It matters to plans that begin with the chunk of the call before: they move it by as many. A call that is late,
         since more steps were due than ``action`` has, begins with noise.
-
-        Args:
-            executed: steps at the policy's rate.
         """
         executed = integer(executed, "executed", TtscompileError)
         with self._turn():

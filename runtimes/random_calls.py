@@ -13,13 +13,7 @@ Observation = dict[str, npt.NDArray[Any]]
 
 
 def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:
-    """Observations of one stream as ``ObservationSpec.draw`` makes them, and noise, for consecutive calls.
-
-    Args:
-        spec: of the policy.
-        count: how many calls.
-        seed: the same calls come of the same seed; more of them begin with the same ones.
-    """
+    """Observations of one stream, and noise, for consecutive calls; more of a seed begin with the same ones."""
     return [random_call(spec, number, seed) for number in range(count)]
 
 

@@ -86,7 +86,6 @@ class TokenTower:
 
         Args:
             lane: of the frame. What is kept of it is gone if this fails.
-            row: ``[1, ...]``, by the input of the frame piece.
 
         Raises:
             ArtifactError: the manifest cuts the picture into other patches than there are tokens.

@@ -35,7 +35,6 @@ class Clock(Protocol):
         May return early; callers look again at what they wait for.
 
         Args:
-            condition: held by the caller; released while waiting.
             timeout: seconds; None for no limit.
         """
 
@@ -112,13 +111,7 @@ class Jitter:
 
 
 def measure_jitter(hz: float, seconds: float, work: Callable[[], object] = lambda: None) -> Jitter:
-    """Run a loop in real time, sleeping between ticks, and measure how late it wakes.
-
-    Args:
-        hz: rate of the loop.
-        seconds: how long it runs.
-        work: called in every tick.
-    """
+    """Run a loop in real time, sleeping between ticks, and measure how late it wakes."""
     ticks = max(int(seconds * hz), 1)
     late, took = np.empty(ticks), np.empty(ticks)
     start = time.perf_counter()

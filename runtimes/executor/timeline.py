@@ -87,12 +87,9 @@ class Timeline:
 
 
 def expand(actions: FloatArray, ticks_per_step: int, interpolation: str) -> FloatArray:
-    """Actions at the policy's rate as actions at the control rate.
+    """Actions ``[Ta, Da]`` at the policy's rate as actions at the control rate, ``[Ta * ticks_per_step, Da]``.
 
-        interpolation: ``hold``: an action is repeated; ``linear``: it moves evenly to the next; the last is repeated.
-
-    Returns:
-        float32 ``[Ta * ticks_per_step, Da]``.
+    With ``hold`` an action is repeated; with ``linear`` it moves evenly to the next, and the last is repeated.
     """
     if ticks_per_step == 1:
         return actions

@@ -91,11 +91,7 @@ class Trace:
         }
 
     def write(self, path: str | Path, process: str = "ttscompile") -> None:
-        """Write the document to a file, whole or not at all.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write the document to a file, whole or not at all. Raises OSError: it cannot be written."""
         replace_file(Path(path), json.dumps(self.to_json(process), allow_nan=False).encode())
 
 

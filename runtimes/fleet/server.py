@@ -65,11 +65,7 @@ class Plans(NamedTuple):
         return found._replace(default=found.known(found.default))
 
     def known(self, plan: str) -> str:
-        """The name, if it is one of these.
-
-        Raises:
-            IllegalPlanError: see above.
-        """
+        """The name, if it is one of these. Raises IllegalPlanError: see above."""
         if plan not in self.names:
             why = "plans that read the call before are left out, since that may be another robot's"
             raise IllegalPlanError(f"plan {plan[:40]!r} cannot run here: expected one of {list(self.names)}; {why}.")

@@ -35,13 +35,7 @@ def _run_dense(work: Workspace, k: int, keep: BoolArray) -> None:
 
 
 def decode_rest(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:
-    """The steps after step 0; the sample is then ``work.sample[K % 2]``.
-
-    Args:
-        work: after ``decode_first``.
-        lowered: instructions of each stream.
-        keep: as above.
-    """
+    """The steps after step 0; the sample is then ``work.sample[K % 2]``."""
     if all(one is lowered[0] for one in lowered):
         _together(work, lowered[0], keep)
     else:

@@ -83,15 +83,7 @@ class IdleSteps:
         self._prepare.run()
 
     def run(self, first: int, stop: int, updates: Array, offsets: Array, anchors: Sequence[bool]) -> None:
-        """The steps ``first`` to ``stop - 1``, which all add ``total``.
-
-        Args:
-            first: a step.
-            stop: a later one.
-            updates: float32 ``[K, G, R, (1 + S) T]``.
-            offsets: float32 ``[K, D, B, T]``.
-            anchors: of each step, whether it enters the history.
-        """
+        """The steps ``first`` to ``stop - 1``, which all add ``total``."""
         dot, add = np.dot, np.add
         (sample, prediction), product, base = self._parts[:2], self._product, self._base
         count, horizon = len(sample), self._horizon

@@ -237,7 +237,6 @@ class JointBlock:
 
     Attributes:
         session: an ``InferenceSession`` of the piece ``blocks``.
-        index: number of the block.
         blanks: by number of streams, zeros for contexts that a block does not read.
     """
 
@@ -269,11 +268,6 @@ class Bound:
     """A session tied to arrays that stay where they are: running it reads some and writes the others.
 
     Binding costs as much as several runs' overhead, and saves it in every run; so bindings are made once and kept.
-
-    Args:
-        session: an ``InferenceSession`` or ``JointBlock``.
-        inputs: by name; contiguous.
-        outputs: by name; contiguous.
     """
 
     __slots__ = ("_arrays", "_binding", "_session")
@@ -292,11 +286,7 @@ class Bound:
             self._binding.bind_output(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
 
     def run(self) -> None:
-        """Run once.
-
-        Raises:
-            ArtifactError: the graph does not do what the manifest says.
-        """
+        """Run once. Raises ArtifactError: the graph does not do what the manifest says."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's own classes, and what it raises itself

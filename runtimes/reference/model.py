@@ -36,8 +36,6 @@ class Contexts:
     """What the loop reads beside the stream, for one observation.
 
     Attributes:
-        streams: B.
-        condition: condition values by name.
         steps: step values by name, one mapping for each step k; empty mappings if the policy has none.
     """
 
@@ -139,14 +137,7 @@ class ReferenceModel:
         return {} if pruner is None else {n: self.weights[n] for n in pruner.constants if n.startswith("pruner.")}
 
     def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
-        """Everything that the observation decides before the loop starts.
-
-        Args:
-            obs: normalised observations by key, ``[B, ...]`` each.
-
-        Returns:
-            Tensors of the device.
-        """
+        """Everything that the observation decides before the loop starts."""
         graph = self._pieces.condition
         there = {key: value.to(self.device) for key, value in obs.items()}
         there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
@@ -199,7 +190,6 @@ class ReferenceModel:
         """The pruner: float32 ``[B, K, blocks, 4]``.
 
         Args:
-            contexts: of the observation.
             weights: tensors to use in place of the pruner's constants of the same names; gradients flow to them.
 
         Raises:
@@ -216,15 +206,7 @@ class ReferenceModel:
         return self._stem(self._bind(self._pieces.stem, sample.to(self.device), k, contexts))[0]
 
     def block(self, b: int, k: int, stream: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
-        """The residual of block b at step k: what is added to the stream, not the sum.
-
-        Args:
-            b: block.
-            k: step.
-            stream: residual stream of all B streams.
-            contexts: of the observation.
-            streams: which streams to evaluate; None for all. The result holds these only.
-        """
+        """The residual of block b at step k: what is added to the stream, not the sum."""
         blocks = self._blocks if k else self._first
         return blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
 
@@ -253,7 +235,6 @@ class ReferenceModel:
         """The denoising loop, whatever the blocks do: what is carried after each step.
 
         Args:
-            contexts: from ``prologue``.
             noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
             known: what a prefix makes known of the samples; None for nothing.
             since: a step to begin with, and what is carried to it; None for the whole loop.
@@ -286,6 +267,7 @@ class ReferenceModel:
         is evaluated without recording: its own gradient would be multiplied by 0. With gates that do not, blocks are
         evaluated for the streams that compute them, and nothing else.
 
+        Args:
             gates: one-hot ``[B, K, blocks, 4]``, float32; or a plan, int8 ``[K, blocks]`` or ``[B, K, blocks]``.
             cache: what the previous call of the episode left; None at its start.
             write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,

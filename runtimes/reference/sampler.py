@@ -87,13 +87,7 @@ def features(carried: Carried, prediction: Tensor) -> Tensor:
 
 
 def jump(layers: Sequence[Tensor], read: Tensor, history: Tensor) -> Tensor:
-    """What a jump adds to the sample, ``[D, B, T]``: see ``core.correction``.
-
-    Args:
-        layers: inner, middle and outer, each with the row that is added last.
-        read: of the condition, ``[B, F]``.
-        history: after the jump's anchor, ``[B, 4 T, D]``.
-    """
+    """What a jump adds to the sample, ``[D, B, T]``: see ``core.correction``."""
     streams, width, dimensions = history.shape
     added = through(layers, torch.cat([read, history.transpose(1, 2).reshape(streams, -1)], 1))
     return added.reshape(streams, dimensions, width // HISTORY).transpose(0, 1)
@@ -114,7 +108,6 @@ def correct(
     Args:
         weights: of the correction at step k, ``[G, 6 T, T]``.
         bias: of the correction at step k, ``[D, 1, T]``, or ``[D, B, T]`` with what it reads of the observation.
-        anchor: whether step k enters the history.
     """
     added = (features(carried, prediction) @ weights + bias).permute(1, 2, 0)
     history = carried.history

@@ -74,13 +74,7 @@ class Admission:
         return sum(each.client for each in self._connections.values())
 
     def comes(self, peer: tuple[Any, ...], own: Any = None) -> bool:
-        """Whether the handshake of a new connection may begin.
-
-        Args:
-            peer: as ``accept`` gives it.
-            own: address of the server that it came to, as ``getsockname`` gives it; with ``peer`` it names the
-                connection, here and in what follows.
-        """
+        """Whether the handshake of a new connection may begin."""
         network, now = network_of(peer[0]), self._clock()
         waiting = [each.network for each in self._connections.values() if not each.client]
         if self._refused_lately(network, now) >= self.limits.refusals_per_minute:
@@ -110,10 +104,8 @@ class Admission:
         """Note how a handshake was answered.
 
         Args:
-            peer: as above.
             status: of HTTP; 101 makes it a client, and 200 is the answer to somebody who watches.
             tls: version of TLS, None without.
-            own: as above.
         """
         connection = self._connections[peer, own]
         connection.answered, connection.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
@@ -191,14 +183,7 @@ class AdmittingSocket(socket.socket):
 
 
 class AdmittedSocket(socket.socket):
-    """The socket of a connection, which tells when it is closed.
-
-    Args:
-        admission: is told.
-        peer: address, as ``accept`` gives it.
-        own: address of the server that it came to.
-        accepted: whose descriptor this one takes over.
-    """
+    """The socket of a connection, which tells when it is closed."""
 
     def __init__(self, admission: Admission, peer: Any, own: Any, accepted: socket.socket) -> None:
         super().__init__(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())

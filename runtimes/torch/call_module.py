@@ -24,14 +24,7 @@ CPU = torch.device("cpu")
 
 
 class CallModule(nn.Module):
-    """A call of a policy. Every constant is a buffer; there are no parameters, and nothing is kept from call to call.
-
-    Args:
-        view: of an artifact, for the plan.
-        weights: constants that a call needs, by name.
-        advance: of the sampler, with the correction.
-        correction: of the sampler's steps, which belongs to the plan; None for none.
-    """
+    """A call of a policy. Every constant is a buffer; nothing is a parameter, or kept from call to call."""
 
     def __init__(
         self,

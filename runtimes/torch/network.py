@@ -48,8 +48,6 @@ class Parts:
     """What all numbers of streams share.
 
     Args:
-        view: of an artifact.
-        placed: its constants, where to compute.
         narrow: type of the products in residual blocks; None for float32.
     """
 

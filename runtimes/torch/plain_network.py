@@ -100,13 +100,7 @@ class PlainNetwork:
         return known if self._pieces.step is None else {**known, **self._step_values(known)}
 
     def run(self, name: str, value: Tensor, contexts: Tensors) -> Tensor:
-        """A piece of the loop on a sample or a stream.
-
-        Args:
-            name: of the piece.
-            value: what flows in.
-            contexts: from ``contexts``.
-        """
+        """A piece of the loop on a sample or a stream."""
         return self._run(name, {**contexts, self._streams_of[name]: value})[0]
 
     def _at(self, k: int, name: str, value: Tensor) -> Tensor:

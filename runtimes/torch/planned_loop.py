@@ -32,13 +32,7 @@ from .sampler import Advance, State, begin
 
 
 class SteppedAdvance(Advance):
-    """The same, also at a step that only the program knows.
-
-    Args:
-        spec: of the policy.
-        correction: of the sampler's steps; None for none.
-        device: where to compute.
-    """
+    """The same, also at a step that only the program knows."""
 
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
         super().__init__(spec, correction, device)

@@ -100,13 +100,7 @@ class Advance:
         return read, added.permute(1, 2, 0, 3)
 
     def jump(self, layers: Sequence[Tensor], read: Tensor | None, history: Tensor) -> Tensor:
-        """What a jump adds, ``[D, B, T]``.
-
-        Args:
-            layers: its own of ``layers``.
-            read: of the condition, ``[B, F]``; None if nothing is.
-            history: after its anchor, ``[D, B, 4 T]``.
-        """
+        """What a jump adds, ``[D, B, T]``."""
         dimensions, streams, _ = history.shape
         value = history.permute(1, 0, 2).reshape(streams, -1)
         value = value if read is None else torch.cat([read, value], 1)
@@ -117,14 +111,7 @@ class Advance:
         return added.reshape(streams, dimensions, self.horizon).permute(1, 0, 2)
 
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
-        """What is carried to step k + 1.
-
-        Args:
-            state: at step k.
-            prediction: the network's output, ``[D, B, T]``.
-            k: step.
-            offset: what the step adds beside, ``[D, B, (1 + S) T]``.
-        """
+        """What is carried to step k + 1."""
         clean = None
         if self._clip is not None:
             of_sample, of_prediction = self._to_clean[k]

@@ -45,8 +45,9 @@ class Inlet:
 class Workspace:
     """Tensors for B streams.
 
-    result: the denoised sample of the last call, ``[B, T, D]``.
-    rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
+    Attributes:
+        result: the denoised sample of the last call, ``[B, T, D]``.
+        rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
     """
 
     def __init__(self, parts: Parts, streams: int) -> None:

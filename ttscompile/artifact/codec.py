@@ -45,11 +45,7 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def decode(content: bytes, where: str = MANIFEST) -> Manifest:
-    """Read ``manifest.json``.
-
-    Raises:
-        ArtifactError: no manifest, another schema version, or one that was changed or damaged.
-    """
+    """Read ``manifest.json``."""
     document = {key: member.data for key, member in parse(content, where, MAX_MANIFEST_BYTES).members().items()}
     if document.get("format") != FORMAT:
         raise ArtifactError(
@@ -94,11 +90,7 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
 
 
 def from_json(root: Value) -> Manifest:
-    """Inverse of ``to_json``; checks that the parts fit each other.
-
-    Raises:
-        ArtifactError: names the path in the document, expected and found.
-    """
+    """Inverse of ``to_json``; checks that the parts fit each other."""
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))

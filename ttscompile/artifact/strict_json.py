@@ -27,11 +27,7 @@ class Value:
     path: str
 
     def fail(self, expected: str) -> NoReturn:
-        """Raise for this value.
-
-        Raises:
-            ArtifactError: always.
-        """
+        """Raise for this value. Raises ArtifactError: always."""
         raise ArtifactError(f"{self.path}: expected {expected}; found {_shorten(self.data)}. {REMEDY}")
 
     def keys(self, *names: str) -> dict[str, Value]:
@@ -89,11 +85,7 @@ class Value:
 
 
 def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
-    """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
-
-    Raises:
-        ArtifactError: not such a document.
-    """
+    """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused."""
     try:
         return Value(parse_json(content, limit), where)
     except ValueError as error:

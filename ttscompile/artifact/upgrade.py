@@ -22,9 +22,6 @@ def upgraded(document: Mapping[str, Any], where: str) -> dict[str, Any]:
 
     Returns:
         A manifest of schema 11, whose identities are those of before, and not those of what it describes.
-
-    Raises:
-        ArtifactError: it is no manifest of schema 10.
     """
     try:
         return _upgraded(document)

@@ -187,11 +187,7 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
 
 
 def _require(manifest: Manifest, variant: Variant) -> None:
-    """Raise unless the artifact has what a plan names; what a runtime can do is another question.
-
-    Raises:
-        IllegalPlanError: says what is missing.
-    """
+    """Raise IllegalPlanError unless the artifact has what a plan names; what a runtime can do is another question."""
     if variant.loop not in manifest.loops:
         raise IllegalPlanError(f"the artifact has no loop {variant.loop!r}; it has {list(manifest.loops)}.")
     if variant.weights not in (known := [ORIGINAL, *manifest.weights]):
@@ -202,11 +198,7 @@ def _require(manifest: Manifest, variant: Variant) -> None:
 
 
 def require_held(artifact: Artifact, plan: Plan) -> None:
-    """Raise unless the artifact holds models for every precision of a plan.
-
-    Raises:
-        ArtifactError: it does not; says what it has.
-    """
+    """Raise ArtifactError unless the artifact holds models for every precision of a plan."""
     record = artifact.manifest.precision
     held = {} if record is None else dict.fromkeys(record.kept, record.name)
     for part, precision in plan.precision.items():

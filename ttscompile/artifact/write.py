@@ -293,11 +293,7 @@ def _fill(
 
 
 def require_unzipped(path: str | os.PathLike[str]) -> Path:
-    """The directory of an artifact that is about to be changed.
-
-    Raises:
-        ArtifactError: no artifact, or a zipped one.
-    """
+    """The directory of an artifact that is about to be changed. Raises ArtifactError: no artifact, or a zipped one."""
     directory = Path(path)
     require_artifact_path(directory)
     if not directory.is_dir():
@@ -312,11 +308,7 @@ def identified(manifest: Manifest) -> Manifest:
 
 
 def require_replaceable(directory: str | os.PathLike[str]) -> None:
-    """Raise unless a directory is free, empty, or an artifact and nothing else: users' files are never removed.
-
-    Raises:
-        ArtifactError: it is something else.
-    """
+    """Raise unless a directory is free, empty, or an artifact and nothing else: users' files are never removed."""
     require_free_or_path(directory, ArtifactError, "Give another output directory.")
     target = Path(os.path.realpath(directory))
     if not target.exists():
@@ -338,11 +330,7 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
-
-    Raises:
-        ArtifactError: somebody else is at it; or it cannot be locked.
-    """
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too."""
     with ExitStack() as held:
         try:
             held.enter_context(lock_folder(directory))

@@ -43,14 +43,7 @@ LEARNED = 256
 
 @dataclass(frozen=True, eq=False)
 class Entrant:
-    """A plan that takes part.
-
-    Attributes:
-        series: see ``MeasuredPoint``.
-        name: see ``MeasuredPoint``.
-        trials: of its artifact.
-        plan: what is judged.
-    """
+    """A plan that takes part."""
 
     series: str
     name: str

@@ -19,10 +19,6 @@ _FIELDS = tuple(field.name for field in fields(Correction))
 class Searches:
     """What is known before a search begins, and what it finds.
 
-    Args:
-        state: of the comparison.
-        shape: K and number of blocks.
-
     Raises:
         CalibrationError: what is there is damaged.
     """

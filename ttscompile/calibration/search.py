@@ -16,11 +16,7 @@ of search lowers the error by 3 to 30 %, the switches by a few."""
 
 
 def open_search(name: str, task: Task) -> Search:
-    """The search of the strategy of this name, ready to begin.
-
-    Raises:
-        CalibrationError: there is no such strategy, or it cannot keep the budget.
-    """
+    """The search of the strategy of this name, ready to begin."""
     strategy, model = strategy_of(name), task.executor.model
     strategy.require_reach(model.steps, model.blocks, task.budget)
     return strategy.make()(task)

@@ -118,13 +118,7 @@ class SparseLoop:
         self.begin = Place(0, batches(fitted), batches(judged))
 
     def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
-        """The place after one step more.
-
-        Args:
-            place: before it.
-            rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
-            pool: see ``pool.workers``; the batches go through the network beside each other.
-        """
+        """The place after one step more."""
         batches, anchor = [batch.fork() for batch in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
         ends = np.cumsum([len(batch.sample) for batch in batches])[:-1]
         own = [rows] * len(batches) if len(rows) == 1 else np.split(rows, ends)
@@ -205,8 +199,6 @@ class _Batch:
     """Some of the calls at a place.
 
     Args:
-        executor: runs the policy.
-        calls: the calls.
         sums: keep of residuals what all blocks added together, which is enough for whole steps.
     """
 

@@ -57,9 +57,6 @@ class StateFile:
 
         Returns:
             Whether there was anything.
-
-        Raises:
-            CalibrationError: it is damaged, or belongs to a run with other settings.
         """
         if self.warning or not self._path.exists():
             return False
@@ -87,11 +84,7 @@ class StateFile:
         return True
 
     def save(self) -> None:
-        """Write everything, at once or not at all.
-
-        Raises:
-            CalibrationError: the directory cannot be written.
-        """
+        """Write everything, at once or not at all. Raises CalibrationError: the directory cannot be written."""
         if self.warning:
             return
         texts = {_SETTINGS: self._settings, _PROGRESS: json.dumps(self.progress, sort_keys=True)}
@@ -107,11 +100,7 @@ class StateFile:
             self.warning = told
 
     def remove(self) -> None:
-        """Forget everything.
-
-        Raises:
-            CalibrationError: the directory cannot be written.
-        """
+        """Forget everything. Raises CalibrationError: the directory cannot be written."""
         if self.warning:
             return
         try:
@@ -124,11 +113,7 @@ class StateFile:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Within the block an error is one of the state: it has everything that was written, and yet does not fit.
-
-        Raises:
-            CalibrationError: it does not.
-        """
+        """Within the block an error is one of the state: it has everything that was written, and yet does not fit."""
         try:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:

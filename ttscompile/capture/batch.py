@@ -17,10 +17,6 @@ BATCHES = (5, 7)
 def unify_batch(left: Graph, right: Graph) -> Graph:
     """One graph for every batch size.
 
-    Args:
-        left: captured with a batch of ``BATCHES[0]``.
-        right: the same module captured with a batch of ``BATCHES[1]``.
-
     Raises:
         CaptureError: they differ in more than the batch size; names the first node that does.
     """

@@ -30,13 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Way:
-    """How a compiled policy runs.
-
-    Attributes:
-        runtime: ``onnxruntime`` or ``torch``.
-        device: that torch computes on; None for the CPU.
-        threads: that it computes with.
-    """
+    """How a compiled policy runs."""
 
     runtime: str = "onnxruntime"
     device: str | None = None

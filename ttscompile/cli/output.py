@@ -120,11 +120,7 @@ def manifest_of(path: Path) -> Manifest:
 
 
 def identity_of(path: Path) -> str:
-    """Identity of an artifact, 64 digits.
-
-    Raises:
-        ArtifactError: there is no artifact.
-    """
+    """Identity of an artifact, 64 digits. Raises ArtifactError: there is no artifact."""
     return manifest_of(path).identity
 
 

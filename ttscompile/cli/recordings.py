@@ -49,11 +49,7 @@ def _sources(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> 
 
 
 def require_recordings(paths: Iterable[Path]) -> None:
-    """Raise unless all of these exist: to be told before torch is imported, which takes seconds.
-
-    Raises:
-        TrajectoryError: names the first that does not.
-    """
+    """Raise TrajectoryError unless all of these exist: to be told before torch is imported, which takes seconds."""
     for path in paths:
         require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
 

@@ -144,13 +144,7 @@ class ServerOptions:
             AUDIT.propagate = before[1]
 
     async def serve(self, server: Listener, identity: str, output: TextIO | None = None) -> None:
-        """Let a server listen until the process is told to end, and write its address, one line of JSON.
-
-        Args:
-            server: made with this lock and these limits.
-            identity: of the artifact.
-            output: that the line goes to; None for standard output.
-        """
+        """Let a server listen until the process is told to end, and write its address, one line of JSON."""
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
         for each in (signal.SIGINT, signal.SIGTERM):
@@ -165,11 +159,7 @@ class ServerOptions:
 
 
 def _token_hash(file: Path | None) -> bytes | None:
-    """Of the token in the file or in the environment.
-
-    Raises:
-        ExecutorError: both have one, or what is there is none.
-    """
+    """Of the token in the file or in the environment. Raises ExecutorError: both have one, or what is there is none."""
     given = os.environ.get(TOKEN_VARIABLE)
     if file is None:
         return None if given is None else hashed(given, f"the environment's {TOKEN_VARIABLE}")

@@ -199,13 +199,7 @@ class Correction:
         return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
 
     def jump(self, j: int, read: FloatArray, history: FloatArray) -> FloatArray:
-        """What jump number j adds to the sample, float32 ``[D, B, T]``.
-
-        Args:
-            j: of the jumps.
-            read: of the condition, float32 ``[B, F]``.
-            history: after the jump's anchor, ``[D, B, 4 T]``.
-        """
+        """What jump number j adds to the sample, float32 ``[D, B, T]``."""
         dimensions, streams, width = history.shape
         value = np.concatenate([read, history.transpose(1, 0, 2).reshape(streams, -1)], 1)
         for layer in (self.inner[j], self.middle[j]):
@@ -272,13 +266,7 @@ def groups_of(steps: int, sample: tuple[int, int]) -> int:
 
 
 def no_correction(steps: int, sample: tuple[int, int], groups: int | None = None) -> Correction:
-    """The correction of K steps and samples ``(T, D)`` that changes nothing.
-
-    Args:
-        steps: K.
-        sample: ``(T, D)``.
-        groups: of action dimensions; None for as many as ``groups_of`` has.
-    """
+    """The correction of K steps and samples ``(T, D)`` that changes nothing."""
     groups, (horizon, dimensions) = groups_of(steps, sample) if groups is None else groups, sample
     return Correction(
         anchors=np.zeros(steps, np.bool_),

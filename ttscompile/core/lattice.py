@@ -122,11 +122,7 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
-    """Raise if any stream's plan is illegal.
-
-    Raises:
-        IllegalPlanError: names the first cell, and how many there are.
-    """
+    """Raise IllegalPlanError if any stream's plan is illegal."""
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
         if len(bad):

@@ -38,11 +38,7 @@ def require_path(path: str | os.PathLike[str], error: type[TtscompileError], giv
 
 
 def require_free_or_path(path: str | os.PathLike[str], error: type[TtscompileError], give: str) -> None:
-    """The same for a path that is written: there may be nothing.
-
-    Raises:
-        TtscompileError: see ``require_path``.
-    """
+    """The same for a path that is written: there may be nothing. Raises TtscompileError: see ``require_path``."""
     name = os.fspath(path)
     try:
         mode = Path(path).stat().st_mode

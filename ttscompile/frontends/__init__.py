@@ -1,4 +1,7 @@
-"""Readers of the checkpoints that users have: each gives a module and a ``PolicySpec``; nothing after it differs."""
+"""Readers of the checkpoints that users have: each gives a module and a ``PolicySpec``; nothing after it differs.
+
+Whatever a checkpoint lacks, or has that is not rebuilt here, is a ``CheckpointError`` of any function of this room.
+"""
 
 from __future__ import annotations
 

@@ -50,11 +50,7 @@ _BUILTIN_TYPES: Mapping[str, type] = {
 
 
 def _load_type(name: str) -> type:
-    """Stand-in for ``dill._dill._load_type``: the plain built-in types that a configuration can hold.
-
-    Raises:
-        CheckpointError: any other name; dill itself would look it up among all it knows, callables included.
-    """
+    """Stand-in for ``dill._dill._load_type``: the plain built-in types that a configuration can hold."""
     if not isinstance(name, str) or name not in _BUILTIN_TYPES:
         raise CheckpointError(
             f"the checkpoint asks dill for the type {name!r}; expected one of {sorted(_BUILTIN_TYPES)}. Nothing of the"

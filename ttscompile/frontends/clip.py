@@ -154,11 +154,7 @@ def find_encoder(name: str, folders: Sequence[Path], kind: str = "clip") -> Path
 
 
 def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Path]) -> Tower:
-    """The configuration of one encoder: its ``part``, ``vision_config`` or ``text_config``, as a ``cls``.
-
-    Raises:
-        CheckpointError: there is none on this machine, or it is not CLIP's.
-    """
+    """The configuration of one encoder: its ``part``, ``vision_config`` or ``text_config``, as a ``cls``."""
     found = find_encoder(name, folders)
     if found is not None:
         where, settings = str(found / "config.json"), read_json(found / "config.json")

@@ -118,8 +118,6 @@ def behind_encoder(
 
     Args:
         encoder: observations by key to ``[B, To, width]``.
-        width: of a step's features.
-        network: settings of the U-Net, but for its channels.
         known: settings of ``cfg.policy`` that were read for encoder and network.
     """
     as_global = saved.settings.flag("obs_as_global_cond", True)

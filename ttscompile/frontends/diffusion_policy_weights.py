@@ -54,9 +54,6 @@ def require_room(needed: Mapping[str, int], weights: Weights, where: str = "cfg.
 
     Args:
         needed: weights that the network has at least, by the setting that asks for them.
-
-    Raises:
-        CheckpointError: it has not: whatever the configuration says, no more memory is taken than the file has.
     """
     total = sum(value.numel() for value in weights.values())
     for name, count in needed.items():

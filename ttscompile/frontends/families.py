@@ -143,10 +143,6 @@ FORMATS = ("auto", *(each.name for each in FAMILIES))
 def find_family(path: Path, format: str) -> Family:
     """The family that reads a checkpoint.
 
-    Args:
-        path: of the checkpoint.
-        format: name of the family; ``auto`` asks every row of ``FAMILIES`` in turn.
-
     Raises:
         CheckpointError: the format is not known, or no family reads what is there; says what it is, if that is known.
     """

@@ -29,9 +29,6 @@ def task_tokens(text: str, name: str, folder: Path | None, most: int, vocabulary
         folder: that has its ``tokenizer.json``; None if there is none.
         most: tokens that the policy reads; what is longer is cut, as lerobot does.
         vocabulary: tokens that the language model knows.
-
-    Raises:
-        CheckpointError: there is no tokenizer, it cannot be read, or it is of another language model.
     """
     path = None if folder is None else find_tokenizer(folder)
     if path is None:

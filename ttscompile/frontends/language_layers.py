@@ -131,9 +131,7 @@ def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: T
     """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is not part of a graph.
 
     Args:
-        layers: of the language model.
         x: the tokens, embedded, ``[B, T, width]``.
-        turns: of their positions.
         mask: added to the scores, ``[B, 1, T, T]``.
     """
     found = []

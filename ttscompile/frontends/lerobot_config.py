@@ -72,9 +72,6 @@ def read_lerobot_config(
         environment: whether this type reads the state of the environment; if not, it is no observation.
         chunked: whether the horizon is called ``chunk_size``, one frame is observed, and every camera has a shape of
             its own: vision-language-action models, which resize images themselves.
-
-    Raises:
-        CheckpointError: it contradicts itself.
     """
     settings = Settings(
         entries, f"{directory / CONFIG}: ", "The file was changed, or is of another version of lerobot."

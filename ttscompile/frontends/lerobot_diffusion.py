@@ -68,11 +68,7 @@ class DiffusionConfig(LeRobotConfig):
 
 
 def read_config(directory: Path, entries: Mapping[str, Any]) -> DiffusionConfig:
-    """Check ``config.json``, of which these are the entries; defaults are lerobot's.
-
-    Raises:
-        CheckpointError: it contradicts itself, or the encoder is not one that is rebuilt here.
-    """
+    """Check ``config.json``, of which these are the entries; defaults are lerobot's."""
     shared = read_lerobot_config(directory, entries, horizon=64, n_action_steps=32, environment=True)
     settings = shared.settings
     backbone = str(settings.values.get("vision_backbone", "resnet18"))

@@ -70,11 +70,7 @@ class MultiTaskDiTConfig(LeRobotConfig):
 
 
 def read_config(directory: Path, entries: Mapping[str, Any]) -> MultiTaskDiTConfig:
-    """Check ``config.json``, of which these are the entries; defaults are lerobot's.
-
-    Raises:
-        CheckpointError: it contradicts itself.
-    """
+    """Check ``config.json``, of which these are the entries; defaults are lerobot's."""
     shared = read_lerobot_config(directory, entries, horizon=32, n_action_steps=24, environment=False)
     settings = shared.settings
     old = settings.flag("use_separate_encoder_per_camera", False)  # the name of lerobot 0.5

@@ -143,11 +143,7 @@ class Processors:
 
 
 def read_processors(directory: Path, features: Features) -> Processors:
-    """The pipelines of a policy that LeRobot saved, with these features.
-
-    Raises:
-        CheckpointError: a file is missing or damaged; a step is not known, there twice, or out of order.
-    """
+    """The pipelines of a policy that LeRobot saved, with these features."""
     before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
     return Processors(
         renamed=_renamed(directory, before, features),

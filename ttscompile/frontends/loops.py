@@ -16,13 +16,7 @@ Make = Callable[[LoadOptions], SamplerTable]
 
 @dataclass(frozen=True)
 class Loops:
-    """What a ``PolicySpec`` has of its loops.
-
-    Attributes:
-        original: for ``PolicySpec.sampler``.
-        others: for ``PolicySpec.loops``.
-        source: what ``PolicySpec.source`` says of them.
-    """
+    """What a ``PolicySpec`` has of its loops."""
 
     original: SamplerTable
     others: Mapping[str, SamplerTable] = field(default_factory=dict)

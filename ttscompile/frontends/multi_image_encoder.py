@@ -61,9 +61,6 @@ class MultiImageEncoder(nn.Module):
     Args:
         views: by key of an image, in the order of their features.
         low_dim: length by key of what is no image, in their order.
-        network: ResNet, a key of ``resnet.DEPTHS``.
-        norm: of the ResNets.
-        shared: whether one ResNet looks at all images.
     """
 
     def __init__(

@@ -57,9 +57,7 @@ class PointCloudEncoder(nn.Module):
     """Points and the robot's state to one vector for each observed step.
 
     Args:
-        extractor: of the points.
         channels: of a point that it takes, the first of those that are there.
-        state: length of the robot's state.
     """
 
     def __init__(self, extractor: PointNet, channels: int, state: int) -> None:

@@ -31,9 +31,6 @@ _ENUM_TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format, "layo
 def resolve_op(node: Node) -> Callable[..., Any]:
     """The function of a node: a functional ATen overload, or ``operator.getitem``.
 
-    Args:
-        node: its ``op`` is looked up below ``torch.ops.aten`` and nowhere else.
-
     Raises:
         CaptureError: no such operation; one that changes its arguments, draws random numbers or reads files; or one
             that has no row in the table of operations.

@@ -65,9 +65,6 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
         memories ``memory`` ``[D, B, S T]``, the tail's contexts as ``tail.NAME`` (of this step) and the stem's as
         ``stem.NAME`` (of the next); outputs ``sample_next``, ``stream_next``, ``prediction`` and with memories
         ``memory_next``. Samples and prediction are ``[D, B, T]``.
-
-    Raises:
-        LoweringError: a constant of the program has the name of one of these inputs.
     """
     inputs = {STREAM: tail.type, **_update_types(spec)}
     for name, piece in ((TAIL, tail), (STEM, stem)):

@@ -20,9 +20,6 @@ class GraphWriter:
     """Nodes and constants of one graph; ``inner`` opens a graph for the body of an If or a Loop.
 
     Names are unique over all graphs of a model, since a body sees the values of the graphs around it.
-
-    Args:
-        names: numbers that no other graph of the model uses.
     """
 
     def __init__(self, names: Iterator[int] | None = None) -> None:

@@ -69,8 +69,6 @@ def attention_of(
     """What a node attends to, if integers can do that, and are faster.
 
     Args:
-        node: of the model.
-        attributes: of the node.
         shapes: of values, zero for a size that is not known.
         any_queries: the shapes are of one case of many: a run has one row, and any number of queries.
     """

@@ -62,10 +62,6 @@ def lower_plan(w: GraphWriter, plan: str, groups: Sequence[int], steps: int, tog
     """Write the nodes that lower a plan.
 
     Args:
-        w: of the graph that the loop is in.
-        plan: int8 [K, N], legal.
-        groups: FORWARD group of each block.
-        steps: K.
         together: how many neighbouring blocks make a group of ``any_of_group``.
     """
     count = len(groups)

@@ -83,10 +83,6 @@ def require_picture_name(path: Path) -> None:
 def write_picture(figure: Figure, path: str | Path) -> None:
     """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them.
 
-    Args:
-        figure: drawn.
-        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
-
     Raises:
         OutputError: it cannot be written; a file that was there is as it was.
     """

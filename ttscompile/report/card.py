@@ -36,9 +36,7 @@ class Success:
     """How one plan of the artifact did on a task.
 
     Attributes:
-        environment: the task.
         variant: artifact and plan, as the evaluation calls them.
-        episodes: their number.
         figures: mean and 95 % interval by name: ``success`` and ``score``.
         machine: that ran the episodes.
     """
@@ -52,10 +50,6 @@ class Success:
 
 def read_success(path: Path, identity: str) -> list[Success]:
     """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact.
-
-    Args:
-        path: of the document.
-        identity: of the artifact.
 
     Raises:
         ReportError: it is no such document, or not of this artifact.
@@ -105,15 +99,7 @@ def card(
     success: Sequence[Success],
     licence: str | None,
 ) -> str:
-    """The text of ``README.md``.
-
-    Args:
-        artifact: loaded.
-        repository: ``org/name``.
-        measured: calls with its default plan and with the dense one, measured now.
-        success: what was evaluated; may be empty.
-        licence: from ``licence_of``.
-    """
+    """The text of ``README.md``."""
     manifest = artifact.manifest
     base = _base(manifest)
     head = {

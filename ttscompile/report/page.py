@@ -30,7 +30,6 @@ class Picture:
     """A PNG.
 
     Attributes:
-        png: the file.
         caption: under it.
         alt: what it shows, for who cannot see it; empty where the caption says it.
     """
@@ -66,11 +65,7 @@ class Page:
     """A report.
 
     Attributes:
-        title: heading of the page.
-        lead: under the title.
         figures: label and value of what matters most.
-        sections: what the page has below the figures, in order.
-        foot: at its end.
     """
 
     title: str

@@ -105,10 +105,6 @@ def bubbling(change: Scores, kinds: Sequence[str]) -> dict[int, list[int]]:
     """The blocks that change most -> the feed-forward blocks at or after each, whose updates it takes over.
 
     In a policy of unknown structure no block is called feed-forward; then any block counts as one.
-
-    Args:
-        change: ``[blocks]``, mean absolute difference of a block's residual between two steps.
-        kinds: the kind of each block.
     """
     followed = [b for b, kind in enumerate(kinds) if kind == FEED_FORWARD] or list(range(len(kinds)))
     sources = np.argsort(-change, kind="stable")[:BUBBLING]
@@ -125,13 +121,7 @@ def union(computed: Sequence[BoolArray], followed: Mapping[int, Sequence[int]]) 
 
 
 def spend(schedules: Sequence[Sequence[Schedule]], followed: Mapping[int, Sequence[int]], budget: int) -> list[int]:
-    """Number of computations of each block before the union, such that there are at most ``budget`` after it.
-
-    Args:
-        schedules: of each block, with 1, 2, ... computations.
-        followed: what ``bubbling`` returns.
-        budget: cells; at least one for each block.
-    """
+    """Number of computations of each block before the union, such that there are at most ``budget`` after it."""
 
     def fits(counts: Sequence[int]) -> bool:
         cells = union([one[n - 1].computed for one, n in zip(schedules, counts, strict=True)], followed)

@@ -108,10 +108,6 @@ class Decisions:
     def decide(self, k: int, feature: FloatArray) -> PlanArray:
         """The row of the plan at step k; to be asked for every step, in order.
 
-        Args:
-            k: the number of the step.
-            feature: ``[B, ...]``, see ``Criterion.always``.
-
         Returns:
             int8 ``[B, blocks]`` of COMPUTE and TIMESTEP; the first ``always`` blocks are COMPUTE.
         """
@@ -224,10 +220,6 @@ def fit_threshold(
 
 def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
     """Fit every criterion that is proposed, take the best, and fit it again on more calls.
-
-    Args:
-        task: see ``Task``.
-        proposed: criteria, each with a threshold to begin with.
 
     Raises:
         CalibrationFailedError: the time was up before one kept the budget.

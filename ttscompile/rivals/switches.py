@@ -53,7 +53,6 @@ class Switch:
         out: ``(k, b)`` of a computed cell of the schedule.
         into: ``(k, b)`` of a reused one.
         weight: ``[F]``.
-        bias: the bias of the same function.
     """
 
     out: tuple[int, int]

@@ -126,14 +126,7 @@ def _rk4(times: npt.NDArray[np.float64], scale: float) -> SamplerTable:
 def deterministic_table(
     name: str, timesteps: npt.NDArray[np.float64], clip: float | None, **columns: npt.NDArray[np.float64]
 ) -> SamplerTable:
-    """A table in float32, with zeros ``[K]`` for columns that are not given: no noise, for one.
-
-    Args:
-        name: of the method.
-        timesteps: ``[K]``, as the network is given them.
-        clip: bound on the predicted sample; None for none.
-        columns: of ``SamplerTable``, and its memories.
-    """
+    """A table in float32, with zeros ``[K]`` for columns that are not given: no noise, for one."""
     zeros = {column: np.zeros(len(timesteps)) for column in SamplerTable.COLUMNS}
     narrow = {column: np.asarray(values, np.float32) for column, values in (zeros | columns).items()}
     return SamplerTable(name=name, timesteps=np.asarray(timesteps, np.float32), clip=clip, **narrow)

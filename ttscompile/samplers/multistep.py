@@ -91,9 +91,6 @@ def set_timesteps(scheduler: Any, steps: int) -> None:
 def multistep_table(scheduler: Any, steps: int, name: str, step_arguments: Mapping[str, Any]) -> SamplerTable:
     """Measure the denoising loop of a multistep scheduler.
 
-    Args:
-        scheduler: a configured ``DPMSolverMultistepScheduler`` after ``set_timesteps``, which is called again.
-
     Raises:
         SpecError: noise levels that repeat, or a step that has not the form of ``SamplerTable``.
     """

@@ -65,15 +65,13 @@ def observation_frames(
 ) -> dict[str, Array]:
     """The frames of each key of the observation.
 
+    Args:
         sources: by key, the arrays that it is made of where they are called otherwise: flattened frame by frame and
             joined; ``NAME:N`` are the first N numbers of one.
 
     Returns:
         By key ``[F, *frame]``. Images ``[F, H, W, C]`` become ``[F, C, H, W]``, divided by 255, where the policy takes
         them so: what the original data sets do.
-
-    Raises:
-        TrajectoryError: an array is missing; names those that there are.
     """
     found = {}
     for key, spec in observations.items():
@@ -138,11 +136,7 @@ def _as_image(array: Array, spec: ObservationSpec) -> Array:
 
 
 def require_proportion(path: Path, total: int, size: int) -> None:
-    """Raise if so many bytes of arrays are out of proportion to the bytes of their file.
-
-    Raises:
-        TrajectoryError: they are.
-    """
+    """Raise TrajectoryError if so many bytes of arrays are out of proportion to the bytes of their file."""
     if total > max(FREE_BYTES, MAX_RATIO * size):
         raise TrajectoryError(
             f"{path}: expected arrays in proportion to a file of {size} bytes, at most {MAX_RATIO} times as much; it"
@@ -173,9 +167,6 @@ def require_files(path: Path) -> None:
     """Raise unless a file, or all in a directory, are files of bytes: reading a pipe or ``/dev/zero`` does not end.
 
     Links to files are followed, which is how caches of downloads keep them; links to directories are not.
-
-    Raises:
-        TrajectoryError: names the first that is none.
     """
     for folder, names, files in os.walk(path) if path.is_dir() else [("", [], [os.fspath(path)])]:
         wrong = [name for name in names if Path(folder, name).is_symlink()]
