@@ -97,7 +97,7 @@ def interface(model: ModelProto) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def store_pieces(
     folder: Path, lowered: LoweredPieces, pieces: Mapping[str, PieceRecord], places: Mapping[str, Place]
 ) -> PrecisionRecord:
-    """Write pieces beside those in fp32, which the reference runtime computes with, into the folder of a new artifact."""
+    """Write pieces beside those in fp32, with which the reference computes, into the folder of a new artifact."""
     where = f"precision {lowered.name!r}"
     if taken := sorted(set(lowered.weights) & set(places)):
         raise ArtifactError(f"{where}: expected constants of new names; found {taken[0]!r}. {REPORT}")

@@ -54,7 +54,7 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """The content of a file of at most so many bytes; of a larger one no more is read, and the last byte is too many."""
+    """The content of a file of at most so many bytes; of a larger one these, and one that is too many."""
     with opened(path) as file:
         return file.read(limit + 1)
 
