@@ -26,11 +26,14 @@ from tests.calibration import policies, tasks
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.once import Once
 from tests.passes.modules import MODULES, spec
-from ttscompile.calibration import proposer, strategies
+from ttscompile.calibration import proposer, sparse_loop, strategies
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.cli import main
-from ttscompile.frontends import families
+from ttscompile.frontends import families, lerobot_vla
+from ttscompile.frontends.settings import Settings
 from ttscompile.runtimes import open as open_module
+from ttscompile.runtimes.reference.sampler import through
+from ttscompile.samplers import flow
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -358,6 +361,47 @@ def test_the_proposer_of_the_contributing_guide(once: Once, tmp_path: Path, monk
     assert result.default_plan == "fewer"
     assert result.plans["fewer"].sparsity == pytest.approx(result.plans["schedule"].sparsity + 0.1)
     assert result.told["fewer"].endswith("is left out")
+
+
+def test_the_loop_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module, its row and its test as they stand in the guide; and what ``--sampler`` makes of it."""
+    written, row, its_test = guide("loop")
+    module = contributed(written, "ttscompile.samplers.midpoint", tmp_path, monkeypatch)
+    for name, method in eval(row, vars(flow) | vars(module)).items():
+        monkeypatch.setitem(flow.METHODS, name, method)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    test.test_a_step_evaluates_the_network_twice()
+    test.test_it_is_of_second_order()
+    test.test_it_bounds_nothing()
+    asked = lerobot_vla._sampler(Settings({}, "config.json: "), families.LoadOptions("midpoint", 5))
+    assert (asked.name, asked.steps) == ("midpoint", 10)
+
+
+def test_the_term_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module, its row and its test as they stand in the guide; a fitted correction has the term."""
+    written, row, its_test = guide("term")
+    module = contributed(written, "ttscompile.calibration.linear_term", tmp_path, monkeypatch)
+    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
+    test.test_what_is_linear_is_found_in_the_form_of_a_jump()
+    test.test_what_is_not_there_on_other_episodes_is_no_term()
+    rows = eval(row, vars(sparse_loop) | vars(module))
+    assert rows == (*sparse_loop.TERMS, module.fit_linear)
+
+    def held(fit: Any, known: Any, missing: Any, episodes: Any) -> Any:
+        layers = fit(known, missing)
+        return layers, through(layers, known)
+
+    monkeypatch.setattr(module, "on_other_episodes", held)  # this policy leaves nothing over that is linear
+    monkeypatch.setattr(sparse_loop, "TERMS", rows[-1:])
+    task = tasks.make_task(policies.compiled(once), policies.record(tmp_path / "calls.npz"), calls=60)
+    some, others = (task.executor.select(task.calls, part) for part in (range(40), range(40, 60)))
+    loop = sparse_loop.SparseLoop(task.executor, some, others, reads=True, whole=True)
+    place = loop.ends(task.whole.plan([0, 6]))[1]
+    correction = loop.correction(place)
+    assert correction is not None and list(correction.landings) == [5]
+    assert np.count_nonzero(correction.inner[0].any(0)) == 2 * 16  # of the numbers of a chunk, either sign
+    ran = task.executor.corrected(correction).run(task.whole.plan([0, 6]), others)
+    np.testing.assert_allclose(place.samples, ran, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -27,6 +27,9 @@ from .regression import Components, Solved, solve
 STREAMS = 64
 """Calls that go through the loop at once."""
 
+TERMS = (fit_jump,)
+"""Ways to fit what is added where a jump ends; of those that hold, the one that leaves least over is taken."""
+
 ANCHOR_SHARE = 0.5
 """Of the blocks that a step computes, from which on it is an anchor."""
 
@@ -160,10 +163,11 @@ class SparseLoop:
         known = torch.cat([self._known, torch.cat([batch.history for batch in batches])], 1)
         missing = torch.cat([batch.left for batch in fitted])
         landing = place.step - 1
-        found = fit_jump(known[: len(missing)], missing, self._episodes, landing)
-        if found is None:
+        fitted_terms = (fit(known[: len(missing)], missing, self._episodes, landing) for fit in TERMS)
+        held = [one for one in fitted_terms if one is not None]
+        if not held:
             return None
-        layers, added = found
+        layers, added = min(held, key=lambda one: float((missing - one[1]).square().mean()))
         added = torch.cat([added, through(layers, known[len(missing) :])])
         ends = np.cumsum([len(batch.sample) for batch in batches])[:-1].tolist()
         for batch, part in zip(batches, added.tensor_split(ends), strict=True):

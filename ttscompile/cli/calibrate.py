@@ -34,7 +34,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
     "--learn",
     LEARNED,
     default="schedule",
-    help=f"Learn these, with commas between, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
+    help=f"Learn these, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
 )
 @number_option(
     "--target-sparsity",

@@ -197,7 +197,7 @@ def _flow(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
     settings = config.settings
     if options.spacing is not None:
         raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
-    method: Any = options.sampler or settings.choice("integration_method", *METHODS)
+    method = options.sampler or settings.choice("integration_method", *METHODS)
     count = options.steps if options.steps is not None else settings.values.get("num_integration_steps", 100)
     if type(count) is not int or not 1 <= count <= MOST_STEPS:
         given = f"{config.directory / CONFIG}: {count!r:.80} integration steps"

@@ -116,7 +116,7 @@ def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
         raise SpecError(
             f"{settings.where}{count!r:.80} steps ({name}, or steps= and --steps); expected 1 to {MOST_STEPS}."
         )
-    method: Any = options.sampler or "euler"
+    method = options.sampler or "euler"
     return flow_matching_table(count, method, start=1.0, end=0.0)
 
 

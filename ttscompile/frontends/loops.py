@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from ..core.spec import SamplerTable
 from ..errors import CheckpointError, SpecError
-from ..samplers.flow import EVALUATIONS
+from ..samplers.flow import METHODS
 from .families import AS_SAVED, LoadOptions
 
 Make = Callable[[LoadOptions], SamplerTable]
@@ -52,5 +52,6 @@ def loop_name(table: SamplerTable, spacing: str | None = None) -> str:
 
     The number is that of steps, as people count them: one of ``rk4`` has four rows of the table.
     """
-    steps = table.steps // EVALUATIONS.get(table.name, 1)
+    method = METHODS.get(table.name)
+    steps = table.steps // (1 if method is None else method.evaluations)
     return "-".join([table.name, str(steps), *([] if spacing is None else [spacing])])
