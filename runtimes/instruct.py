@@ -19,10 +19,6 @@ TASK = "task"
 class Instruct:
     """Puts the tokens of a task into an observation.
 
-    Args:
-        spec: of the policy.
-        path: of ``tokenizer.json``, or of the folder that has it.
-
     Raises:
         ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
     """

@@ -44,12 +44,7 @@ def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
 
 
 class LoweringCache(Generic[Lowered]):
-    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change.
-
-    Args:
-        lower: what a backend makes of a plan ``[K, blocks]``.
-        capacity: plans to keep.
-    """
+    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change."""
 
     def __init__(self, lower: Callable[[PlanArray], Lowered], capacity: int = 64) -> None:
         self._lower, self._capacity = lower, capacity

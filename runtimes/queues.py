@@ -20,11 +20,7 @@ Frames = dict[str, deque[Array]]
 
 
 class Queues:
-    """Frames and actions of one episode.
-
-    Args:
-        specs: of the policy's observations.
-    """
+    """Frames and actions of one episode."""
 
     def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
         self._specs = specs

@@ -33,9 +33,6 @@ class Clock(Protocol):
         """Wait until the condition is notified or ``timeout`` seconds of this clock have passed.
 
         May return early; callers look again at what they wait for.
-
-        Args:
-            timeout: seconds; None for no limit.
         """
 
 

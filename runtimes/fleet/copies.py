@@ -94,12 +94,7 @@ class Copy:
 
 
 class RayCopies:
-    """``server.Copies`` behind a handle of Ray Serve.
-
-    Args:
-        handle: of the deployment of ``Copy``.
-        name: of its application.
-    """
+    """``server.Copies`` behind a handle of Ray Serve."""
 
     def __init__(self, handle: Any, name: str) -> None:
         self._handle, self._name = handle, name

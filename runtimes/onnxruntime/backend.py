@@ -25,11 +25,7 @@ from .workspace import Workspace
 
 
 class OnnxBackends:
-    """Opens backends on views of one artifact, which share sessions, and what they remember of frames.
-
-    Args:
-        threads: of arithmetic; one runs on the caller's thread.
-    """
+    """Opens backends on views of one artifact, which share sessions, and what they remember of frames."""
 
     def __init__(self, threads: int = 1) -> None:
         self.sessions = Sessions(threads)

@@ -16,12 +16,7 @@ from .workspace import Workspace
 
 
 def decode_first(work: Workspace, keep: BoolArray) -> None:
-    """Step 0, which is dense in every plan, so that it need not wait for one.
-
-    Args:
-        work: observation and noise taken in.
-        keep: bool ``[K, blocks]``; computed residuals that go into the rollout cache.
-    """
+    """Step 0, which is dense in every plan, so that it need not wait for one."""
     work.begin()
     _run_dense(work, 0, keep)
 

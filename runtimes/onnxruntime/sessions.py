@@ -76,11 +76,7 @@ those of onnxruntime, with a thread a core. No argument turns it off."""
 
 
 class Sessions:
-    """The sessions of one artifact's models; views that compute with the same model share its session.
-
-    Args:
-        threads: of arithmetic. With one thread all run on the caller's thread and make none.
-    """
+    """The sessions of one artifact's models; views that compute with the same model share its session."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads

@@ -151,12 +151,7 @@ class ReferenceModel:
         return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
 
     def joined(self, parts: Iterable[Contexts], streams: int) -> Contexts:
-        """What the loop reads for several batches of streams, as for one batch of all of them.
-
-        Args:
-            parts: one after the other; each is copied before the next is made.
-            streams: of all of them together, at least one.
-        """
+        """What the loop reads for several batches of streams, as for one batch of all of them."""
         read = [graph for graph in (self._pieces.condition, self._pieces.step) if graph is not None]
         axes = {name: one.batch_axis for graph in read for name, one in graph.types().items()}
 

@@ -53,12 +53,7 @@ class Connection:
 
 
 class Admission:
-    """Counts and limits; used by the server's event loop alone.
-
-    Args:
-        limits: what clients may do.
-        clock: seconds that never go back.
-    """
+    """Counts and limits; used by the server's event loop alone."""
 
     def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits
@@ -101,12 +96,7 @@ class Admission:
         return ""
 
     def answers(self, peer: tuple[Any, ...], status: int, tls: str | None, own: Any = None) -> None:
-        """Note how a handshake was answered.
-
-        Args:
-            status: of HTTP; 101 makes it a client, and 200 is the answer to somebody who watches.
-            tls: version of TLS, None without.
-        """
+        """Note how a handshake was answered."""
         connection = self._connections[peer, own]
         connection.answered, connection.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
         no_fault_of_theirs = status in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE)
@@ -153,12 +143,7 @@ class Admission:
 
 
 class AdmittingSocket(socket.socket):
-    """A listening socket that asks about every connection, before a byte of it is read.
-
-    Args:
-        admission: is asked.
-        family: of addresses.
-    """
+    """A listening socket that asks about every connection, before a byte of it is read."""
 
     def __init__(self, admission: Admission, family: int) -> None:
         super().__init__(family, socket.SOCK_STREAM)
@@ -196,12 +181,7 @@ class AdmittedSocket(socket.socket):
 
 
 class Pace:
-    """How long a client's next request has to wait, so that it has no more than its share of a second.
-
-    Args:
-        per_second: requests; as many may come at once after a quiet second.
-        now: seconds of any clock.
-    """
+    """How long a client's next request has to wait, so that it has no more than its share of a second."""
 
     def __init__(self, per_second: float, now: float) -> None:
         self._each = 1 / per_second

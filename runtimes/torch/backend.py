@@ -58,9 +58,6 @@ class TorchBackends:
 class TorchBackend:
     """A ``Backend`` on torch.
 
-    Args:
-        view: of an artifact; its blocks have their products in fp32, bf16 or fp16.
-
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
         workspace: of the batch size under way.

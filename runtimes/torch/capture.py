@@ -24,11 +24,7 @@ WARM_UP = 2
 
 
 class Lines:
-    """Runs lines, captured or not.
-
-    Args:
-        capture: how; None to run them as they are.
-    """
+    """Runs lines, captured or not."""
 
     def __init__(self, capture: Capture | None) -> None:
         self._capture = capture

@@ -26,11 +26,7 @@ Array: TypeAlias = npt.NDArray[np.generic]
 
 
 class Placed:
-    """Arrays of an artifact on a device, each once.
-
-    Args:
-        device: where they go.
-    """
+    """Arrays of an artifact on a device, each once."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -45,11 +41,7 @@ class Placed:
 
 
 class Parts:
-    """What all numbers of streams share.
-
-    Args:
-        narrow: type of the products in residual blocks; None for float32.
-    """
+    """What all numbers of streams share."""
 
     def __init__(self, view: View, placed: Placed, narrow: torch.dtype | None) -> None:
         self.manifest, self.pieces = view.manifest, view.pieces

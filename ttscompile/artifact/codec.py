@@ -73,12 +73,7 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
 
 
 def is_as_written(manifest: Manifest, content: bytes) -> bool:
-    """Whether these bytes are how ttscompile writes a manifest, or wrote it in the schema before, which says the same.
-
-    Args:
-        manifest: what ``decode`` made of the bytes.
-        content: of ``manifest.json``.
-    """
+    """Whether these bytes are how ttscompile writes this manifest, or wrote the same in the schema before."""
     document = {key: member.data for key, member in parse(content, MANIFEST, MAX_MANIFEST_BYTES).members().items()}
     return content == (encode(manifest) if document["schema_version"] == SCHEMA_VERSION else dump(document))
 

@@ -119,11 +119,7 @@ class FlopsRecord:
         return fixed + plan_flops(plan, self.blocks)
 
     def ceiling(self, steps: int) -> float:
-        """How many times the FLOPs of a call are that computes step 0 alone, in a dense call: no plan saves more.
-
-        Args:
-            steps: K. The ceiling is below K: prologue, stems and tails are always computed.
-        """
+        """How many times the FLOPs of a call are that computes step 0 alone, in a dense call: no plan saves more."""
         fixed, blocks = self.prologue + steps * (self.stem + self.tail), sum(self.blocks)
         return (fixed + steps * blocks) / (fixed + blocks)
 

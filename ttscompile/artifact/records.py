@@ -169,10 +169,6 @@ def requirements(models: Mapping[str, ModelProto]) -> Requires:
 def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[str, Any]) -> dict[str, PlanRecord]:
     """Records of plans by name, ``dense`` left out; see ``write.update_plans``.
 
-    Args:
-        manifest: with the loops and weights that the plans name.
-        record: of the calibration: what the plans of the pruner come to on average is in it.
-
     Raises:
         ArtifactError: names that cannot be, fields that name what the artifact lacks, or sparsities that are no shares.
         IllegalPlanError: cells that do not fit the policy.

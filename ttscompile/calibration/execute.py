@@ -133,12 +133,7 @@ class Executor:
             return np.asarray(self.model.logits(calls.contexts, tensors).numpy(), dtype=np.float32)
 
     def samples(self, calls: Calls, blocks: Blocks) -> Iterator[Tensor]:
-        """The sample ``[N, T, D]`` after each step, with the executor's correction.
-
-        Args:
-            calls: N of them.
-            blocks: from a step and the stream after its stem to the stream after its last block.
-        """
+        """The sample ``[N, T, D]`` after each step, with the executor's correction."""
         loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction)
         return (carried.sample for carried in loop)
 

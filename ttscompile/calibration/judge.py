@@ -310,10 +310,6 @@ def _scored(
 def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
     """h, and how far two answers of the original are apart, mean over the pairs of draws of each call.
 
-    Args:
-        x: what a plan answers, ``[N, R, A]``.
-        y: what the original answers.
-
     Returns:
         ``[N]`` twice.
     """

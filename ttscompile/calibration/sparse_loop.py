@@ -200,11 +200,7 @@ class SparseLoop:
 
 
 class _Batch:
-    """Some of the calls at a place.
-
-    Args:
-        sums: keep of residuals what all blocks added together, which is enough for whole steps.
-    """
+    """Some of the calls at a place."""
 
     def __init__(self, executor: Executor, calls: Calls, sums: bool) -> None:
         self._executor, self._calls, self._sums = executor, calls, sums

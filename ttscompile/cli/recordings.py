@@ -55,12 +55,7 @@ def require_recordings(paths: Iterable[Path]) -> None:
 
 
 def trajectories_options(required: bool = True, what: str = "Learn from these recorded episodes.") -> Decorator:
-    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``.
-
-    Args:
-        required: whether the command does nothing without recordings.
-        what: the sentence that says what is done with them.
-    """
+    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
     return together(
         click.option(
             "-t",

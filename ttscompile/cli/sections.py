@@ -28,11 +28,7 @@ class Section:
 
 
 class SectionedCommand(FilesCommand):
-    """Shows the options of each section under its title, and refuses those whose section was not asked for.
-
-    Args:
-        sections: options that are in none stand first, as click puts them.
-    """
+    """Shows the options of each section under its title, and refuses those whose section was not asked for."""
 
     def __init__(self, *args: Any, sections: Sequence[Section] = (), **settings: Any) -> None:
         super().__init__(*args, **settings)

@@ -189,11 +189,7 @@ class Correction:
         return np.asarray(condition @ self.reading, np.float32)
 
     def from_condition(self, read: FloatArray) -> FloatArray:
-        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``.
-
-        Args:
-            read: of the condition, float32 ``[B, F]``.
-        """
+        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``."""
         count, *shape = self.observed.shape
         added = read @ self.observed.reshape(count, -1)
         return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
@@ -240,11 +236,7 @@ def correction_flops(sample: tuple[int, int]) -> int:
 
 
 def numbers_of(features: Iterable[tuple[int, ...]]) -> int:
-    """N: how many numbers of the condition a correction may read; 0 where there are too many.
-
-    Args:
-        features: the shapes of its values for one stream.
-    """
+    """N: how many numbers of the condition a correction may read; 0 where there are too many."""
     numbers = sum(math.prod(shape) for shape in features)
     return numbers if numbers <= MOST_NUMBERS else 0
 

@@ -42,12 +42,7 @@ def load_checkpoint_policy(
 
 
 def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes]:
-    """Files by which the program that trained a policy takes the compiled one in its place; none where it cannot.
-
-    Args:
-        path: of the checkpoint, which was loaded.
-        spec: what was loaded from it.
-    """
+    """Files by which the program that trained a policy takes the compiled one in its place; none where it cannot."""
     if spec.source.get("format") != "lerobot":
         return {}
     from .lerobot_files import lerobot_files

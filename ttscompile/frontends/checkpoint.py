@@ -160,9 +160,6 @@ def _unreadable(path: Path, error: Exception) -> CheckpointError:
 def plain_config(value: Any, where: str = "cfg", depth: int = 0, values: Iterator[int] | None = None) -> Any:
     """Turn inert configuration objects into dictionaries, lists and scalars.
 
-    Args:
-        value: what ``read_checkpoint`` found, or a part of it; plain dictionaries and lists pass as they are.
-
     Returns:
         dict, list, str, int, float, bool or None, nested.
 

@@ -114,12 +114,7 @@ def behind_encoder(
     network: Mapping[str, Any],
     known: Collection[str],
 ) -> Rebuilt:
-    """A U-Net on what an encoder makes of the observed steps.
-
-    Args:
-        encoder: observations by key to ``[B, To, width]``.
-        known: settings of ``cfg.policy`` that were read for encoder and network.
-    """
+    """A U-Net on what an encoder makes of the observed steps."""
     as_global = saved.settings.flag("obs_as_global_cond", True)
     (n_obs_steps,) = saved.sizes("n_obs_steps")
     config = UNetConfig(

@@ -53,12 +53,7 @@ AS_SAVED = LoadOptions()
 
 
 def as_converted(source: Mapping[str, str], encoders: str | os.PathLike[str] | None = None) -> LoadOptions:
-    """The options that decide what a policy observes, as a source tells them: its task, and cameras left out.
-
-    Args:
-        source: of the artifact.
-        encoders: the folder that ``convert`` was given, which no artifact tells.
-    """
+    """The options that decide what a policy observes, as a source tells them: its task, and cameras left out."""
     without = source.get(WITHOUT)
     cameras = without.split(", ") if without else None
     return LoadOptions(task=source.get("task"), encoders=encoders, without_cameras=cameras)

@@ -13,12 +13,7 @@ _NO_TASK = "Or leave the task out: the policy then takes tokens as an observatio
 
 
 def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) -> list[Path]:
-    """Where a language model's files are looked for: the folder that the user names, the checkpoint's, the one above.
-
-    Args:
-        encoders: that the user names; None for none.
-        directory: of the checkpoint.
-    """
+    """Where a language model's files are looked for: the folder that the user names, the checkpoint's, its parent."""
     return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
 
 

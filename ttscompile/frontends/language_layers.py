@@ -128,12 +128,7 @@ class Layer(nn.Module):
 
 
 def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:
-    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is not part of a graph.
-
-    Args:
-        x: the tokens, embedded, ``[B, T, width]``.
-        mask: added to the scores, ``[B, 1, T, T]``.
-    """
+    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is in no graph."""
     found = []
     for layer in layers:
         x, keys, values = layer(x, turns, mask)

@@ -56,12 +56,7 @@ class _Camera(nn.Module):
 
 
 class MultiImageEncoder(nn.Module):
-    """All keys of the observation to one vector for each observed step: the images' features, then the others.
-
-    Args:
-        views: by key of an image, in the order of their features.
-        low_dim: length by key of what is no image, in their order.
-    """
+    """All keys of the observation to one vector for each observed step: the images' features, then the others."""
 
     def __init__(
         self, views: Mapping[str, View], low_dim: Mapping[str, int], network: str, norm: Norm, shared: bool

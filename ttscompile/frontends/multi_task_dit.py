@@ -108,12 +108,7 @@ class _Layer(nn.Module):
 
 
 class DiffusionTransformer(nn.Module):
-    """The denoiser: noisy actions, timestep and condition vector to a prediction.
-
-    Args:
-        config: sizes and variant.
-        condition_dim: channels of the condition vector.
-    """
+    """The denoiser: noisy actions, timestep and condition vector to a prediction."""
 
     def __init__(self, config: DiTConfig, condition_dim: int) -> None:
         super().__init__()

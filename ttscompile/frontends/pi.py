@@ -135,11 +135,7 @@ class Pi(nn.Module):
 
 
 class Prefix(nn.Module):
-    """What the network reads once a call.
-
-    Args:
-        network: whose parts these are.
-    """
+    """What the network reads once a call."""
 
     def __init__(self, network: Pi) -> None:
         super().__init__()
@@ -168,11 +164,7 @@ class Prefix(nn.Module):
 
 
 class Expert(nn.Module):
-    """The denoiser.
-
-    Args:
-        network: whose parts these are.
-    """
+    """The denoiser."""
 
     def __init__(self, network: Pi) -> None:
         super().__init__()

@@ -54,11 +54,7 @@ class PointNet(nn.Module):
 
 
 class PointCloudEncoder(nn.Module):
-    """Points and the robot's state to one vector for each observed step.
-
-    Args:
-        channels: of a point that it takes, the first of those that are there.
-    """
+    """Points and the robot's state to one vector for each observed step."""
 
     def __init__(self, extractor: PointNet, channels: int, state: int) -> None:
         super().__init__()

@@ -154,11 +154,7 @@ class SmolVLA(nn.Module):
 
 
 class Prefix(nn.Module):
-    """What the network reads once a call.
-
-    Args:
-        network: whose parts these are.
-    """
+    """What the network reads once a call."""
 
     def __init__(self, network: SmolVLA) -> None:
         super().__init__()
@@ -186,11 +182,7 @@ class Prefix(nn.Module):
 
 
 class Expert(nn.Module):
-    """The denoiser.
-
-    Args:
-        network: whose parts these are.
-    """
+    """The denoiser."""
 
     def __init__(self, network: SmolVLA) -> None:
         super().__init__()

@@ -105,9 +105,6 @@ class Evaluator:
     The weights are held by reference, not copied: an optimiser's in-place update shows in the next call, and gradients
     flow to them and to the inputs.
 
-    Args:
-        device: where device arguments inside the graph point. Weights and inputs must be there.
-
     Raises:
         CaptureError: an operation that ``resolve_op`` refuses, an argument that names no value, a constant that is
             missing or does not have its type, or a symbolic size that no input can give a value.

@@ -55,10 +55,6 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
     The update is that of ``core.update``, with what belongs to the step as inputs. A term of the denoised sample
     whose column of the sampler's table is zero at every step is left out.
 
-    Args:
-        tail: residual stream and contexts -> prediction ``[B, T, D]``.
-        stem: sample ``[B, T, D]`` and contexts -> residual stream.
-
     Returns:
         A graph with the inputs ``stream``, ``sample`` and ``offset`` ``[D, B, T]``, ``history`` ``[D, B, 4 T]``,
         ``update`` ``[G, R, (1 + S) T]``, ``sample_to_x0`` and ``out_to_x0`` ``[1]``, where the sampler has S > 0

@@ -69,12 +69,7 @@ class Schedule:
 
 
 def best_schedules(similarity: Scores, most: int) -> list[Schedule]:
-    """The schedules with the highest scores with 1, 2, ... ``most`` computations, the first at step 0.
-
-    Args:
-        similarity: ``[K, K]``, ``S[a, t]`` of one block.
-        most: computations at most.
-    """
+    """The schedules with the highest scores with 1, 2, ... ``most`` computations, the first at step 0."""
     steps = len(similarity)
     sums = np.concatenate([np.zeros((steps, 1)), np.cumsum(similarity, 1)], 1)
     segment = sums - np.diagonal(sums)[:, None]  # [a, e]: a's residual is added at a..e-1

@@ -68,12 +68,7 @@ class Switch:
 
 
 class _Components:
-    """Principal components of features, and ridge regression on them.
-
-    Args:
-        features: ``[N, F]``.
-        episodes: ``[N]``; the folds keep the calls of an episode together.
-    """
+    """Principal components of features, and ridge regression on them."""
 
     def __init__(self, features: Matrix, episodes: IntArray) -> None:
         self._mean = features.mean(0, dtype=np.float64)

@@ -119,12 +119,7 @@ def _flat(path: Path, name: str, array: Array) -> Array:
 
 
 def _as_image(array: Array, spec: ObservationSpec) -> Array:
-    """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255.
-
-    Args:
-        array: ``[F, ...]``.
-        spec: of one frame.
-    """
+    """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255."""
     frame = spec.shape
     if array.ndim != 4 or len(frame) != 3 or array.shape[1:] == frame or array.shape[-1] != frame[0]:
         return array

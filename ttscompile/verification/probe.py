@@ -27,12 +27,7 @@ Array = npt.NDArray[Any]
 
 
 class Probe:
-    """The pieces on one observation.
-
-    Args:
-        view: of an artifact.
-        obs: normalised observations by key, ``[B, ...]``.
-    """
+    """The pieces on one observation."""
 
     def __init__(self, view: View, obs: Mapping[str, Array]) -> None:
         self._view, self._manifest, self._pool = view, view.manifest, Sessions(1)
