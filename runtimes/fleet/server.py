@@ -93,9 +93,6 @@ class FleetServer(Listener):
         plan: of requests that name none; None for the artifact's default.
         waiting: requests that may be under way; further ones are refused.
         lock: who may come in; None lets every program of this machine in, and nobody else.
-
-    Raises:
-        IllegalPlanError: see ``Plans.of``.
     """
 
     methods = METHODS

@@ -60,11 +60,7 @@ class CallModule(nn.Module):
         return self._spec
 
     def _network(self, obs: Mapping[str, Tensor], initial: Tensor) -> PlainNetwork:
-        """The network of a call.
-
-        Raises:
-            ObservationError: an observation or the initial noise of another shape or dtype, or missing.
-        """
+        """The network of a call."""
         spec = self._spec
         horizon, dimensions = spec.sample
         if initial.ndim != 3 or tuple(initial.shape[1:]) != spec.sample or initial.dtype != torch.float32:
@@ -95,11 +91,7 @@ class CallModule(nn.Module):
     def _offset(
         self, network: PlainNetwork, advance: Advance, initial: Tensor, steps: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
-        """What each step adds to the sample, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``.
-
-        Raises:
-            ObservationError: noise of the steps of another shape, or missing.
-        """
+        """What each step adds to the sample, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``."""
         spec = self._spec
         horizon, dimensions = spec.sample
         own = self._kept("offset")

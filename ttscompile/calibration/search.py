@@ -32,10 +32,6 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
 
     Returns:
         What was found, and whether the time cut the search short.
-
-    Raises:
-        CalibrationError: there is no such strategy, or it cannot keep the budget.
-        CalibrationFailedError: the time was up before there was a plan within the budget.
     """
     clock = Clock(seconds)
     found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
@@ -58,9 +54,6 @@ def search_plan(
 
     Returns:
         What was found, after how many intervals, and why it stopped: ``finished`` or ``time limit``.
-
-    Raises:
-        CalibrationFailedError: the time was up before there was a plan within the budget.
     """
     count = search.intervals if most is None else min(most, search.intervals)
     number, longest = first, 0.0

@@ -99,12 +99,7 @@ def _goes_on(artifact: Artifact, plan: Plan) -> bool:
 
 
 def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
-    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
-
-    Raises:
-        RuntimeUnavailableError: there is no torch.
-        SpecError: the checkpoint is of another policy.
-    """
+    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another."""
     try:
         import torch
 
@@ -133,11 +128,7 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
 
 
 def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = None) -> tuple[nn.Module, PolicySpec]:
-    """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
-
-    Raises:
-        SpecError: the checkpoint is of another policy.
-    """
+    """The network of the checkpoint that an artifact was made from, and what that says about it; needs torch."""
     from ttscompile.frontends import load_checkpoint_policy
     from ttscompile.frontends.families import as_converted
 

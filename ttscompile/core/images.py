@@ -17,9 +17,6 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
     """An image of another size as the specification has it; anything else as it is.
 
     What openpi and LeRobot do: bilinear, without smoothing what becomes smaller.
-
-    Raises:
-        TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.
     """
     if spec.fit is None or array.dtype != np.float32 or array.ndim < 3 or not array.size:
         return array

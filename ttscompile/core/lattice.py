@@ -57,9 +57,6 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
 
     Returns:
         int8 ``[B, K, blocks]``, contiguous.
-
-    Raises:
-        IllegalPlanError: wrong dtype, shape or values.
     """
     array = given = _sources(plan)
     if array.ndim == 2:
@@ -71,11 +68,7 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
 
 
 def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
-    """A copy of a plan of any shape and integer dtype, which holds nothing but sources.
-
-    Raises:
-        IllegalPlanError: it does not.
-    """
+    """A copy of a plan of any shape and integer dtype, which holds nothing but sources."""
     array = listed(plan, "plan", IllegalPlanError, "int8").copy()
     if array.dtype.kind not in "iu":
         raise IllegalPlanError(

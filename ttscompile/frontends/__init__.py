@@ -1,6 +1,7 @@
 """Readers of the checkpoints that users have: each gives a module and a ``PolicySpec``; nothing after it differs.
 
-Whatever a checkpoint lacks, or has that is not rebuilt here, is a ``CheckpointError`` of any function of this room.
+Whatever a checkpoint lacks, or has that is not rebuilt here, is a ``CheckpointError`` of any function of this room; a
+sampler, spacing or number of steps that was asked for and cannot be is a ``SpecError``.
 """
 
 from __future__ import annotations

@@ -162,10 +162,6 @@ def plain_config(value: Any, where: str = "cfg", depth: int = 0, values: Iterato
 
     Returns:
         dict, list, str, int, float, bool or None, nested.
-
-    Raises:
-        CheckpointError: an object of another type, a malformed one, nesting without end, or more values than any
-            configuration has.
     """
     values = itertools.count() if values is None else values
     if depth > _DEEPEST:

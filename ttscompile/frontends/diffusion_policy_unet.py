@@ -153,10 +153,6 @@ def denoiser(
         given: how it is given the observation.
         steps: name of the setting that says how many steps its sample has.
         start: the first of them that is executed.
-
-    Raises:
-        CheckpointError: the network cannot halve and double so many steps, or they end before what is asked of them;
-            weights that do not fit.
     """
     horizon, n_obs_steps = saved.settings.number(steps, most=_MOST_STEPS), saved.settings.number("n_obs_steps")
     if horizon % config.divisor:

@@ -84,12 +84,7 @@ class Family:
     options: frozenset[str]
 
     def load(self, path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
-        """Load a checkpoint of this family.
-
-        Raises:
-            CheckpointError: an option that is of other families, or whatever the family's module refuses.
-            SpecError: the sampler asked for is not possible.
-        """
+        """Load a checkpoint of this family."""
         for name in (field.name for field in fields(options) if getattr(options, field.name) is not None):
             if name not in self.options:
                 takers = " and ".join(each.title for each in FAMILIES if name in each.options)

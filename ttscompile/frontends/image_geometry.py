@@ -21,9 +21,6 @@ class ResizeCrop(nn.Module):
         crop: (height, width) within the resized image; None for all of it.
         antialias: whether pixels of a smaller image are averages of all that they stand for, as torchvision resizes
             tensors from its version 0.17 on.
-
-    Raises:
-        CheckpointError: the crop is larger than what it crops.
     """
 
     rows: torch.Tensor

@@ -211,11 +211,7 @@ class Network(nn.Module):
 
 
 class ConditionEncoder(Measured):
-    """Raw observations to the condition vector: each frame is [state, cameras, environment], oldest first.
-
-    Raises:
-        CheckpointError: the crop is larger than the images.
-    """
+    """Raw observations to the condition vector: each frame is [state, cameras, environment], oldest first."""
 
     def __init__(self, config: DiffusionConfig, processors: Processors, rgb_encoder: nn.Module | None) -> None:
         geometry = None

@@ -88,12 +88,7 @@ def _observations(config: LeRobotConfig, processors: Processors) -> dict[str, Ob
 
 
 def diffusion_loops(config: LeRobotConfig, options: LoadOptions) -> Loops:
-    """The denoising loops of a policy that was trained with diffusion; the defaults are lerobot's.
-
-    Raises:
-        CheckpointError: settings that are not possible.
-        SpecError: the sampler asked for is not possible.
-    """
+    """The denoising loops of a policy that was trained with diffusion; the defaults are lerobot's."""
     settings = config.settings.values
     scheduler = {key: settings.get(key, default) for key, default in _SCHEDULER_SETTINGS.items()}
     scheduler["_target_"] = f"{config.settings.choice('noise_scheduler_type', 'DDPM', 'DDIM')}Scheduler"

@@ -31,10 +31,6 @@ def loops_of(make: Make, options: LoadOptions, own: str) -> Loops:
 
     Args:
         options: of the caller; without sampler, steps and spacing nothing is asked for.
-
-    Raises:
-        CheckpointError: the checkpoint describes no loop that is known, and nothing was asked for; or as ``make``.
-        SpecError: what is asked for is not possible.
     """
     if options.sampler is None and options.steps is None and options.spacing is None:
         return Loops(make(AS_SAVED))

@@ -67,10 +67,6 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
         own_steps: K of the policy; None for the number of training timesteps.
         step_arguments: what the policy hands to every ``step`` of its own scheduler (``eta``).
         where: the settings stand, for messages.
-
-    Raises:
-        CheckpointError: the configured scheduler is of another class, or has settings that diffusers does not know.
-        SpecError: the sampler, spacing or number of steps asked for is not possible.
     """
     sampler, spacing = options.sampler, options.spacing
     steps = own_steps if options.steps is None else options.steps

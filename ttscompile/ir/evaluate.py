@@ -150,11 +150,7 @@ class Evaluator:
         return self.run([inputs[name] for name in self._graph.inputs], bind_batch(self._graph.inputs, inputs))
 
     def run(self, inputs: Sequence[torch.Tensor], streams: int) -> tuple[torch.Tensor, ...]:
-        """The same for inputs in order, which are known to fit, and for so many streams.
-
-        Raises:
-            CaptureError: an operation fails on these values; names the node.
-        """
+        """The same for inputs in order, which are known to fit, and for so many streams."""
         frame: Frame = [*inputs, *self._constants]
         index = 0
         try:
@@ -212,11 +208,7 @@ class Evaluator:
 
 
 def resolve_enum(node: Node, argument: Enum, device: torch.device) -> Any:
-    """The torch object that an enumeration among the arguments of a node names; a device is ``device``.
-
-    Raises:
-        CaptureError: torch has no such object.
-    """
+    """The torch object that an enumeration among the arguments of a node names; a device is ``device``."""
     if argument.kind == "device":
         return device
     value = getattr(torch, argument.name, None)
@@ -226,11 +218,7 @@ def resolve_enum(node: Node, argument: Enum, device: torch.device) -> Any:
 
 
 def bind_batch(types: Mapping[str, TensorType], values: Mapping[str, torch.Tensor]) -> int:
-    """The number of streams B that makes ``values`` fit ``types``; 1 if no type depends on it.
-
-    Raises:
-        ObservationError: a value is missing, or does not fit; names it.
-    """
+    """The number of streams B that makes ``values`` fit ``types``; 1 if no type depends on it."""
     streams: int | None = None
     origin = ""
     for name, type_ in types.items():

@@ -26,11 +26,7 @@ _CHARACTER = 0.012
 
 
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
-    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib is not installed.
-    """
+    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -67,11 +63,7 @@ def beside(place: float, name: str, shift: float = 0.0) -> dict[str, Any]:
 
 
 def require_picture_name(path: Path) -> None:
-    """Raise unless a picture may have this name: to be told before there is something to draw.
-
-    Raises:
-        OutputError: no suffix that says the format, or no such folder.
-    """
+    """Raise unless a picture may have this name: to be told before there is something to draw."""
     if path.suffix.lower() not in FORMATS:
         raise _refused(path, f"its name ends in {path.suffix!r}, which is no format of pictures here")
     if not path.parent.is_dir():
@@ -81,11 +73,7 @@ def require_picture_name(path: Path) -> None:
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:
-    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them.
-
-    Raises:
-        OutputError: it cannot be written; a file that was there is as it was.
-    """
+    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them."""
     place, content = Path(path), BytesIO()
     require_picture_name(place)
     suffix = place.suffix.lower()

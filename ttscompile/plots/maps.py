@@ -27,13 +27,7 @@ _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward
 
 
 def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: str = "") -> None:
-    """Draw one plan and write the picture.
-
-    Raises:
-        IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
-        RuntimeUnavailableError: matplotlib is not installed.
-        OutputError: the picture cannot be written.
-    """
+    """Draw one plan and write the picture."""
     if plan.ndim != 2 or plan.shape[1] != len(kinds) or not np.isin(plan, list(Source)).all():
         raise IllegalPlanError(
             f"cannot draw a plan of shape {plan.shape} with values {np.unique(plan).tolist()}; expected"
@@ -74,10 +68,6 @@ def plot_errors(
         errors: ``[A, blocks]``.
         tolerance: errors above it are framed.
         cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib is not installed.
-        OutputError: the picture cannot be written.
     """
     count, blocks = errors.shape
     figure, axes = _map(6.5 + 0.03 * count, 2.2 + 0.17 * blocks, kinds, "the errors")

@@ -47,11 +47,7 @@ class Given:
 def build(
     artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None] = lambda what: None
 ) -> Page:
-    """Measure what has to be measured, draw, and put the page together.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
-    """
+    """Measure what has to be measured, draw, and put the page together."""
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")

@@ -76,11 +76,7 @@ class Page:
 
 
 def require_packages() -> None:
-    """Raise before anything is measured for a page that could not be made.
-
-    Raises:
-        RuntimeUnavailableError: Jinja2 or matplotlib is not installed.
-    """
+    """Raise before anything is measured for a page that could not be made."""
     for name in ("jinja2", "matplotlib"):
         try:
             importlib.import_module(name)
@@ -92,11 +88,7 @@ def require_packages() -> None:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document without scripts, which refers to nothing outside of itself.
-
-    Raises:
-        RuntimeUnavailableError: Jinja2 is not installed.
-    """
+    """The page as one HTML document without scripts, which refers to nothing outside of itself."""
     require_packages()
     from jinja2 import Environment, StrictUndefined
 

@@ -89,11 +89,7 @@ class Criterion:
 
 
 class Decisions:
-    """What a criterion decides during one call of B streams. Streams do not influence each other.
-
-    Raises:
-        IllegalPlanError: the policy has no block after the first ``always`` ones.
-    """
+    """What a criterion decides during one call of B streams. Streams do not influence each other."""
 
     def __init__(self, criterion: Criterion, steps: int, blocks: int, streams: int) -> None:
         if criterion.always >= blocks:
@@ -219,11 +215,7 @@ def fit_threshold(
 
 
 def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
-    """Fit every criterion that is proposed, take the best, and fit it again on more calls.
-
-    Raises:
-        CalibrationFailedError: the time was up before one kept the budget.
-    """
+    """Fit every criterion that is proposed, take the best, and fit it again on more calls."""
     probes, some, more = task.clock.in_time(repeat(None)), task.some_calls(COMPARED), task.some_calls(COUNTED)
     fitted = [fit_threshold(task, criterion, some, 0.0, start, probes) for criterion, start in proposed]
     kept = [one for one in fitted if one is not None]
