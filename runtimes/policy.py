@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ttscompile.artifact.load import Artifact
 from ttscompile.core.coercion import integer
 from ttscompile.core.plan import Plan
-from ttscompile.core.spec import FP32, FloatArray, Noise, PolicySpec
+from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import NonFiniteActionsError, TtscompileError
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
@@ -82,7 +82,7 @@ class CompiledPolicy:
         """What this policy is: with the plan that it was loaded with."""
         view, default = self._runtime.view(self._default), self._default
         manifest, blocks = view.manifest, []
-        begun = self._whole_loop(default).sampler
+        begun = self._runtime.noise_spec(default).sampler
         for block in manifest.blocks:
             shape = tuple(n for i, n in enumerate(block.type.at(1)) if i != block.type.batch_axis)
             blocks.append(BlockInfo(block.kind, shape, block.flops))
@@ -320,7 +320,7 @@ class CompiledPolicy:
 
     def _draw(self, streams: int, plan: Plan) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
-        spec = self._whole_loop(plan)
+        spec = self._runtime.noise_spec(plan)
         shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
         initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
         if not spec.sampler.stochastic:
@@ -337,10 +337,6 @@ class CompiledPolicy:
         own = self._default.otherwise or self._default
         cells: Any = plan  # whatever it is: the runtime checks it
         return Plan(own.loop, cells, precision=own.precision, tokens=own.tokens)
-
-    def _whole_loop(self, plan: Plan) -> PolicySpec:
-        """With the loop that the noise of a call is for: that of ``otherwise``, where a plan begins with a chunk."""
-        return self._runtime.view(plan.otherwise or plan).manifest.spec
 
     def _prefix_refusal(self, plan: Plan) -> str | None:
         """Why a call with this plan takes no prefix; None if it does."""

@@ -199,7 +199,7 @@ class Runtime:
         opened = self._opened_for(plan)
         view, backend = opened.view, opened.backend
         spec, manifest = view.manifest.spec, view.manifest
-        noise = check_noise(noise, streams, self._noise_spec(plan))
+        noise = check_noise(noise, streams, self.noise_spec(plan))
         if view.start is not None and self._chunk is not None:
             noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
@@ -253,7 +253,7 @@ class Runtime:
         )
         return sample, report
 
-    def _noise_spec(self, plan: Plan) -> PolicySpec:
+    def noise_spec(self, plan: Plan) -> PolicySpec:
         """What noise has to fit: of the loop whose last steps these are, where the plan begins with a chunk."""
         return self.view(plan if plan.otherwise is None else plan.otherwise).manifest.spec
 
