@@ -255,7 +255,16 @@ class ExecutorState:
         return self._job
 
     def finish(self, job: Job, actions: FloatArray, now: float) -> str:
-        """Take the chunk of a call; whether it was ``scheduled``, ``discarded``, ``refused`` or ``overdue``."""
+        """Take the chunk of a call.
+
+        Args:
+            job: the call.
+            actions: ``[horizon + reserve, Da]``, the playable part of the prediction.
+            now: when it was done.
+
+        Returns:
+            What became of it: ``scheduled``, ``discarded``, ``refused`` or ``overdue``.
+        """
         counts, self._job = self.recorder.counts, None
         counts.calls += 1
         latency = now - job.started

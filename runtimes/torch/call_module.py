@@ -91,7 +91,11 @@ class CallModule(nn.Module):
     def _offset(
         self, network: PlainNetwork, advance: Advance, initial: Tensor, steps: Tensor | None
     ) -> tuple[Tensor, Tensor | None]:
-        """What each step adds to the sample, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``."""
+        """What each step adds to the sample, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``.
+
+        Raises:
+            ObservationError: noise of the steps of another shape, or missing.
+        """
         spec = self._spec
         horizon, dimensions = spec.sample
         own = self._kept("offset")

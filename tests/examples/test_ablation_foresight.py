@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import foresight
 import numpy as np
@@ -83,7 +84,7 @@ def test_two_episodes_are_too_few(compiled: Path, tmp_path: Path) -> None:
 def test_of_one_step_nothing_can_be_chosen(compiled: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded = load_artifact(compiled)
     sampler = loaded.manifest.spec.sampler
-    rows = {name: np.ascontiguousarray(getattr(sampler, name)[:1]) for name in sampler.COLUMNS}
+    rows: Any = {name: np.ascontiguousarray(getattr(sampler, name)[:1]) for name in sampler.COLUMNS}
     one = replace(sampler, timesteps=sampler.timesteps[:1].copy(), **rows)
     single = replace(loaded, manifest=replace(loaded.manifest, spec=replace(loaded.manifest.spec, sampler=one)))
     monkeypatch.setattr(foresight, "load_artifact", lambda _: single)

@@ -17,6 +17,7 @@ from ttscompile.cli.contestants import Way, contestants
 from ttscompile.core.lattice import dense_plan
 from ttscompile.core.plan import Plan
 from ttscompile.doctor.artifact import artifact_findings
+from ttscompile.ir.program import Program
 from ttscompile.report.timing import measure_plans
 from ttscompile.runtimes.random_calls import random_call
 from ttscompile.samplers.flow import flow_matching_table
@@ -24,13 +25,14 @@ from ttscompile.samplers.flow import flow_matching_table
 
 @pytest.fixture(scope="module")
 def artifact(once: Once) -> Artifact:
-    def convert(path: Path) -> None:
+    def convert(path: Path) -> Program:
         drawing = policies.spec()
         still = replace(flow_matching_table(4), timesteps=np.arange(4)[::-1].copy())
         spec = replace(drawing, sampler=still, loops={"drawing-10": drawing.sampler})
-        ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path)
+        program = ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path)
         plans = {"dense": load_artifact(path).plans["dense"], "drawing": Plan("drawing-10", dense_plan(10, 6))}
         update_plans(path, plans, "drawing", {})
+        return program
 
     return load_artifact(once.compiled("a loop that draws noise beside one that does not", convert)[0])
 

@@ -45,7 +45,11 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def decode(content: bytes, where: str = MANIFEST) -> Manifest:
-    """Read ``manifest.json``."""
+    """Read ``manifest.json``.
+
+    Raises:
+        ArtifactError: no manifest, another schema version, or one that was changed or damaged.
+    """
     document = {key: member.data for key, member in parse(content, where, MAX_MANIFEST_BYTES).members().items()}
     if document.get("format") != FORMAT:
         raise ArtifactError(
@@ -73,7 +77,12 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
 
 
 def is_as_written(manifest: Manifest, content: bytes) -> bool:
-    """Whether these bytes are how ttscompile writes this manifest, or wrote the same in the schema before."""
+    """Whether these bytes are how ttscompile writes a manifest, or wrote it in the schema before, which says the same.
+
+    Args:
+        manifest: what ``decode`` made of the bytes.
+        content: of ``manifest.json``.
+    """
     document = {key: member.data for key, member in parse(content, MANIFEST, MAX_MANIFEST_BYTES).members().items()}
     return content == (encode(manifest) if document["schema_version"] == SCHEMA_VERSION else dump(document))
 
@@ -85,7 +94,11 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
 
 
 def from_json(root: Value) -> Manifest:
-    """Inverse of ``to_json``; checks that the parts fit each other."""
+    """Inverse of ``to_json``; checks that the parts fit each other.
+
+    Raises:
+        ArtifactError: names the path in the document, expected and found.
+    """
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))
@@ -105,6 +118,9 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     identity covers that, the pruner's weights, all fields of all plans by name, which of them is the default, and by
     name the weights and models that plans may take: a calibration belongs to the model with or without them. Neither
     covers what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+
+    Returns:
+        Two sha256 of 64 digits.
     """
     document = to_json(manifest)
     hashes = {name: record.sha256 for name, record in manifest.files.items()}

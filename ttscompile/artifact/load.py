@@ -357,7 +357,11 @@ def plan_of(
 
 
 def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -> None:
-    """Raise IllegalPlanError unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0."""
+    """Raise unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0.
+
+    Raises:
+        IllegalPlanError: it is not.
+    """
     if plan.dtype != np.int8 or plan.ndim != 2:
         found = f"{plan.dtype}{list(plan.shape)}"
         raise IllegalPlanError(f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {found}.")

@@ -275,9 +275,12 @@ class Manifest:
             ``pixels_00`` and ``tokens_00`` of each frame piece in ``tokens``.
         contexts: binding and type of every context.
         features: condition values that the pruner reads, and corrections.
+        flops: see ``FlopsRecord``.
         plans: beside ``dense``, by name.
         default_plan: ``dense`` or a name in ``plans``.
         calibration: record of the calibration, free JSON; None before any.
+        stores: names of the files that are not ONNX.
+        requires: what the ONNX graphs need.
         files: every file but the manifest.
         precision: models in another precision than fp32, which plans may take; None if there are none.
         loop_pruners: by further loop with a pruner of its own, name of the file with its constants.

@@ -33,7 +33,11 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 def check_model(path: Path, files: Mapping[str, FileRecord]) -> None:
-    """Raise unless all weights of a model are in it, or in ranges of the artifact's files, which were checked."""
+    """Raise unless all weights of a model are in it, or in ranges of the artifact's files, which were checked.
+
+    Raises:
+        ArtifactError: unreadable, no such model, or weights elsewhere.
+    """
     content = read_file(path, MAX_BYTES) if path.suffix == ".onnx" else None
     if content is None or len(content) > MAX_BYTES:
         raise ArtifactError(f"{path}: expected a file NAME.onnx of at most {MAX_BYTES} bytes. {REMEDY}")

@@ -27,7 +27,11 @@ class Value:
     path: str
 
     def fail(self, expected: str) -> NoReturn:
-        """Raise for this value. Raises ArtifactError: always."""
+        """Raise for this value.
+
+        Raises:
+            ArtifactError: always.
+        """
         raise ArtifactError(f"{self.path}: expected {expected}; found {_shorten(self.data)}. {REMEDY}")
 
     def keys(self, *names: str) -> dict[str, Value]:
@@ -85,7 +89,16 @@ class Value:
 
 
 def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
-    """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused."""
+    """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
+
+    Args:
+        content: the document.
+        where: name of the file, for messages.
+        limit: largest accepted size in bytes.
+
+    Raises:
+        ArtifactError: not such a document.
+    """
     try:
         return Value(parse_json(content, limit), where)
     except ValueError as error:
