@@ -40,7 +40,6 @@ class Computed:
 
     Attributes:
         values: ``[1, ...]`` each.
-        tokens: for how many tokens it was computed.
         of: how many tokens it has; 0 where the whole frame is the unit.
     """
 

@@ -141,7 +141,6 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
     """What a prefix makes known of the samples of a call; None if it is empty.
 
     Args:
-        spec: of a policy that takes prefixes.
         prefix: from ``check_prefix``, then normalised.
         initial: the noise that the call starts from, ``[B, T, D]``.
     """

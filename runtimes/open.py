@@ -29,7 +29,6 @@ class Options:
 
     Attributes:
         threads: of arithmetic, one of which is the caller's. The reference runs with torch's own setting.
-        device: where it computes.
     """
 
     threads: int = 1

@@ -45,7 +45,6 @@ class _Kept:
     Attributes:
         pixels: that each token was computed for, ``[C, H, W]``.
         arrays: rows ``[T, ...]`` by input of the piece.
-        values: what the tower gave last.
         age: new frames since all tokens were computed.
     """
 

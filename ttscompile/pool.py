@@ -33,7 +33,6 @@ class Work:
     """What is done with each part.
 
     Attributes:
-        here: in this process.
         elsewhere: makes the same function in another process; importable there.
         given: what it is made from. Sent once, and not with each part.
         threads: whether ``here`` may run in several threads at once.

@@ -38,7 +38,6 @@ class Feasibility:
 
     Attributes:
         latency: the longest call that has to be reckoned with.
-        control_hz: rate of the control loop.
         policy_hz: rate of observations and actions in the policy's own time.
         horizon_steps: actions of a chunk that the policy executes: ``play``.
         margin_ticks: control ticks that a chunk shall be there before it is needed.

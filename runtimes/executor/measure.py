@@ -89,7 +89,6 @@ class Jitter:
     """How late the ticks of a loop were, in milliseconds, and what the loop's own work took.
 
     Attributes:
-        max: the latest tick.
         late: ticks that were later than half a period.
         work_us: median of the work of a tick, microseconds.
     """

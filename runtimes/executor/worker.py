@@ -32,8 +32,6 @@ class Worker:
     Attributes:
         lock: of everything here that several threads use; held for microseconds.
         news: notified when a call has ended; a condition on ``lock``.
-        process: that the thread is in.
-        feasibility: the arithmetic of each tier.
         failure: what ended the thread; None if nothing did.
     """
 

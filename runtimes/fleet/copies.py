@@ -33,8 +33,6 @@ class FleetSettings:
     """How copies are made, and how they put requests together.
 
     Attributes:
-        copies: how many there are.
-        threads: of each.
         batch: streams of one call, at most.
         wait_ms: for which a request waits for others of its plan.
     """

@@ -48,7 +48,6 @@ class OnnxBackend:
 
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
-        frames: what depends on one frame alone.
         sessions: by piece; those of single blocks only once a plan needs them.
         workspace: of the batch size under way; None after one that found no memory.
     """

@@ -43,7 +43,6 @@ class Workspace:
         stream: the residual stream after what was added to it.
         current: float32 ``[blocks, *stream]``, what each block computed last.
         table: float32 ``[blocks, *stream]``, what each reused block adds at the moment.
-        rollout: entries of the rollout cache.
         idle: for steps without a computed block; None if the network is of another form.
     """
 

@@ -54,7 +54,6 @@ class Denoised:
 
     Attributes:
         samples: the sample ``[B, T, D]`` after each step, K of them.
-        cache: for the next call of the episode.
     """
 
     samples: tuple[Tensor, ...]
@@ -79,10 +78,7 @@ class ReferenceModel:
         first: values of constants that blocks have at step 0, where those are others.
 
     Attributes:
-        device: where the pieces compute.
-        sampler: what moves the sample on.
         weights: every constant by name; at step 0 blocks may have others (``first``).
-        pruner_weights: the pruner's tensors by name.
     """
 
     def __init__(

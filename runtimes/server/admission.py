@@ -34,13 +34,8 @@ class Connection:
     """A connection, from its socket's acceptance to its end.
 
     Attributes:
-        number: in the order in which they came.
-        peer: address and port.
         network: of the address, which limits are counted by.
-        since: time of the admission's clock.
-        client: whether its handshake was accepted.
         answered: whether its handshake was answered, and so told in the audit.
-        requests: that it has sent.
     """
 
     number: int

@@ -40,7 +40,6 @@ class Lines:
 
         Args:
             key: of all that the line depends on beside the values of its tensors; None not to capture it.
-            line: what to run.
         """
         if self._capture is None or key is None:
             line()

@@ -121,7 +121,6 @@ class _Operands:
     """The residuals that the instructions of a plan work on.
 
     Attributes:
-        current: what each block computed last.
         whole: the sum of all of these, where one step computed them; None where it is not known.
     """
 

@@ -20,11 +20,7 @@ Tensors = Mapping[str, Tensor]
 
 
 class PlainNetwork:
-    """``loop.Network`` of one call; the prologue is computed when it is made.
-
-    Attributes:
-        stream_type: of the residual stream.
-    """
+    """``loop.Network`` of one call; the prologue is computed when it is made."""
 
     def __init__(
         self,

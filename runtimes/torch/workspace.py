@@ -26,7 +26,6 @@ class Inlet:
 
     Attributes:
         array: what to write to; on the CPU the memory of the tensor itself.
-        tensor: what the call reads.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: str, device: torch.device) -> None:

@@ -66,7 +66,6 @@ class Budget:
     """A goal, and what it comes to.
 
     Attributes:
-        goal: what was asked for.
         cells: that a plan may compute, step 0 included.
         measured: how it was found out, where it was measured; JSON.
     """

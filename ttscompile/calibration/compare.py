@@ -95,7 +95,6 @@ def compare(
             strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
         plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
             all where none is named. ``NAME@PRECISION`` is one in another precision.
-        runtime: that executes the plans.
 
     Raises:
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.

@@ -39,7 +39,6 @@ class Executor:
 
     Attributes:
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
-        types: of each block's residual.
         axes: of the streams in each block's residual.
         alike: whether all blocks have residuals of one type.
         pruner_graph: the pruner; None if the artifact has none.

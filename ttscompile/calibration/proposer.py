@@ -105,7 +105,6 @@ class Proposer(Protocol):
 
         Args:
             trials: to learn from (``calls``) and to choose on (``learned``); never ``held_out``.
-            plan: the best so far.
             clock: nothing is begun that would end after its limit, but for what has to be done at least.
 
         Raises:

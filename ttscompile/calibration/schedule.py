@@ -37,7 +37,6 @@ class Schedule:
 
     Attributes:
         budget: what was asked for, once it is known what it comes to.
-        intervals: how many the search took.
         stopped: why it ended: ``finished`` or ``time limit``.
         skipped: why there is no plan of a name that there might be.
     """

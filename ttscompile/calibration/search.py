@@ -49,7 +49,6 @@ def search_plan(
 
     Args:
         most: intervals; None for the strategy's own number.
-        first: the interval to begin with.
         after: told after each interval how many are done, and how many seconds the longest took.
 
     Returns:

@@ -51,11 +51,8 @@ class Place:
     """Before a step of a sparse loop.
 
     Attributes:
-        step: the number of the step.
         fitted: calls that corrections are fitted on, at this place.
         judged: others, that only go along.
-        solved: the corrections of the steps before.
-        anchors: whether these steps are anchors.
         jumps: those that hold, by the step after which they were added.
     """
 

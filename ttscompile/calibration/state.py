@@ -38,7 +38,6 @@ class StateFile:
         work: ``calibration`` or ``comparison``.
 
     Attributes:
-        arrays: the saved arrays by name.
         progress: how far the work is, as JSON.
     """
 

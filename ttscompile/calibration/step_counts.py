@@ -33,7 +33,6 @@ class Best:
     """The best of a family.
 
     Attributes:
-        steps: that are computed.
         error: on calls that its correction was not fitted on, in the units of the actions.
     """
 

@@ -49,11 +49,9 @@ class Task:
     """What to find a plan for.
 
     Attributes:
-        actions: which part of the sample counts.
         calls: to learn from, with targets; never those that the plan is judged on.
         budget: cells that a plan may compute, step 0 included.
         pruner: constants of the pruner by name; empty if the artifact has none.
-        kinds: what each block is.
         whole: compares schedules of whole steps on ``calls``.
         clock: what can be left out is not begun if it would end after its limit.
     """

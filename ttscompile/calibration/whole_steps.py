@@ -35,12 +35,7 @@ MakePlans = Callable[[Calls], PlanArray]
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean absolute error of the executed actions of a schedule.
-
-    Attributes:
-        normalised: as the network has them.
-        units: in the units of the actions.
-    """
+    """Mean absolute error of the executed actions of a schedule."""
 
     normalised: float
     units: float

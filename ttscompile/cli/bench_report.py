@@ -33,11 +33,7 @@ class PrecisionError:
     """How far executed actions of dense calls are from those in fp32, with equal noise, in their units.
 
     Attributes:
-        precision: of the calls.
-        calls: how many.
-        mean: over the calls.
         p90: 90th percentile over the calls.
-        largest: of all numbers.
     """
 
     precision: str

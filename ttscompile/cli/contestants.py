@@ -55,7 +55,6 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
     Args:
         plans: of the first artifact, and of the others where they have one of this name; all where none is named.
             ``NAME@PRECISION`` is one in another precision.
-        ways: how they run.
 
     Raises:
         ArtifactError: one cannot be run, or has no models of a plan's precision.

@@ -27,7 +27,6 @@ class LoopReport:
     """Which plans keep up.
 
     Attributes:
-        control_hz: rate of the loop.
         judged: a verdict by label.
         jitter: how late a loop woke, alone and beside a plan; None if that was not measured.
     """

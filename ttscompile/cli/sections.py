@@ -17,8 +17,6 @@ class Section:
     """Options that belong together.
 
     Attributes:
-        title: over them in the help.
-        options: names of their parameters.
         needs: parameters of which one must be given where one of the options is; none for no such condition.
     """
 

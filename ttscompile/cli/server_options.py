@@ -91,9 +91,7 @@ class ServerOptions:
     """What ``server_options`` were given as, checked.
 
     Attributes:
-        host: to listen on.
         port: 0 for any that is free.
-        lock: who may come in.
         max_clients: that may be connected; None for what is usual.
     """
 

@@ -25,7 +25,6 @@ def load_checkpoint_policy(
     """Load a trained policy without the code that trained it, and without running anything from the file.
 
     Args:
-        path: the checkpoint.
         format: name of a row of ``families.FAMILIES``; ``auto`` tells by what is there.
         options: what is asked for in place of what the checkpoint says.
 

@@ -38,12 +38,8 @@ class TowerConfig:
     """One encoder; the names are those of transformers' configuration.
 
     Attributes:
-        hidden_size: width.
         intermediate_size: width inside the feed-forward layers.
-        num_hidden_layers: layers.
-        num_attention_heads: attention heads.
         hidden_act: ``quick_gelu``, ``gelu``, or ``gelu_pytorch_tanh``, which approximates it.
-        layer_norm_eps: of every layer normalisation.
     """
 
     hidden_size: int

@@ -34,12 +34,9 @@ class UNetConfig:
     """Sizes and variant of one network; the names are those of the original configuration.
 
     Attributes:
-        input_dim: channels of sample and prediction.
         local_cond_dim: channels of a condition for each step of the sample; None for none.
         global_cond_dim: channels of the condition vector; None for none.
-        diffusion_step_embed_dim: width of the timestep's embedding.
         down_dims: channels of the levels; every level but the last halves the number of steps.
-        kernel_size: of the convolutions.
         n_groups: of their group norms.
         cond_predict_scale: whether the condition scales the features as well as shifting them.
         condition_layer: whether a layer of the condition's own width comes before scale and shift.

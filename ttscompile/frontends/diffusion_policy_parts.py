@@ -53,8 +53,6 @@ class Rebuilt:
         observations: what callers give, by key.
         sample: ``(T, D)``.
         action_dim: Da, the first of D channels.
-        start: first executed step of the chunk.
-        variant: for people.
         known: names of the settings of ``cfg.policy`` that were read, beside those that all have. The others are what
             the policy hands to every step of its scheduler.
     """

@@ -150,9 +150,7 @@ def denoiser(
 
     Args:
         weights: of the policy, without those of an encoder.
-        given: how it is given the observation.
         steps: name of the setting that says how many steps its sample has.
-        start: the first of them that is executed.
     """
     horizon, n_obs_steps = saved.settings.number(steps, most=_MOST_STEPS), saved.settings.number("n_obs_steps")
     if horizon % config.divisor:

@@ -67,7 +67,6 @@ class Family:
         name: of the format, as ``convert`` takes it and ``PolicySpec.source`` keeps it.
         title: of the project, for messages.
         reads: what the user gives, for messages; begins with an article.
-        kind: of thing that a checkpoint is.
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
         module: in this package. Its ``load(path, options)`` gives the network in eval mode and the ``PolicySpec``, and

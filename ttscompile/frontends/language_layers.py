@@ -23,12 +23,8 @@ class LanguageConfig:
     """Sizes of one language model, or of an expert that is built like one.
 
     Attributes:
-        width: of the stream.
         hidden: width inside the feed-forward layers.
-        layers: how many.
-        heads: of queries.
         groups: heads of keys and values.
-        channels: of a head.
         epsilon: of the norms.
         gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
     """

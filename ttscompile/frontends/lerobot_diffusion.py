@@ -43,10 +43,7 @@ class DiffusionConfig(LeRobotConfig):
     """What this type has beside what all have.
 
     Attributes:
-        network: of the denoiser.
-        vision_backbone: name of the ResNet.
         use_group_norm: whether it has group norm in the place of batch norm.
-        keypoints: of the spatial softmax.
         separate_encoders: whether each camera has an encoder of its own.
         resize: (height, width) of images, or None.
         crop: (height, width) of the centre that is cut out of them, or None.

@@ -49,7 +49,6 @@ class MultiTaskDiTConfig(LeRobotConfig):
     """What this type has beside what all have.
 
     Attributes:
-        network: of the denoiser.
         flow: whether the objective is flow matching; diffusion otherwise.
         vision_encoder_name: CLIP, by name or path.
         text_encoder_name: the same, of the text.

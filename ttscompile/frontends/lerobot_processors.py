@@ -57,7 +57,6 @@ class Statistics:
         mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
         first: mean, or the lower end of the range.
         second: standard deviation, or the upper end.
-        eps: of the processor's configuration.
     """
 
     mode: str

@@ -26,7 +26,6 @@ class View:
         resize: ``(height, width)`` that it is brought to; None for none.
         crop: of the centre that is looked at; None for the whole image.
         scale: of each colour, after that.
-        offset: of each colour.
     """
 
     height: int

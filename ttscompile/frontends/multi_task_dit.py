@@ -26,11 +26,8 @@ class DiTConfig:
     """Sizes and variant of the denoiser; the names are those of lerobot's configuration.
 
     Attributes:
-        action_dim: channels of the sample.
         horizon: T.
-        hidden_dim: width.
         num_layers: layers, of an attention and a feed-forward block each.
-        num_heads: attention heads.
         timestep_embed_dim: channels of the timestep's embedding.
         use_positional_encoding: whether learned positions are added to the tokens.
         use_rope: whether queries and keys are rotated by their position.

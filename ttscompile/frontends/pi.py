@@ -37,10 +37,6 @@ class PiConfig:
     """Sizes and variant.
 
     Attributes:
-        vision: of the image encoder.
-        text: of the language model.
-        vocabulary: tokens that there are.
-        expert: of the action expert.
         state: numbers of the state, padded; None in pi0.5, whose instruction holds the state.
         actions: numbers of an action, padded.
         periods: shortest and longest of the timestep's waves.

@@ -30,7 +30,6 @@ class PointNet(nn.Module):
         coloured: whether points have a colour; the MLP is a layer deeper then, which has no norm.
         features: of the vector; None for those of the MLP, without a layer after it.
         norms: whether the MLP has layer norms.
-        last_norm: whether the vector has.
     """
 
     def __init__(self, coloured: bool, features: int | None, norms: bool, last_norm: bool) -> None:

@@ -56,7 +56,6 @@ class Camera:
         shape: ``(C, H, W)`` as they come.
         crop: ``(height, width)`` of the centre that is looked at; None for the whole image.
         scale: of the image's normaliser, one number for all of it.
-        offset: of the same.
     """
 
     shape: tuple[int, int, int]

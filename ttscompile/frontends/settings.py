@@ -33,7 +33,6 @@ class Settings:
     """Entries by name; every method raises CheckpointError, which says what was found and what was expected.
 
     Attributes:
-        values: the entries.
         where: they stand; begins every message, ``cfg.policy.`` or ``config.json: ``.
         remedy: a sentence that ends every message.
     """

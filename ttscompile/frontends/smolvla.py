@@ -40,12 +40,9 @@ class SmolVLAConfig:
     """Sizes and variant.
 
     Attributes:
-        vision: of the image encoder.
         text: of the language model, whose first ``text.layers`` are used.
-        vocabulary: tokens that there are.
         scale: patches along each axis that become one token.
         image: height and width of the images that the encoder sees.
-        expert: of the action expert.
         crosses: whether layer ``i`` of the expert sees the prefix alone; otherwise prefix and actions.
         state: numbers of the state, padded.
         actions: numbers of an action, padded.

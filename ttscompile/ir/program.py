@@ -36,7 +36,6 @@ class Block:
     """One residual block ``x <- x + f(x, context)``.
 
     Attributes:
-        index: position in the order of execution.
         kind: self_attention, cross_attention, feed_forward or a structural signature.
         stream: value that flows in, a_{i-1}.
         result: value that flows out, a_i.
@@ -178,7 +177,6 @@ class Phase:
     """What every phase has.
 
     Attributes:
-        spec: the policy beside its network.
         denoiser: graph of one evaluation: inputs sample, timestep, observations; output the prediction.
         weights: value of every constant of every graph.
         dense_flops: of one call in the original loop as the module makes it: K evaluations, one stream.

@@ -23,7 +23,6 @@ class Contexts:
         streams: value of B, int64 ``[1]``.
         steps: K.
 
-        conditions: condition values by name.
         rows: tables ``[K, ...]`` by name.
         by_step: step values ``[K * B, ...]`` by name, step-major, whatever their axis of streams is.
     """

@@ -47,11 +47,9 @@ class Attention:
     Attributes:
         inputs: names of query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` in float32.
         flat: they are as above, as is the result; else ``[B, heads, tokens, C]``.
-        heads: how many.
         queries: T; zero if only a run says it, and then B is one.
         keys: S.
         channels: C of query and key, and of value.
-        scale: of the scores.
     """
 
     inputs: tuple[str, str, str]

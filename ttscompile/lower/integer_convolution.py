@@ -42,7 +42,6 @@ class Convolution:
         pads: before each axis of ``sizes``, and then after each.
         places: which pixels each place of the result sees, of the padded ones, int32 ``[places * kernel]``; None where
             they are all of them in order.
-        sizes: of the result.
     """
 
     x: str

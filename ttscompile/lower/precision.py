@@ -76,7 +76,6 @@ def parts_to_lower(
     """The parts of a program (``ir.pieces.part_of``) for which another precision is worth while.
 
     Args:
-        program: after all passes.
         keep_fp32: parts that stay as they are; ``prologue`` for all of them but ``blocks``.
 
     Returns:

@@ -74,13 +74,10 @@ class Comparison:
     """The outcome of a comparison.
 
     Attributes:
-        points: in the order of the series.
         calls: held-out calls that each point was measured on.
-        episodes: numbers of the held-out episodes.
         threads: threads that onnxruntime computed with.
         other_noise: mean absolute difference of two dense calls of one observation, in the units of the actions.
         skipped: why a strategy has no plan at a sparsity.
-        warnings: what a reader has to know.
     """
 
     points: tuple[MeasuredPoint, ...]

@@ -33,8 +33,6 @@ class Given:
         episode: recorded observations; None for none.
         comparison: points of one; None for none.
         verification: what was found; see ``verified``.
-        threads: of the calls that are timed.
-        calls: counted ones of each plan.
     """
 
     episode: Episode | None = None

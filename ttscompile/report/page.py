@@ -30,7 +30,6 @@ class Picture:
     """A PNG.
 
     Attributes:
-        caption: under it.
         alt: what it shows, for who cannot see it; empty where the caption says it.
     """
 

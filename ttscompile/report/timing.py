@@ -40,7 +40,6 @@ class Contestant:
         report: the report of the last call; None if there is none, and everything was computed.
         dense_flops: of a call without a report; None where they are not known.
         policy: that runs the plan; None of a network.
-        threads: that it computes with.
     """
 
     label: str
@@ -58,7 +57,6 @@ class Measurement:
     """What the counted calls of one contestant took.
 
     Attributes:
-        times_ms: wall time of each call.
         parts_ms: median of each of ``PARTS``; empty without reports.
         flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
@@ -103,9 +101,6 @@ def measure(
 
     Args:
         entered: at least one; those of one specification get the same observations and noise.
-        calls: counted ones of each.
-        seed: of observations and noise.
-        warm_up: calls of each before these.
         in_a_row: calls that each makes in its turn, of which the last is timed.
     """
     timer = Timer(len(entered), warm_up)

@@ -24,9 +24,7 @@ class Adaptation:
     """Intervals after the search: all but the last linearise, the last one fits.
 
     Attributes:
-        done: whether nothing is left to do.
         pruner: constants of the pruner; None before the last interval, or if no switch helps.
-        switches: how many switches the pruner has.
     """
 
     INTERVALS = 5

@@ -61,7 +61,6 @@ class Schedule:
 
     Attributes:
         computed: bool ``[K]``.
-        score: of the similarities.
     """
 
     computed: BoolArray

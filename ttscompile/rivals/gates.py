@@ -54,7 +54,6 @@ class Gates(NothingAfter):
 
     Attributes:
         plan: the best schedule within the budget so far.
-        loss: its error on some of the calls.
     """
 
     intervals = INTERVALS

@@ -63,7 +63,6 @@ def load_trajectories(
     """Read episodes from files.
 
     Args:
-        observations: what one call of the policy takes.
         action_steps: how many actions of a chunk are executed: the frames between two calls.
         sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
             are called otherwise; ``NAME:N`` are the first N numbers of one.

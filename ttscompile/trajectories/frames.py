@@ -33,7 +33,6 @@ class Frames:
     """What a file holds; arrays are read when they are asked for.
 
     Attributes:
-        names: names of the arrays.
         read: the array ``[F, ...]`` of a name.
         ends: for each episode the frame after its last, increasing.
     """
@@ -48,7 +47,6 @@ class Recording:
     """A data set that is open, in the process that reads it.
 
     Attributes:
-        names: names of the arrays.
         read: the rows of an array by its name, F, and blocks ``[n, ...]`` of them as they are stored.
         ends: for each episode the frame after its last, increasing.
         order: ``[F]`` which stored row is which frame, if they are not in order.
