@@ -67,7 +67,10 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     """All steps of a call in which every stream follows one plan.
 
     Args:
+        network: of the call.
+        plan: lowered.
         keep: bool ``[K, blocks]``; computed residuals that the result holds.
+        advance: the sampler.
         initial: the sample at step 0, ``[B, T, D]``.
         offset: what each step adds to the sample, K of ``[D, B, (1 + S) T]``.
         rollout: entries of the rollout cache that the plan reads, by flat index.
@@ -121,6 +124,7 @@ class _Operands:
     """The residuals that the instructions of a plan work on.
 
     Attributes:
+        current: what each block computed last.
         whole: the sum of all of these, where one step computed them; None where it is not known.
     """
 

@@ -15,6 +15,7 @@ def parse_json(content: bytes, limit: int, *, allow_nan: bool = False) -> Any:
     """Parse UTF-8 JSON without a key twice, numbers that JSON does not have, or absurd size or depth.
 
     Args:
+        content: the document.
         limit: largest accepted size in bytes. Parsed, a document of brackets takes a hundred times its size.
         allow_nan: accept NaN and infinity, as ``json.dumps`` writes them.
 
