@@ -92,6 +92,7 @@ class AsyncExecutor:
 
         Args:
             obs: by key, without the axes of batch and time: ``{"obs": float32 [Do]}``. Copied.
+            t: when it was taken, on the executor's clock; None for now. Frames may come late and out of order.
 
         Raises:
             ObservationError: it does not fit the policy, is not finite, or comes from the future.
@@ -146,6 +147,9 @@ class AsyncExecutor:
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode. Never blocks; nothing that was computed or observed before is played after it.
+
+        Args:
+            seed: of the policy's noise from here on; None goes on with the sequence under way.
 
         Raises:
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.

@@ -83,7 +83,10 @@ class IdleSteps:
         self._prepare.run()
 
     def run(self, first: int, stop: int, updates: Array, offsets: Array, anchors: Sequence[bool]) -> None:
-        """The steps ``first`` to ``stop - 1``, which all add ``total``."""
+        """The steps ``first`` to ``stop - 1``, which all add ``total``.
+
+        Updates are ``[K, G, R, (1 + S) T]``, offsets ``[K, D, B, T]``; ``anchors`` enter the history.
+        """
         dot, add = np.dot, np.add
         (sample, prediction), product, base = self._parts[:2], self._product, self._base
         count, horizon = len(sample), self._horizon

@@ -197,7 +197,7 @@ class ReferenceModel:
         return self._stem(self._bind(self._pieces.stem, sample.to(self.device), k, contexts))[0]
 
     def block(self, b: int, k: int, stream: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
-        """The residual of block b at step k: what is added to the stream, not the sum."""
+        """The residual of block b at step k, for all ``streams`` or these: what is added to the stream, not the sum."""
         blocks = self._blocks if k else self._first
         return blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
 

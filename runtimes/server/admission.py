@@ -64,7 +64,7 @@ class Admission:
         return sum(each.client for each in self._connections.values())
 
     def comes(self, peer: tuple[Any, ...], own: Any = None) -> bool:
-        """Whether the handshake of a new connection may begin."""
+        """Whether the handshake of a connection may begin; both addresses together name it, from here on."""
         network, now = network_of(peer[0]), self._clock()
         waiting = [each.network for each in self._connections.values() if not each.client]
         if self._refused_lately(network, now) >= self.limits.refusals_per_minute:
@@ -91,7 +91,7 @@ class Admission:
         return ""
 
     def answers(self, peer: tuple[Any, ...], status: int, tls: str | None, own: Any = None) -> None:
-        """Note how a handshake was answered."""
+        """Note how a handshake was answered: 101 makes it a client, and 200 is for somebody who watches."""
         connection = self._connections[peer, own]
         connection.answered, connection.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
         no_fault_of_theirs = status in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE)
@@ -176,7 +176,10 @@ class AdmittedSocket(socket.socket):
 
 
 class Pace:
-    """How long a client's next request has to wait, so that it has no more than its share of a second."""
+    """How long a client's next request has to wait, so that it has no more than its share of a second.
+
+    After a quiet second as many may come at once.
+    """
 
     def __init__(self, per_second: float, now: float) -> None:
         self._each = 1 / per_second

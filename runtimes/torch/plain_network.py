@@ -86,7 +86,7 @@ class PlainNetwork:
         return self._at(k, TAIL, stream)
 
     def contexts(self, k: Tensor) -> dict[str, Tensor]:
-        """All that the pieces of the loop read at a step that only the program knows, by name."""
+        """All that the pieces of the loop read at a step that only the program knows, int64 ``[1]``; by name."""
         rows = {name: self._repeated(name, table.index_select(0, k)[0]) for name, table in self._tables.items()}
         known = {**self._weights, **self._condition, **rows}
         return known if self._pieces.step is None else {**known, **self._step_values(known)}

@@ -96,7 +96,7 @@ class Advance:
         return read, added.permute(1, 2, 0, 3)
 
     def jump(self, layers: Sequence[Tensor], read: Tensor | None, history: Tensor) -> Tensor:
-        """What a jump adds, ``[D, B, T]``."""
+        """What a jump adds, ``[D, B, T]``, of ``read [B, F]``, if there is any, and ``history [D, B, 4 T]``."""
         dimensions, streams, _ = history.shape
         value = history.permute(1, 0, 2).reshape(streams, -1)
         value = value if read is None else torch.cat([read, value], 1)
@@ -107,7 +107,7 @@ class Advance:
         return added.reshape(streams, dimensions, self.horizon).permute(1, 0, 2)
 
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
-        """What is carried to step k + 1."""
+        """What is carried to step k + 1, of ``prediction [D, B, T]`` and ``offset [D, B, (1 + S) T]``."""
         clean = None
         if self._clip is not None:
             of_sample, of_prediction = self._to_clean[k]

@@ -118,7 +118,7 @@ class SparseLoop:
         self.begin = Place(0, batches(fitted), batches(judged))
 
     def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
-        """The place after one step more."""
+        """The place after one step more, of one row of a plan for all calls, ``[1, blocks]``, or one for each."""
         batches, anchor = [batch.fork() for batch in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
         ends = np.cumsum([len(batch.sample) for batch in batches])[:-1]
         own = [rows] * len(batches) if len(rows) == 1 else np.split(rows, ends)
@@ -197,7 +197,7 @@ class SparseLoop:
 
 
 class _Batch:
-    """Some of the calls at a place."""
+    """Some of the calls at a place; with ``sums`` residuals are kept as their sum, which is enough for whole steps."""
 
     def __init__(self, executor: Executor, calls: Calls, sums: bool) -> None:
         self._executor, self._calls, self._sums = executor, calls, sums
