@@ -24,7 +24,7 @@ from ttscompile.cli.options import (
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_written
-from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
+from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, NumberOption
 
 
 @click.command(cls=FilesCommand)
@@ -80,11 +80,13 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 @count_option("--rank", "Rank of the low-rank update to each weight matrix, for weights.", default=16)
 @count_option("--updates", "Train weights with so many updates.", default=600)
 @seed_option("Seed of the split, the noise and the training.")
-@number_option(
+@click.option(
     "--max-minutes",
-    MINUTES,
-    "Take the best plan that is found in so many minutes, about. Also decides how many calls are used.",
+    cls=NumberOption,
+    type=MINUTES,
     default=15.0,
+    show_default=True,
+    help="Take the best plan that is found in so many minutes, about. Also decides how many calls are used.",
 )
 @click.option(
     "--device",

@@ -56,6 +56,9 @@ class Fetched:
 def fetch_artifact(text: str) -> Fetched:
     """An artifact: its manifest, and the files that the manifest lists.
 
+    Args:
+        text: ``hf://org/name[@revision][/folder]``.
+
     Raises:
         HubError: there is no such repository, no artifact in it, or no network and nothing in the cache.
         RuntimeUnavailableError: ``huggingface_hub`` is not installed.
@@ -73,6 +76,9 @@ def fetch_artifact(text: str) -> Fetched:
 
 def fetch_checkpoint(text: str) -> Fetched:
     """A checkpoint: a directory of LeRobot, or one ``.ckpt`` file.
+
+    Args:
+        text: ``hf://org/name[@revision][/path]``.
 
     Raises:
         HubError: there is no such repository, no checkpoint in it or several, or no network and nothing in the cache.
@@ -174,7 +180,11 @@ def _licence(card: Path) -> str | None:
 
 
 def library() -> Any:
-    """The package ``huggingface_hub``. Raises RuntimeUnavailableError: it is not installed."""
+    """The package ``huggingface_hub``.
+
+    Raises:
+        RuntimeUnavailableError: it is not installed.
+    """
     try:
         import huggingface_hub
         import huggingface_hub.errors
