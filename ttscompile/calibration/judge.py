@@ -89,9 +89,6 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT, threads: int | None 
     the chunk of another episode, as if the world had changed between two calls; the worse of the two counts.
 
     Args:
-        trials: holding all that the plan names.
-        plan: any that a runtime can execute.
-        part: of the episodes.
         threads: with which its calls are timed; None leaves that out.
 
     Raises:

@@ -105,7 +105,6 @@ class Proposer(Protocol):
 
         Args:
             trials: to learn from (``calls``) and to choose on (``learned``); never ``held_out``.
-            plan: the best so far.
             clock: nothing is begun that would end after its limit, but for what has to be done at least.
 
         Raises:
@@ -136,11 +135,7 @@ class Row:
     consecutive: bool = False
 
     def make(self, request: Request) -> Proposer:
-        """The proposer.
-
-        Raises:
-            ImportError: there is no such module, or it needs a package that is not installed.
-        """
+        """The proposer. Raises ImportError: there is no such module, or it needs a package that is not installed."""
         module, _, name = self.maker.partition(":")
         made: Proposer = getattr(importlib.import_module(f"ttscompile.{module}"), name)(request)
         return made
@@ -160,11 +155,7 @@ NAMES = tuple(row.name for row in PROPOSERS)
 
 
 def rows_of(learn: tuple[str, ...]) -> tuple[Row, ...]:
-    """The rows of these names, in the order of ``PROPOSERS``.
-
-    Raises:
-        CalibrationError: none is of a name, or there is no name.
-    """
+    """The rows of these names, in the order of ``PROPOSERS``."""
     unknown = [name for name in learn if name not in NAMES]
     if unknown or not learn:
         found = repr(unknown[0]) if unknown else "none"
