@@ -56,7 +56,7 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 def read_file(path: Path, limit: int) -> bytes:
     """The content of a file of at most so many bytes; of a larger one these, and one that is too many."""
     with opened(path) as file:
-        return file.read(limit + 1)
+        return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)  # Python allocates what is asked for
 
 
 def check_file(path: Path, record: FileRecord) -> None:

@@ -43,7 +43,7 @@ from .files import check_file, read_file
 from .folder import Folder, Stamp
 from .graph_json import graph_from_json
 from .manifest import MANIFEST, Manifest, PlanRecord, abbreviated
-from .onnx_files import check_model
+from .onnx_files import check_models
 from .requires import check_runtime
 from .size import check_size
 from .strict_json import REMEDY, Value, parse
@@ -268,8 +268,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
             f" {abbreviated(identities(manifest)[0])}. {REMEDY}"
         )
     check_size(manifest, directory)
-    for name in sorted(manifest.models):
-        check_model(directory / name, manifest.files)
+    check_models(directory, manifest.models, manifest.files)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}

@@ -1,13 +1,15 @@
-"""Where the weights of an ONNX model lie, read from its bytes with numpy's dependencies alone, that is, none.
+"""Where the weights of ONNX models lie, and how many parts they have, read with numpy's dependencies alone: none.
 
-onnxruntime opens whatever file a model names beside it. Here each of these names is held against the manifest before
-onnxruntime sees the model: a file of the artifact, whose hash was checked, and a range inside it.
+onnxruntime opens whatever file a model names beside it, and makes an object of a hundred bytes of a message of two.
+Here each of these names is held against the manifest before onnxruntime sees the model: a file of the artifact, whose
+hash was checked, and a range inside it. And all fields are counted, whether they lead to a tensor or not.
 Source: the format of messages, https://protobuf.dev/programming-guides/encoding/, and the field numbers of onnx.proto.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ArtifactError
@@ -15,67 +17,90 @@ from .files import read_file
 from .manifest import FileRecord
 from .strict_json import REMEDY
 
-MAX_BYTES = 512 * 2**20
+MAX_BYTES = 64 * 2**20
+"""Of all models of an artifact, whose weights lie beside them. Push-T has 0.2 MB."""
+MAX_FIELDS = 1_000_000
+"""In all models of an artifact. Push-T has 20,000."""
 MAX_DEPTH = 32
 
-# Fields through which a tensor can be reached, by message; all others are skipped.
+# Fields that hold messages, by message; but for messages of which each has a few numbers and texts only.
 _FIELDS: Mapping[str, Mapping[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
-    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "graph": {1: "node", 5: "tensor", 11: "value", 12: "value", 13: "value", 14: "annotation", 15: "sparse"},
     "training": {1: "graph", 2: "graph"},
-    "function": {7: "node", 11: "attribute"},
-    "node": {5: "attribute"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "function": {7: "node", 11: "attribute", 12: "value"},
+    "node": {5: "attribute", 10: "devices"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 14: "type", 15: "type", 22: "sparse", 23: "sparse"},
     "sparse": {1: "tensor", 2: "tensor"},
+    "tensor": {},
+    "annotation": {},
+    "value": {2: "type"},
+    "type": {1: "array", 4: "item", 5: "map", 8: "array", 9: "item"},
+    "array": {2: "shape"},
+    "shape": {},
+    "item": {1: "type"},
+    "map": {2: "type"},
+    "devices": {2: "sharding"},
+    "sharding": {4: "sharded"},
+    "sharded": {},
 }
 _EXTERNAL_DATA = 13
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
-def check_model(path: Path, files: Mapping[str, FileRecord]) -> None:
-    """Raise unless all weights of a model are in it, or in ranges of the artifact's files, which were checked.
+@dataclass
+class _Left:
+    """How many fields may still be read."""
+
+    fields: int = MAX_FIELDS
+
+
+def check_models(directory: Path, names: Iterable[str], files: Mapping[str, FileRecord]) -> None:
+    """Raise unless all weights of models are in them, or in ranges of the artifact's files, which were checked.
+
+    Args:
+        directory: of the artifact.
+        names: of the models.
+        files: of the artifact.
 
     Raises:
-        ArtifactError: unreadable, no such model, or weights elsewhere.
+        ArtifactError: unreadable, no such model, too much of it, or weights elsewhere.
     """
-    content = read_file(path, MAX_BYTES) if path.suffix == ".onnx" else None
-    if content is None or len(content) > MAX_BYTES:
-        raise ArtifactError(f"{path}: expected a file NAME.onnx of at most {MAX_BYTES} bytes. {REMEDY}")
-    try:
-        places = [_entries(tensor) for tensor in _tensors(memoryview(content), "model", 0)]
-    except (ValueError, IndexError) as error:
-        raise ArtifactError(f"{path}: expected an ONNX model; found a message that ends amiss. {REMEDY}") from error
-    for place in places:
-        if place and not _fits(place, files):
-            raise ArtifactError(
-                f"{path}: expected weights in the model itself or in a range of a file of the artifact; found"
-                f" {str(place)[:200]}. {REMEDY}"
-            )
+    left, names = _Left(), sorted(names)
+    if (total := sum(files[name].bytes for name in names)) > MAX_BYTES:
+        raise ArtifactError(f"{directory}: expected ONNX models of {MAX_BYTES} bytes at most; found {total}. {REMEDY}")
+    for path in (directory / name for name in names):
+        if path.suffix != ".onnx":
+            raise ArtifactError(f"{path}: expected a file NAME.onnx. {REMEDY}")
+        try:
+            for place in _places(memoryview(read_file(path, MAX_BYTES)), "model", 0, left):
+                if not _fits(place, files):
+                    raise ArtifactError(
+                        f"{path}: expected weights in the model itself or in a range of a file of the artifact; found"
+                        f" {str(place)[:200]}. {REMEDY}"
+                    )
+        except (ValueError, IndexError) as error:
+            found = error if left.fields < 0 else "a message that ends amiss"
+            raise ArtifactError(f"{path}: expected an ONNX model; found {found}. {REMEDY}") from error
 
 
-def _tensors(message: memoryview, kind: str, depth: int) -> Iterator[memoryview]:
-    """All tensors below a message."""
+def _places(message: memoryview, kind: str, depth: int, left: _Left) -> Iterator[dict[str, str]]:
+    """The entries of ``external_data`` of each tensor below a message that has not its data itself."""
     if depth > MAX_DEPTH:
         raise ValueError("messages too deep in each other")
-    for number, value in _read(message):
-        below = _FIELDS[kind].get(number)
-        if below == "tensor" and value is not None:
-            yield value
-        elif below is not None and value is not None:
-            yield from _tensors(value, below, depth + 1)
-
-
-def _entries(tensor: memoryview) -> dict[str, str]:
-    """The entries of ``external_data``; empty if the tensor has its data itself."""
-    entries: dict[str, str] = {}
-    for number, value in _read(tensor):
-        if number == _EXTERNAL_DATA and value is not None:
-            fields = {n: bytes(v).decode() for n, v in _read(value) if v is not None}
-            key = fields.get(1, "")
-            if key in entries:
+    fields, entries = _FIELDS[kind], dict[str, str]()
+    for number, value in _read(message, left):
+        if value is None:
+            continue
+        if number in fields:
+            yield from _places(value, fields[number], depth + 1, left)
+        elif kind == "tensor" and number == _EXTERNAL_DATA:
+            texts = {n: bytes(v).decode() for n, v in _read(value, left) if v is not None}
+            if texts.get(1, "") in entries:
                 raise ValueError("an entry twice")
-            entries[key] = fields.get(2, "")
-    return entries
+            entries[texts.get(1, "")] = texts.get(2, "")
+    if entries:
+        yield entries
 
 
 def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:
@@ -87,12 +112,17 @@ def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:
     return int(offset) + int(length) <= files[location].bytes
 
 
-def _read(message: memoryview) -> Iterator[tuple[int, memoryview | None]]:
+def _read(message: memoryview, left: _Left) -> Iterator[tuple[int, memoryview | None]]:
     """Number and content of each field; None for numbers."""
     position, end = 0, len(message)
     while position < end:
+        left.fields -= 1
+        if left.fields < 0:
+            raise ValueError(f"more than {MAX_FIELDS:,} fields in the models of one artifact")
         key, position = _varint(message, position)
         number, wire = key >> 3, key & 7
+        if number == 0:
+            raise ValueError("a field without a number")
         if wire == _BYTES:
             size, position = _varint(message, position)
             if size > end - position:

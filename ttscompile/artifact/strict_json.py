@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from ..core.untrusted_json import parse_json
 from ..errors import ArtifactError
 
-MAX_BYTES = 256 * 2**20
+MAX_BYTES = 64 * 2**20
 REMEDY = "The file was changed or damaged; copy the artifact again, or convert the checkpoint again."
 
 
@@ -40,14 +40,15 @@ class Value:
         missing = [key for key in names if key not in members]
         unknown = [key for key in members if key not in names]
         if missing or unknown:
-            self.fail(f"an object with the keys {', '.join(names)} (missing: {missing}, unknown: {unknown})")
+            found = f"missing: {missing}, unknown: {_shorten(unknown)}"
+            self.fail(f"an object with the keys {', '.join(names)} ({found})")
         return members
 
     def members(self) -> dict[str, Value]:
         """The members of an object with any keys, in order."""
         if not isinstance(self.data, dict):
             self.fail("an object")
-        return {key: Value(item, f"{self.path}.{key}") for key, item in self.data.items()}
+        return {key: Value(item, f"{self.path}.{key:.80}") for key, item in self.data.items()}
 
     def items(self, most: int | None = None) -> list[Value]:
         """The items of a list."""
@@ -100,7 +101,7 @@ def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
         ArtifactError: not such a document.
     """
     try:
-        return Value(parse_json(content, limit), where)
+        return Value(parse_json(content, limit, shown=True), where)
     except ValueError as error:
         raise ArtifactError(f"{where}: expected a JSON document; {error}. {REMEDY}") from None
 
@@ -116,5 +117,5 @@ def dump_compact(data: object) -> bytes:
 
 
 def _shorten(data: object) -> str:
-    text = repr(data)
+    text = ascii(data)
     return text if len(text) <= 80 else f"{text[:77]}..."
