@@ -6,7 +6,8 @@ Nothing but numpy is needed to read one.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -102,67 +103,61 @@ def from_json(root: Value) -> Manifest:
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))
+    uses = _uses(manifest)
     if manifest.precision is not None:
-        _check_precision(manifest, manifest.precision, members["precision"])
-    for name, weights in manifest.weights.items():
-        _check_weights(manifest, weights, members["weights"].members()[name])
+        _check_precision(manifest, manifest.precision, members["precision"], uses)
+    for weights, value in zip(manifest.weights.values(), members["weights"].members().values(), strict=True):
+        _check_weights(manifest, weights, value, uses)
     _check_plans(manifest, members)
     _check_parts(manifest, members)
+    if uses.keys() != manifest.files.keys():
+        members["files"].fail(f"exactly the files {sorted(uses)}")
     return manifest
 
 
 def identities(manifest: Manifest) -> tuple[str, str]:
     """Identity and model identity of what a manifest describes; its own two fields are not read.
 
-    The model identity covers weights, tables, graphs, loops, normalisers, observations, chunk and block table. The
-    identity covers that, the pruner's weights, all fields of all plans by name, which of them is the default, and by
-    name the weights and models that plans may take: a calibration belongs to the model with or without them. Neither
-    covers what people are told: source, FLOPs, reasons, sparsities, errors, calibration record, versions.
+    The model identity covers graphs, weights, tables, loops, normalisers, observations, chunk and block table. The
+    identity covers that, pruners, all fields of all plans by name, which of them is the default, and by name the
+    weights and models that plans may take: a calibration belongs to the model with or without them. Every file stands
+    in them with its name, by which others name it, and its hash. Neither covers what no action depends on: source,
+    FLOPs, reasons, sparsities, calibration record, versions, what is required, and the golden record.
 
     Returns:
         Two sha256 of 64 digits.
     """
-    document = to_json(manifest)
-    hashes = {name: record.sha256 for name, record in manifest.files.items()}
-    pieces = {name: {**piece, "file": hashes[piece["file"]]} for name, piece in document["pieces"].items()}
-    pruners = {
-        name: pieces.pop(name) for name in list(pieces) if name == PRUNER or name.startswith(of_loop(PRUNER, ""))
-    }
-    model = {
-        "spec": {key: value for key, value in document["spec"].items() if key != "source"},
-        "blocks": [{key: block[key] for key in ("kind", "type", "group")} for block in document["blocks"]],
-        "pieces": pieces,
-        "contexts": document["contexts"],
-        "features": document["features"],
-        "tokens": document["tokens"],
-        "program": hashes[manifest.stores.program],
-        "weights": hashes[manifest.stores.weights],
-    }
-    model_identity = _checksum(model)
-    plans = {name: {k: v for k, v in plan.items() if k not in _TOLD} for name, plan in document["plans"].items()}
-    whole: dict[str, Any] = {
+    document, own = to_json(manifest), (PRUNER, of_loop(PRUNER, ""))
+    pieces, stores = document["pieces"], {k: v for k, v in document["stores"].items() if k not in _GOLDEN}
+    of_model = {name: piece for name, piece in pieces.items() if name != own[0] and not name.startswith(own[1])}
+    read = {stores["program"], stores["weights"], *(piece["file"] for piece in of_model.values())}
+    hashes = {name: record.sha256 for name, record in sorted(manifest.acting.items())}
+    model_identity = _checksum(
+        {
+            "spec": {key: value for key, value in document["spec"].items() if key != "source"},
+            "blocks": [{key: block[key] for key in ("kind", "type", "group")} for block in document["blocks"]],
+            "pieces": of_model,
+            **{key: document[key] for key in ("contexts", "features", "tokens")},
+            "stores": {key: stores[key] for key in ("program", "weights")},
+            "files": {name: digest for name, digest in hashes.items() if name in read},
+        }
+    )
+    precision = {k: v for k, v in (document["precision"] or {}).items() if k != "asked"}
+    whole = {
         "model": model_identity,
-        "pruner": [pruners, hashes.get(manifest.stores.pruner or ""), _hashed(manifest.loop_pruners, hashes)],
-        "plans": [hashes.get(manifest.stores.plans or ""), plans],
-        "default_plan": manifest.default_plan,
-        "starts": document["starts"],
-        "weights": {name: _hashed(record, hashes) for name, record in document["weights"].items()},
+        "pieces": {name: piece for name, piece in pieces.items() if name not in of_model},
+        "plans": {n: {k: v for k, v in plan.items() if k not in _TOLD} for n, plan in document["plans"].items()},
+        **{key: document[key] for key in ("default_plan", "loop_pruners", "starts", "weights")},
+        "precision": precision,
+        "stores": stores,
+        "files": hashes,
     }
-    if manifest.precision is not None:
-        whole["precision"] = _hashed({k: document["precision"][k] for k in ("name", "weights", "models")}, hashes)
     return _checksum(whole), model_identity
 
 
+_GOLDEN = ("golden", "golden_plans")
 _TOLD = ("sparsity", "flops_sparsity")
 """Of a plan what people are told and no action depends on."""
-
-
-def _hashed(record: Mapping[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
-    """A record with the hash of every file in place of its name."""
-    return {
-        key: _hashed(value, hashes) if isinstance(value, Mapping) else hashes.get(value, value)
-        for key, value in record.items()
-    }
 
 
 def _check_plans(manifest: Manifest, fields: Mapping[str, Value]) -> None:
@@ -202,8 +197,8 @@ def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
     return None
 
 
-# C901, PLR0912: a condition for each part
-def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # noqa: C901, PLR0912
+# C901: a condition for each part
+def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # noqa: C901
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")
@@ -228,14 +223,6 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")
     if not has_pruner and any(plan.pruned for plan in manifest.plans.values()):
         fields["plans"].fail("no plan of the kind pruner, because there is no piece called pruner")
-    files = {piece.file for piece in manifest.pieces.values()} | {n for n in vars(manifest.stores).values() if n}
-    if manifest.precision is not None:
-        files |= {manifest.precision.weights, *manifest.precision.models.values()}
-    files |= set(manifest.loop_pruners.values())
-    for weights in manifest.weights.values():
-        files |= weights.files
-    if files != set(manifest.files):
-        fields["files"].fail(f"exactly the files {sorted(files)}")
     if manifest.stores.plans is None and any(plan.kind == "schedule" for plan in manifest.plans.values()):
         fields["stores"].fail("a file of plans, because there are schedules")
     if DENSE in manifest.plans:
@@ -262,7 +249,24 @@ def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
             fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")
 
 
-def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) -> None:
+def _uses(manifest: Manifest) -> Counter[str]:
+    """How often each file is named; by pieces, stores and pruners once."""
+    common = {piece.file for piece in manifest.pieces.values()} | set(manifest.loop_pruners.values())
+    uses = Counter(common | {name for name in vars(manifest.stores).values() if name})
+    if manifest.precision is not None:
+        uses.update((manifest.precision.weights, *manifest.precision.models.values()))
+    for one in manifest.weights.values():
+        uses.update((one.weights, *one.models.values(), *one.precision_models.values()))
+        uses.update([one.precision_weights] if one.precision_weights else [])
+    return uses
+
+
+def _require_alone(value: Value, files: Iterable[str], uses: Mapping[str, int]) -> None:
+    if any(uses[name] > 1 for name in files):
+        value.fail("a file for each model and one for the weights, which nothing else uses")
+
+
+def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value, uses: Mapping[str, int]) -> None:
     blocks = set(map(block_name, range(len(manifest.blocks))))
     known = {piece for piece in manifest.pieces if part_of(piece) is not None} | blocks
     models = set(record.models)
@@ -274,13 +278,10 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value) 
         value.fail(f"models called {' and '.join(OF_ALL_BLOCKS)} too")
     if not set(record.asked) <= {part_of(piece) for piece in known} - {part_of(piece) for piece in models}:
         value.fail("parts of the policy that none of its models belongs to, as those that stay fp32")
-    own = {record.weights, *record.models.values()}
-    others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
-    if len(own) <= len(record.models) or own & others:
-        value.fail("a file for each model and one for the weights, which nothing else uses")
+    _require_alone(value, (record.weights, *record.models.values()), uses)
 
 
-def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value) -> None:
+def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value, uses: Mapping[str, int]) -> None:
     known = {*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS}
     if set(record.models) != known:
         value.fail(f"a model of each of {', '.join(sorted(known))}")
@@ -288,13 +289,7 @@ def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value) -> N
     lower = set() if other is None else set(other.models) & known
     if set(record.precision_models) != lower or (record.precision_weights is None) is bool(lower):
         value.fail(f"models in another precision, and a file of their weights, for {sorted(lower) or 'nothing'}")
-    others = {piece.file for piece in manifest.pieces.values()} | set(vars(manifest.stores).values())
-    others |= {file for one in manifest.weights.values() if one is not record for file in one.files}
-    if other is not None:
-        others |= {other.weights, *other.models.values()}
-    count = 1 + len(record.models) + len(record.precision_models) + bool(lower)
-    if len(record.files) != count or record.files & others:
-        value.fail("a file for each model and one for the weights, which nothing else uses")
+    _require_alone(value, record.files, uses)
 
 
 def _checksum(document: object) -> str:

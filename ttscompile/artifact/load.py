@@ -268,7 +268,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
             f" {abbreviated(identities(manifest)[0])}. {REMEDY}"
         )
     check_size(manifest, directory)
-    check_models(directory, manifest.models, manifest.files)
+    check_models(directory, manifest.models, manifest.acting)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}

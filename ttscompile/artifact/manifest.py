@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from ..core.correction import Correction, numbers_of
 from ..core.lattice import PlanArray, plan_flops
 from ..core.plan import ORIGINAL, UNIFORM, TokenReuse
-from ..core.rules import Positive, Rule, Sha256, Share
+from ..core.rules import LoopName, Positive, Rule, Sha256, Share
 from ..core.spec import FP32, PolicySpec, SamplerTable
 from ..ir.graph import TensorType
 from ..ir.pieces import BLOCKS, PRUNER, is_block, part_of
@@ -32,7 +32,11 @@ FileName = Annotated[
         lambda name: re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}", name) and name != MANIFEST,
     ),
 ]
-Version = Annotated[str, Rule("a version like 1.23", re.compile(r"[0-9]+(\.[0-9]+)*").fullmatch)]
+PLAN_NAME = Rule("letters, digits and _ . % -", re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}").fullmatch)
+PlanName = Annotated[str, PLAN_NAME]
+Version = Annotated[str, Rule("a version like 1.23", re.compile(r"[0-9]{1,9}(\.[0-9]{1,9}){0,9}").fullmatch)]
+FEW, MANY = (Rule(f"at most {most} entries", lambda them, most=most: len(them) <= most) for most in (256, 4096))
+"""Of what each is held against the others, and of what there is one a block or a piece. Push-T has 24 blocks."""
 OfContext = Annotated[
     Binding, Rule("table, condition or step", (Binding.TABLE, Binding.CONDITION, Binding.STEP).__contains__)
 ]
@@ -294,22 +298,22 @@ class Manifest:
     identity: Sha256
     model_identity: Sha256
     spec: PolicySpec
-    blocks: tuple[BlockRecord, ...]
-    pieces: Mapping[str, PieceRecord]
-    contexts: Mapping[str, ContextRecord]
+    blocks: Annotated[tuple[BlockRecord, ...], MANY]
+    pieces: Annotated[Mapping[str, PieceRecord], MANY]
+    contexts: Annotated[Mapping[str, ContextRecord], MANY]
     features: tuple[str, ...]
     flops: FlopsRecord
-    plans: Mapping[str, PlanRecord]
+    plans: Annotated[Mapping[PlanName, PlanRecord], FEW]
     default_plan: str
     calibration: Mapping[str, Any] | None
     stores: Stores
     requires: Requires
-    files: Mapping[FileName, FileRecord]
+    files: Annotated[Mapping[FileName, FileRecord], MANY]
     precision: PrecisionRecord | None = None
-    loop_pruners: Mapping[str, FileName] = field(default_factory=dict)
-    starts: Mapping[str, StartRecord] = field(default_factory=dict)
-    weights: Mapping[str, WeightsRecord] = field(default_factory=dict)
-    tokens: Mapping[str, TokensRecord] = field(default_factory=dict)
+    loop_pruners: Annotated[Mapping[LoopName, FileName], FEW] = field(default_factory=dict)
+    starts: Annotated[Mapping[LoopName, StartRecord], FEW] = field(default_factory=dict)
+    weights: Annotated[Mapping[PlanName, WeightsRecord], FEW] = field(default_factory=dict)
+    tokens: Annotated[Mapping[str, TokensRecord], FEW] = field(default_factory=dict)
 
     @property
     def loops(self) -> tuple[str, ...]:
@@ -339,6 +343,12 @@ class Manifest:
         for weights in self.weights.values():
             own |= {*weights.models.values(), *weights.precision_models.values()}
         return own
+
+    @property
+    def acting(self) -> dict[str, FileRecord]:
+        """The files that actions depend on: all but those that only ``verify`` reads."""
+        golden = (self.stores.golden, self.stores.golden_plans)
+        return {name: record for name, record in self.files.items() if name not in golden}
 
     @property
     def steps(self) -> int:

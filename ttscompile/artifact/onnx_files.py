@@ -23,15 +23,16 @@ MAX_FIELDS = 1_000_000
 """In all models of an artifact. Push-T has 20,000."""
 MAX_DEPTH = 32
 
+_SPARSE = "sparse"
 # Fields that hold messages, by message; but for messages of which each has a few numbers and texts only.
 _FIELDS: Mapping[str, Mapping[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
-    "graph": {1: "node", 5: "tensor", 11: "value", 12: "value", 13: "value", 14: "annotation", 15: "sparse"},
+    "graph": {1: "node", 5: "tensor", 11: "value", 12: "value", 13: "value", 14: "annotation", 15: _SPARSE},
     "training": {1: "graph", 2: "graph"},
     "function": {7: "node", 11: "attribute", 12: "value"},
     "node": {5: "attribute", 10: "devices"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 14: "type", 15: "type", 22: "sparse", 23: "sparse"},
-    "sparse": {1: "tensor", 2: "tensor"},
+    "attribute": {5: "tensor", 10: "tensor", 6: "graph", 11: "graph", 14: "type", 15: "type", 22: _SPARSE, 23: _SPARSE},
+    _SPARSE: {1: "tensor", 2: "tensor"},
     "tensor": {},
     "annotation": {},
     "value": {2: "type"},

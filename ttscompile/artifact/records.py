@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,7 @@ from . import tensors
 from .bind import REPORT, interface
 from .codec import plan_fault
 from .load import check_schedule
-from .manifest import BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
+from .manifest import PLAN_NAME, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
 from .strict_json import Value, dump_compact, parse
 from .towers import TokensRecord
 from .typed_json import from_json
@@ -40,7 +39,6 @@ MAX_OPSET, MAX_IR = 23, 11
 """What ``ONNXRUNTIME`` reads: 1.22.1 refuses opset 23, 1.23.2 opens and runs it (tried). Also in pyproject.toml."""
 
 PRUNER_PREFIX = "pruner."
-_PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
 
 
 def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.NDArray[Any]]:
@@ -179,8 +177,8 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
             if plan.cells is None or plan.cells.any() or plan.variant != Variant() or plan.correction is not None:
                 raise ArtifactError("plan 'dense': expected another name, since that is the original policy.")
             continue
-        if _PLAN_NAME.fullmatch(name) is None:
-            raise ArtifactError(f"plan {name!r}: expected letters, digits and _ . % -.")
+        if not PLAN_NAME.holds(name):
+            raise ArtifactError(f"plan {name!r}: expected {PLAN_NAME.expected}.")
         otherwise = None
         if plan.otherwise is not None:
             otherwise = next((other for other, one in plans.items() if one is plan.otherwise), None)

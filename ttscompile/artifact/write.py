@@ -288,7 +288,9 @@ def _fill(
             tokens=records.tokens_records(program),
         )
     )
-    write_synced(folder / MANIFEST, encode(manifest))
+    content = encode(manifest)
+    decode(content)  # refuses what nobody could load
+    write_synced(folder / MANIFEST, content)
     return manifest
 
 

@@ -11,8 +11,8 @@ from typing import Any, NoReturn
 MAX_DEPTH = 64
 """Levels below the root, which is level 0."""
 MAX_VALUES = 500_000
-"""Values below the root, counted by what stands before one; Push-T has 12,000 in its graphs. Parsed, an empty object takes
-fifty times its bytes, and a reader of records some microseconds."""
+"""Values below the root, counted by what stands before one. Push-T has 12,000 in its graphs. Parsed, an empty object
+takes fifty times its bytes, and a reader of records takes some microseconds for it."""
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 _NOT_SHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -39,7 +39,9 @@ def parse_json(content: bytes, limit: int, *, allow_nan: bool = False, shown: bo
     with suppress(RecursionError):
         data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, **numbers)
         level = [data]
-        unseen = None if content.isascii() and b"\\" not in content else _NOT_SHOWN if shown else _NO_TEXT
+        unseen = (
+            None if content.isascii() and not re.search(rb"[\\\x7f]", content) else _NOT_SHOWN if shown else _NO_TEXT
+        )
         for _ in range(MAX_DEPTH + 1):
             if unseen is not None:
                 _require_shown(level, unseen)
