@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 
+from ..core.zip_files import open_zip
 from ..errors import ArtifactError
 from ..measure.process import Process
 from .codec import MAX_MANIFEST_BYTES, decode
@@ -70,7 +71,7 @@ def unpack(path: Path) -> Unpacked:
     except OSError as error:
         raise _no_room(path, error) from error
     try:
-        with opened(path) as file, zipfile.ZipFile(file) as archive:
+        with opened(path) as file, open_zip(file) as archive:
             _extract(archive, path, unpacked.path)
     except _UNREADABLE as error:
         unpacked.remove()
@@ -93,7 +94,7 @@ def is_checkpoint(path: Path) -> bool:
     if path.is_dir():
         return (path / "config.json").is_file() and not (path / MANIFEST).exists()
     try:
-        with zipfile.ZipFile(path) as archive:
+        with path.open("rb") as file, open_zip(file) as archive:
             return any(PurePosixPath(name).name == "data.pkl" for name in archive.namelist())  # of torch.save
     except _UNREADABLE:
         return path.suffix in (".ckpt", ".pt", ".pth", ".safetensors")

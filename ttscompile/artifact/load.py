@@ -269,6 +269,8 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
         )
     check_size(manifest, directory)
     check_models(directory, manifest.models, manifest.acting)
+    others = sorted(manifest.files.keys() - manifest.models - {manifest.stores.program})
+    tensors.require_few((directory / name for name in others), directory)
     stored = tensors.read(directory / manifest.stores.weights)
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}

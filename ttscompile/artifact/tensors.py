@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.untrusted_json import MAX_VALUES, most_values
 from ..errors import ArtifactError
 from .files import opened, write_synced
 from .strict_json import REMEDY, Value, parse
@@ -77,19 +78,38 @@ def read_header(path: Path) -> dict[str, Entry]:
         return _header(file, path)
 
 
-def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
+def require_few(paths: Iterable[Path], where: object) -> None:
+    """Raise if the headers of these files together have more values than JSON may have.
+
+    Raises:
+        ArtifactError: they have, or are none.
+    """
+    total = 0
+    for path in paths:
+        with opened(path) as file:
+            total += most_values(_content(file, path))
+    if total > MAX_VALUES:
+        raise ArtifactError(f"{where}: expected headers with at most {MAX_VALUES:,} values; found {total:,}. {REMEDY}")
+
+
+def _content(file: BufferedReader, path: Path) -> bytes:
+    """The JSON of a header."""
     size = os.fstat(file.fileno()).st_size
     prefix = file.read(_PREFIX)
     length = int.from_bytes(prefix, "little")
     if len(prefix) < _PREFIX or length > min(MAX_HEADER_BYTES, size - _PREFIX):
         raise _error(path, f"a header of at most {MAX_HEADER_BYTES} bytes inside the file", f"{size} bytes")
-    content = file.read(length)
+    return file.read(length)
+
+
+def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
+    content, size = _content(file, path), os.fstat(file.fileno()).st_size
     root = parse(content, path.name, MAX_HEADER_BYTES)
     members = root.members()
     if "__metadata__" in members:
         for value in members.pop("__metadata__").members().values():
             value.text()
-    start = _PREFIX + length
+    start = _PREFIX + len(content)
     entries = sorted(
         ((name, _entry(value, start)) for name, value in members.items()),
         key=lambda item: (item[1].offset, item[1].length),

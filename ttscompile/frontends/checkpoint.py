@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
+from ..core.zip_files import open_zip
 from ..errors import CheckpointError
 
 _DEEPEST = 64  # nesting of a configuration; a real one has about 6 levels, a cycle has no end
@@ -108,7 +109,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _require_stored(path: Path) -> None:
     """Raise if reading the archive could take more memory than the file has bytes: ``torch.save`` never compresses."""
-    with zipfile.ZipFile(path) as archive:
+    with path.open("rb") as file, open_zip(file) as archive:
         entries = archive.infolist()
     compressed = [entry.filename for entry in entries if entry.compress_type != zipfile.ZIP_STORED]
     total, size = sum(entry.file_size for entry in entries), path.stat().st_size

@@ -14,6 +14,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NoReturn
 
+from ..core.zip_files import open_zip
 from ..errors import CheckpointError
 from .settings import read_json
 
@@ -175,7 +176,7 @@ def refuse_file(path: Path) -> None:
     if not zipfile.is_zipfile(path):
         return
     try:
-        with zipfile.ZipFile(path) as archive:
+        with path.open("rb") as file, open_zip(file) as archive:
             names = archive.namelist()
     except (zipfile.BadZipFile, NotImplementedError, OSError, ValueError):
         return  # a damaged archive, which the reader of checkpoints describes

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from ..core.paths import require_path
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values
+from ..core.zip_files import open_zip
 from ..errors import TrajectoryError
 from .frames import Frames, few, observation_frames, one_error, require_proportion
 from .sandbox import sandboxed_frames
@@ -158,6 +160,9 @@ def read_npz(path: Path) -> dict[str, Array]:
     hint = f": no such file, truncated, or with Python objects in it, which are never loaded. Record it again. {_SAVEZ}"
     # numpy parses headers as Python text, and raises whatever its parts raise; it leaves open what is no archive.
     with one_error(f"{path}: cannot be read as .npz", hint), path.open("rb") as handle:
+        if zipfile.is_zipfile(handle):
+            open_zip(handle).close()  # which numpy does without a limit
+        handle.seek(0)
         file = np.load(handle, allow_pickle=False)
         if not isinstance(file, np.lib.npyio.NpzFile):
             raise TrajectoryError(f"{path}: expected an .npz with several arrays; found a single one. {_SAVEZ}.")
