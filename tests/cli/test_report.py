@@ -181,8 +181,8 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     manifest = artifact.manifest
     spec = replace(manifest.spec, source={HOSTILE: HOSTILE}, sampler=replace(manifest.spec.sampler, name=HOSTILE))
     blocks = tuple(replace(block, kind=HOSTILE, reason=HOSTILE) for block in manifest.blocks)
-    record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE, "other": HOSTILE}, "skipped": {HOSTILE: HOSTILE}}
-    record |= {"told": {HOSTILE: HOSTILE, "weights": [HOSTILE]}, "learned": [HOSTILE, HOSTILE]}
+    record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE}, "skipped": {HOSTILE: HOSTILE}}
+    record |= {"told": {HOSTILE: HOSTILE}, "learned": [HOSTILE, HOSTILE]}
     plans = {HOSTILE: manifest.plans["schedule"]}
     manifest = replace(manifest, spec=spec, blocks=blocks, plans=plans, default_plan=HOSTILE, calibration=record)
     artifact = replace(

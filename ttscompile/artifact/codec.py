@@ -32,11 +32,13 @@ from ..ir.pieces import (
     tokens_name,
 )
 from . import typed_json
+from .calibration_record import check_record
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, PrecisionRecord, WeightsRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
 from .upgrade import upgraded
 
-MAX_MANIFEST_BYTES = 32 * 2**20
+MAX_MANIFEST_BYTES, MAX_MANIFEST_VALUES = 32 * 2**20, 200_000
+"""Of Push-T it has 41 KB and 2,000 values."""
 
 
 def encode(manifest: Manifest) -> bytes:
@@ -51,7 +53,7 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
     Raises:
         ArtifactError: no manifest, another schema version, or one that was changed or damaged.
     """
-    document = {key: member.data for key, member in parse(content, where, MAX_MANIFEST_BYTES).members().items()}
+    document = _document(content, where)
     if document.get("format") != FORMAT:
         raise ArtifactError(
             f"{where}: expected the manifest of a ttscompile artifact (format {FORMAT!r}); found another document."
@@ -77,6 +79,11 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
     return replace(manifest, identity=identity, model_identity=model_identity)
 
 
+def _document(content: bytes, where: str) -> dict[str, Any]:
+    parsed = parse(content, where, MAX_MANIFEST_BYTES, MAX_MANIFEST_VALUES)
+    return {key: member.data for key, member in parsed.members().items()}
+
+
 def is_as_written(manifest: Manifest, content: bytes) -> bool:
     """Whether these bytes are how ttscompile writes a manifest, or wrote it in the schema before, which says the same.
 
@@ -84,7 +91,7 @@ def is_as_written(manifest: Manifest, content: bytes) -> bool:
         manifest: what ``decode`` made of the bytes.
         content: of ``manifest.json``.
     """
-    document = {key: member.data for key, member in parse(content, MANIFEST, MAX_MANIFEST_BYTES).members().items()}
+    document = _document(content, MANIFEST)
     return content == (encode(manifest) if document["schema_version"] == SCHEMA_VERSION else dump(document))
 
 
@@ -103,6 +110,8 @@ def from_json(root: Value) -> Manifest:
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))
+    if manifest.calibration is not None:
+        check_record(members["calibration"])
     uses = _uses(manifest)
     if manifest.precision is not None:
         _check_precision(manifest, manifest.precision, members["precision"], uses)

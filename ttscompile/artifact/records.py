@@ -24,6 +24,7 @@ from ..ir.layers import layers_graph
 from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
+from .calibration_record import check_record
 from .codec import plan_fault
 from .load import check_schedule
 from .manifest import PLAN_NAME, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
@@ -219,7 +220,9 @@ def calibration_record(record: Mapping[str, Any]) -> dict[str, Any]:
         content = dump_compact(dict(record))
     except (TypeError, ValueError) as error:
         raise ArtifactError(f"calibration record: expected JSON; found {error}. Convert arrays to lists.") from error
-    return {key: value.data for key, value in parse(content, "calibration record").members().items()}
+    read = parse(content, "calibration record")
+    check_record(read)
+    return dict(read.data)
 
 
 def _interfaces(program: Program) -> dict[str, PieceRecord]:

@@ -43,6 +43,8 @@ def _bytes(manifest: Manifest) -> Iterator[int]:
         yield math.prod(spec.shape) * np.dtype(spec.dtype).itemsize
     for context in manifest.contexts.values():
         yield _nbytes(context.type) * (1 if context.binding is Binding.CONDITION else steps)
+    for plan in manifest.plans.values():
+        yield manifest.steps_of(plan.loop) * len(manifest.blocks)  # cells
     for block in manifest.blocks:
         yield 4 * _nbytes(block.type)
     for tokens in manifest.tokens.values():

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from ..core.untrusted_json import parse_json
+from ..core.untrusted_json import MAX_VALUES, parse_json
 from ..errors import ArtifactError
 
 MAX_BYTES = 64 * 2**20
@@ -89,19 +89,20 @@ class Value:
         return number
 
 
-def parse(content: bytes, where: str, limit: int = MAX_BYTES) -> Value:
+def parse(content: bytes, where: str, limit: int = MAX_BYTES, values: int = MAX_VALUES) -> Value:
     """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
 
     Args:
         content: the document.
         where: name of the file, for messages.
         limit: largest accepted size in bytes.
+        values: largest accepted number of values.
 
     Raises:
         ArtifactError: not such a document.
     """
     try:
-        return Value(parse_json(content, limit, shown=True), where)
+        return Value(parse_json(content, limit, values=values, shown=True), where)
     except ValueError as error:
         raise ArtifactError(f"{where}: expected a JSON document; {error}. {REMEDY}") from None
 

@@ -56,13 +56,14 @@ def from_json(kind: type[Record], value: Value) -> Record:
     Raises:
         ArtifactError: not such a record; says where, what was expected, and what was found.
     """
-    return cast(Record, _read(kind, value))
+    return cast(Record, read_as(kind, value))
 
 
-def _read(kind: Any, value: Value) -> Any:
+def read_as(kind: Any, value: Value) -> Any:
+    """A value of any type that a field of a record may have; see ``from_json``."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        found = _read(arguments[0], value)
+        found = read_as(arguments[0], value)
         for rule in arguments[1:]:
             if not rule.holds(found):
                 value.fail(rule.expected)
@@ -77,10 +78,10 @@ def _read(kind: Any, value: Value) -> Any:
         return _tuple(arguments, value)
     if origin is not None and issubclass(origin, Mapping):
         key, item = arguments
-        return {_read(key, Value(name, value.path)): _read(item, one) for name, one in value.members().items()}
+        return {read_as(key, Value(name, value.path)): read_as(item, one) for name, one in value.members().items()}
     if kind is TensorType:
         parts = value.keys("dtype", "shape")
-        return TensorType(tuple(map(_size, parts["shape"].items())), _read(DType, parts["dtype"]))
+        return TensorType(tuple(map(_size, parts["shape"].items())), read_as(DType, parts["dtype"]))
     if isinstance(kind, enum.EnumMeta):
         members = {str(one.value): one for one in cast(type[enum.Enum], kind)}
         return members[value.text(*members)]
@@ -99,7 +100,7 @@ def _read(kind: Any, value: Value) -> Any:
 def _record(kind: Any, value: Value) -> Any:
     hints = _hints(kind)
     members = value.keys(*hints)
-    read = {name: _read(hint, members[name]) for name, hint in hints.items()}
+    read = {name: read_as(hint, members[name]) for name, hint in hints.items()}
     try:
         return kind(**read)
     except SpecError as error:
@@ -119,16 +120,16 @@ def _read_either(kinds: tuple[Any, ...], value: Value) -> Any:
     rest = [kind for kind in kinds if kind is not types.NoneType]
     listed = [kind for kind in rest if get_origin(kind) in (tuple, np.ndarray)]
     single = [kind for kind in rest if kind not in listed]
-    return _read((listed if listed and (isinstance(value.data, list) or not single) else single)[0], value)
+    return read_as((listed if listed and (isinstance(value.data, list) or not single) else single)[0], value)
 
 
 def _tuple(kinds: tuple[Any, ...], value: Value) -> tuple[Any, ...]:
     items = value.items()
     if kinds[1:] == (...,):
-        return tuple(_read(kinds[0], item) for item in items)
+        return tuple(read_as(kinds[0], item) for item in items)
     if len(items) != len(kinds):
         value.fail(f"a list of {len(kinds)}")
-    return tuple(_read(kind, item) for kind, item in zip(kinds, items, strict=True))
+    return tuple(read_as(kind, item) for kind, item in zip(kinds, items, strict=True))
 
 
 def _array(value: Value) -> npt.NDArray[Any]:

@@ -289,7 +289,7 @@ def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) 
     """Plans that may have been learned from the episodes that they are judged on here."""
     found = []
     for name, one in {"this artifact": artifact, **others}.items():
-        held_out = ((one.manifest.calibration or {}).get("episodes") or {}).get("validation")
+        held_out = (one.manifest.calibration or {}).get("episodes", {}).get("validation")
         if one.manifest.plans and (held_out is None or tuple(held_out) != split.validation):
             found.append(
                 f"{name}: its calibration held out the episodes {held_out}, and this comparison"

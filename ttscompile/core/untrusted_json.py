@@ -18,12 +18,15 @@ _NO_TEXT = re.compile("[\ud800-\udfff]")
 _NOT_SHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-def parse_json(content: bytes, limit: int, *, allow_nan: bool = False, shown: bool = False) -> Any:
+def parse_json(
+    content: bytes, limit: int, *, values: int = MAX_VALUES, allow_nan: bool = False, shown: bool = False
+) -> Any:
     """Parse UTF-8 JSON without a key twice, numbers or texts that JSON does not have, or absurd size, number or depth.
 
     Args:
         content: the document.
         limit: largest accepted size in bytes.
+        values: largest accepted number of values, as ``most_values`` counts them.
         allow_nan: accept NaN and infinity, as ``json.dumps`` writes them.
         shown: refuse texts and keys that a terminal does not show as they are: control characters, and those that turn
             the direction of writing.
@@ -33,8 +36,8 @@ def parse_json(content: bytes, limit: int, *, allow_nan: bool = False, shown: bo
     """
     if len(content) > limit:
         raise ValueError(f"it has more than {limit:,} bytes")
-    if most_values(content) > MAX_VALUES:
-        raise ValueError(f"it has more than {MAX_VALUES:,} values")
+    if most_values(content) > values:
+        raise ValueError(f"it has more than {values:,} values")
     numbers: dict[str, Any] = {} if allow_nan else {"parse_constant": _no_constant, "parse_float": _finite}
     with suppress(RecursionError):
         data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, **numbers)

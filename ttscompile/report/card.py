@@ -65,7 +65,7 @@ def read_success(path: Path, identity: str) -> list[Success]:
             )
             for each in own
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ReportError(f"{path}: {expected}; found {type(error).__name__}: {error!s:.200}.") from error
     if not found:
         raise ReportError(f"{path}: no variant in it has the identity {identity[:12]}. Evaluate this artifact again.")
@@ -147,10 +147,8 @@ def _errors(manifest: Manifest) -> Section:
     record = manifest.calibration
     if record is None or not facts.scores(record):
         return Section("Error", ("It was not calibrated: every call is dense, and does what the base does.",))
-    calls, episodes = record.get("calls"), record.get("episodes")
-    held = calls.get("validation") if isinstance(calls, Mapping) else None
-    of = episodes.get("validation") if isinstance(episodes, Mapping) else None
-    told = f" ({held} calls of {len(of)} episodes)" if isinstance(held, int) and isinstance(of, list) else ""
+    held, of = (record.get(key, {}).get("validation") for key in ("calls", "episodes"))
+    told = f" ({held} calls of {len(of)} episodes)" if held is not None and of is not None else ""
     text = (
         f"Of the actions, in their units, on recorded episodes that nothing was learned from{told}, against the dense"
         " policy with the same noise: the mean over calls, and the 90th percentile."
@@ -205,14 +203,11 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     more += f" --prediction-horizon {spec.sample[0]}" * (spec.left_out > 0)
     lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{more}{precision}"]
     if record is not None:
-        options = [("strategy", "strategy"), ("seed", "seed")]
-        told = {name: record[key] for name, key in options if isinstance(record.get(key), str | int)}
-        budget = record.get("budget")
+        told, budget = {key: record[key] for key in ("strategy", "seed") if key in record}, record.get("budget", {})
         goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
-        asked = {k: budget[k] for k in goals if isinstance(budget, Mapping) and isinstance(budget.get(k), int | float)}
+        asked = {key: budget[key] for key in goals if budget.get(key) is not None}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
-        learned = record.get("learned")
-        if isinstance(learned, list) and learned not in ([], ["schedule"]):
+        if (learned := record.get("learned", [])) not in ([], ["schedule"]):
             words += f" --learn {','.join(map(_word, learned[:8]))}"
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
     lines.append("ttscompile verify DIR")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from ..errors import ReportError
 from ..measure.points import Point
 
 MAX_BYTES = 16 * 2**20
+_LARGEST = 1e300
 _REMEDY = "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed."
 
 
@@ -20,7 +20,7 @@ def read_comparison(path: Path) -> tuple[Point, ...]:
     require_path(path, ReportError, _REMEDY)
     try:
         with path.open("rb") as file:
-            document: Any = parse_json(file.read(MAX_BYTES + 1), MAX_BYTES)
+            document: Any = parse_json(file.read(MAX_BYTES + 1), MAX_BYTES, shown=True)
     except (OSError, ValueError) as error:
         raise ReportError(f"{path}: no JSON document: {error}. {_REMEDY}") from error
     document = document.get("comparison") if isinstance(document, dict) else None
@@ -41,4 +41,4 @@ def read_comparison(path: Path) -> tuple[Point, ...]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST

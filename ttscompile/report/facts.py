@@ -217,7 +217,7 @@ def plan_table(artifact: Artifact) -> Table:
 def score_table(record: Mapping[str, Any]) -> Table:
     """What calibration measured on episodes that it did not learn from."""
     compared = "of_other_noise"
-    told = any(isinstance(score.get(compared), int | float) for score in scores(record).values())
+    told = any(score.get(compared) is not None for score in scores(record).values())
 
     def row(name: str, score: Mapping[str, Any], *saved: str) -> tuple[str, ...]:
         beside = (_figure(score, compared, ".2f"),) if told else ()
@@ -233,7 +233,7 @@ def score_table(record: Mapping[str, Any]) -> Table:
 
 def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
     """A number of a score; empty where it has none."""
-    return format(score[key], form) if isinstance(score.get(key), int | float) else ""
+    return "" if score.get(key) is None else format(score[key], form)
 
 
 def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -243,7 +243,7 @@ def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What became of what was learned, in the words of what learns it; and that a plan is another network."""
-    told = {str(name): one for name, one in _mapping(record.get("told")).items() if isinstance(one, str) and one}
+    told = {name: one for name, one in record.get("told", {}).items() if one}
     network = (
         "A plan with weights of its own is another network. So its errors say less about it than those of other plans:"
         " evaluate it on your task."
@@ -254,7 +254,7 @@ def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
 def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What the errors can be held against, and what that has meant for the task."""
     apart = record.get("other_noise")
-    if not isinstance(apart, int | float):
+    if apart is None:
         return ()
     told = (
         f"Two dense calls with different noise are {apart:.4g} apart on these episodes. On five policies errors up to"
@@ -267,7 +267,7 @@ def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
     """Why there is no plan of a name that calibration could have made."""
-    return tuple(f"Plan {name!r}: none, {reason}." for name, reason in _mapping(record.get("skipped")).items())
+    return tuple(f"Plan {name!r}: none, {reason}." for name, reason in record.get("skipped", {}).items())
 
 
 def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
@@ -286,16 +286,9 @@ def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
 def scores(
     record: Mapping[str, Any] | None, wanted: tuple[str, ...] = ("sparsity", "flops_saved")
 ) -> Mapping[str, Mapping[str, Any]]:
-    """Of each plan that calibration judged, if its figures are there: a record is free JSON of whoever made it."""
-    return {
-        str(name): score
-        for name, score in _mapping((record or {}).get("plans")).items()
-        if isinstance(score, Mapping) and all(isinstance(score.get(key), int | float) for key in wanted)
-    }
-
-
-def _mapping(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
+    """Of each plan that calibration judged, if its figures are there."""
+    judged = (record or {}).get("plans", {}).items()
+    return {name: score for name, score in judged if all(score.get(key) is not None for key in wanted)}
 
 
 def limits(artifact: Artifact) -> Section:

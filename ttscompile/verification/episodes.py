@@ -172,7 +172,5 @@ def _run(
 
 def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:
     """``error`` or ``error_p90`` that calibration measured for a plan on held-out calls; None if it did not."""
-    scores = (calibration or {}).get("plans")
-    score = scores.get(name) if isinstance(scores, Mapping) else None
-    found = score.get(key) if isinstance(score, Mapping) else None  # free JSON, by whoever made the artifact
-    return float(found) if isinstance(found, int | float) else None
+    found = (calibration or {}).get("plans", {}).get(name, {}).get(key)
+    return None if found is None else float(found)
