@@ -13,6 +13,7 @@ from ttscompile.artifact.golden import load_golden
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import engaged
+from ttscompile.verification.episodes import ROUNDING, allowed
 from ttscompile.verification.rung import FAILED, PASSED, Rung
 
 
@@ -35,21 +36,38 @@ class Timed:
         self.calls += 1
         slowed = 10 if self._draw.random() < self._busy else 1
         self.now += self._seconds.get(plan, self._seconds["dense"]) * slowed
-        return self._policy.predict_action(obs, noise=noise, plan=plan)
+        return self._policy.predict_action(obs, noise=noise, plan="schedule" if plan == "uniform" else plan)
 
     @property
     def last_report(self) -> Any:
         return self._policy.last_report
 
 
-def judged(directory: Path, schedule: float, dense: float = 1.0, busy: float = 0.0) -> tuple[Rung, int]:
-    """The rung with a single plan of so many seconds a call, and how many calls were made."""
+def judged(
+    directory: Path, schedule: float, dense: float = 1.0, busy: float = 0.0, name: str = "", default: str = "schedule"
+) -> tuple[Rung, int]:
+    """The rung with a single plan of so many seconds a call, under another name too, and how many calls were made."""
     artifact = load_artifact(directory)
-    plans = {"schedule": artifact.manifest.plans["schedule"]}
-    artifact = replace(artifact, manifest=replace(artifact.manifest, plans=plans))
-    policy = Timed(ttscompile.load(directory, seed=0), {"dense": dense, "schedule": schedule}, busy)
+    plans = dict.fromkeys(filter(None, ("schedule", name)), artifact.manifest.plans["schedule"])
+    artifact = replace(artifact, manifest=replace(artifact.manifest, plans=plans, default_plan=default))
+    policy = Timed(ttscompile.load(directory, seed=0), {"dense": dense, "schedule": schedule, name: schedule}, busy)
     rung = engaged.check_engaged(artifact, load_golden(artifact), policy, lambda: policy.now)  # type: ignore[arg-type]
     return rung, policy.calls
+
+
+def test_the_baseline_is_no_default(sound: Path) -> None:
+    assert judged(sound, 0.25, name="uniform", default="schedule")[0].status == PASSED
+    rung, _ = judged(sound, 0.25, name="uniform", default="uniform")
+    assert rung.status == FAILED
+    assert "plan 'uniform' is the default, and is the baseline of comparisons" in rung.told
+
+
+@pytest.mark.parametrize(
+    ("promised", "calls", "expected"), [(2.0, 32, 6.0), (2.0, 33, 4.0), (1e-9, 32, 0.02), (None, 1, float("inf"))]
+)
+def test_a_promise_that_is_too_good_is_kept_to(promised: float | None, calls: int, expected: float) -> None:
+    """Two calls with other noise are 20 apart."""
+    assert allowed(promised, ROUNDING * 20, calls)[1] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("schedule", [1.0, 1.1, 0.96])

@@ -11,7 +11,7 @@ from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..artifact.manifest import PlanRecord
 from ..core.lattice import sparsity
-from ..core.plan import DENSE, FULL
+from ..core.plan import DENSE, FULL, UNIFORM
 from ..core.spec import Noise
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
@@ -80,6 +80,8 @@ def check_engaged(
         name: _fault(plan := manifest.plans[name], one, manifest.steps_of(plan.loop) * len(manifest.blocks))
         for name, one in found.items()
     }
+    if manifest.default_plan == UNIFORM:
+        judged[UNIFORM] = "is the default, and is the baseline of comparisons: evenly spaced steps, not calibrated"
     faults = [f"plan {name!r} {fault}" for name, fault in judged.items() if fault]
     name = manifest.default_plan if manifest.default_plan in found else next(iter(found))
     figure = (found[name].executed, None, "of the cells")

@@ -26,8 +26,9 @@ which are of a few episodes, whose calls are alike."""
 
 FEW = 32
 
-NEGLIGIBLE = 0.05
-"""Share of the yardstick below which an error is no worse than calibrated, however small that one was."""
+ROUNDING, NEGLIGIBLE = 0.001, 0.05
+"""Share of the yardstick below which an error, or a distance, is no worse than calibrated: other processors round
+otherwise, and distances are estimates."""
 
 Progress = Callable[[str], None]
 """Told what is being done."""
@@ -92,14 +93,13 @@ def check_episodes(
         remedy = "Give recorded episodes with --trajectories to have this judged."
         return Rung(SPARSITY, SKIPPED, found, finite(error), None, UNIT, remedy, details=details)
     promised, promised_p90 = (_promised(manifest.calibration, name, key) for key in ("error", "error_p90"))
-    noise, unit = other_noise, UNIT
+    noise, unit, least = other_noise, UNIT, ROUNDING * other_noise
     if unpaired is not None:
-        error, noise, unit = unpaired.distance, 1.0, OF_NOISE
+        error, noise, unit, least = unpaired.distance, 1.0, OF_NOISE, NEGLIGIBLE
         promised, promised_p90 = _promised(manifest.calibration, name, "distance"), None
         found += f". It is of another loop, in which the same noise means something else: by two draws {error:.3g} away"
     beyond = max(noise, promised_p90 or 0.0)
-    factor = FEW_AS_CALIBRATED if calls <= FEW else AS_CALIBRATED
-    worse = float("inf") if promised is None else max(factor * promised, NEGLIGIBLE * noise)
+    factor, worse = allowed(promised, least, calls)
     reasons = list[str]()
     if not error <= beyond:
         reasons.append("more than other noise would change")
@@ -168,6 +168,16 @@ def _run(
         scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
         for pair, both in zip(own, zip(dense, other, strict=True), strict=True):
             unpaired.add(*(np.stack(each) * scale for each in (pair, both)))
+
+
+def allowed(promised: float | None, least: float, calls: int) -> tuple[float, float]:
+    """How often the error that calibration measured a plan's may be, and what that comes to.
+
+    An error is recorded by whoever made the artifact: one that is better than what is measured is no excuse, however
+    small both are.
+    """
+    factor = FEW_AS_CALIBRATED if calls <= FEW else AS_CALIBRATED
+    return factor, float("inf") if promised is None else max(factor * promised, least)
 
 
 def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:
