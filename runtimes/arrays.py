@@ -55,8 +55,8 @@ def read_observation(
         raise ObservationError(f"the observation is a {type(obs).__name__}; expected {expected}.")
     given = {key: value for key in specs if (value := obs.get(key, _MISSING)) is not _MISSING}
     if len(given) < len(specs) or (not others and len(obs) != len(specs)):
-        missing, unexpected = sorted(specs.keys() - given.keys()), sorted(map(str, obs.keys() - specs.keys()))
-        found = f"{sorted(map(str, obs))} (missing: {missing}, unexpected: {unexpected})"
+        names = [sorted(map(str, each))[:20] for each in (obs, specs.keys() - given.keys(), obs.keys() - specs.keys())]
+        found = "{:.400} (missing: {:.400}, unexpected: {:.400})".format(*map(str, names))
         remedy = "Give exactly the keys that the policy was compiled for."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)

@@ -130,7 +130,7 @@ class FleetServer(Listener):
                 "idle_timeout": self._limits.idle_timeout,
             }
         plan = self._plans.known(request.params.get("plan") or self._plans.default)
-        obs = self._checked(request.params["obs"])
+        obs = await self.apart(request.large, self._checked, request.params["obs"])
         if self._waiting >= self._most:
             problem = f"{self._waiting} requests are under way, and that is how many may be"
             raise OverloadedError(f"{problem}. Ask again later, or let the fleet have more copies.")

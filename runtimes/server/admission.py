@@ -105,6 +105,11 @@ class Admission:
         if (connection := self._connections.get((peer, own))) is not None:
             connection.requests += 1
 
+    def offends(self, peer: tuple[Any, ...], own: Any = None) -> None:
+        """Count a client that is cut off as a handshake that failed."""
+        if (connection := self._connections.get((peer, own))) is not None:
+            self._refuse(connection.network)
+
     def leaves(self, peer: tuple[Any, ...], own: Any = None) -> None:
         """Forget a connection whose socket is closed."""
         connection = self._connections.pop((peer, own), None)

@@ -54,7 +54,8 @@ class ExecutorServer(Listener):
         """See ``Listener``."""
         executor, params = self._executor, request.params
         if request.method == "observe":
-            executor.observe(read_frame(params["obs"], executor.frames), params.get("t"))
+            frame = await self.apart(request.large, read_frame, params["obs"], executor.frames)
+            executor.observe(frame, params.get("t"))
             return {}
         if request.method == "action":
             t, timeout = params.get("t"), params.get("timeout") or 0.0

@@ -10,10 +10,12 @@ from ttscompile.core.coercion import integer
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
 
-_COUNTS = ("clients", "message_bytes", "handshakes", "handshakes_per_address", "refusals_per_minute")
+_COUNTS = ("clients", "message_bytes", "message_values", "handshakes", "handshakes_per_address", "refusals_per_minute")
 
 NUMBER_BYTES = 8
 """Of a message for each number of an observation: a float32 in base64 takes 5.4 bytes, a pixel in digits takes four."""
+VALUES = 3
+"""Of a message for each number of an observation: lists of one number have a bracket and a comma beside it."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +25,14 @@ class ServerLimits:
     Attributes:
         clients: at a time.
         message_bytes: largest size of a request.
+        message_values: most values of its JSON, numbers of lists among them.
         handshake_timeout: seconds for the opening handshake, and before that as many for TLS.
         idle_timeout: seconds between two complete requests.
         send_timeout: seconds that a client may take to read an answer, once its socket's buffers are full.
         action_timeout: seconds that a client may wait for an action.
         clients_per_address: of the clients, those of one address (of IPv6, one network of 64 bits); None for all.
+        control_per_second: pings and fragments without content of one client, with a second's worth at once; one that
+            sends more is cut off.
         requests_per_second: of one client, with a second's worth at once; the rest waits its turn.
         handshakes: connections that are not clients yet, at a time.
         handshakes_per_address: of these, those of one address.
@@ -37,11 +42,13 @@ class ServerLimits:
 
     clients: int = 8
     message_bytes: int = 1 << 20
+    message_values: int = 20_000
     handshake_timeout: float = 5.0
     idle_timeout: float = 60.0
     send_timeout: float = 5.0
     action_timeout: float = 30.0
     clients_per_address: int | None = None
+    control_per_second: float = 100.0
     requests_per_second: float = 2000.0
     handshakes: int = 64
     handshakes_per_address: int = 16
@@ -49,9 +56,10 @@ class ServerLimits:
 
     @classmethod
     def of(cls, observations: Mapping[str, ObservationSpec], clients: int) -> ServerLimits:
-        """Limits of a server that is sent such observations; a message may have 1 MiB at least."""
+        """Limits of a server that is sent such observations; a message may have 1 MiB and 20,000 values at least."""
         numbers = sum(prod(one.shape) for one in observations.values())
-        return cls(clients, max(cls.message_bytes, NUMBER_BYTES * numbers + (1 << 16)))
+        size, values = NUMBER_BYTES * numbers + (1 << 16), VALUES * numbers + 1000
+        return cls(clients, max(cls.message_bytes, size), max(cls.message_values, values))
 
     def __post_init__(self) -> None:
         for name in (*_COUNTS, *(["clients_per_address"] if self.clients_per_address is not None else [])):

@@ -16,6 +16,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from contextlib import ExitStack
+from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ from .admission import Admission, AdmittingSocket, Pace
 from .limits import ServerLimits
 from .lock import Lock
 from .metrics import CONTENT_TYPE, Metric, exposition
-from .protocol import Methods, Request, answer, failure, read_request
+from .protocol import LARGE, Methods, Request, answer, failure, read_request
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -72,6 +73,10 @@ class Listener(ABC):
     def metrics(self) -> list[Metric]:
         """What ``/metrics`` shows beside what every server counts."""
 
+    async def apart(self, large: bool, call: Callable[..., Any], *arguments: Any) -> Any:
+        """What a function gives; where it has much to do in a thread, so that other clients are served meanwhile."""
+        return await asyncio.to_thread(call, *arguments) if large else call(*arguments)
+
     def end(self) -> None:  # noqa: B027  # some servers hold nothing
         """Called once, when the server has ended."""
 
@@ -100,6 +105,8 @@ class Listener(ABC):
         port = integer(port, "port", ExecutorError, 0, 65535)
         try:
             from websockets.asyncio.server import serve
+
+            from .connection import CountedConnection
         except ModuleNotFoundError as error:
             problem = f"the server needs {error.name}, which is not installed"
             raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[serve]'.") from error
@@ -123,6 +130,7 @@ class Listener(ABC):
                 ping_interval=None,  # clients stay simple; the idle timeout finds those that are gone
                 max_size=limits.message_bytes,
                 max_queue=1,
+                create_connection=partial(CountedConnection, self._admission, limits),
                 logger=quiet,
                 ssl=tls,
                 **timeouts,
@@ -251,7 +259,8 @@ class Listener(ABC):
     async def _reply(self, text: str | bytes) -> str:
         request_id, method, outcome = None, "unknown", "ok"
         try:
-            request = read_request(text, self.methods)
+            large = len(text) > LARGE
+            request = await self.apart(large, read_request, text, self.methods, self._limits.message_values)
             request_id, method = request.id, request.method
             return answer(request_id, await self.do(request))
         except TtscompileError as error:

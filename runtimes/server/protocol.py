@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ttscompile.core.untrusted_json import MAX_VALUES, most_values
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import Array, FrameSpec
 
@@ -32,26 +33,34 @@ DTYPES = {
 """What a packed array may be of, by each of its names: ``uint8``, ``|u1``, ``u1``."""
 KINDS = {"b": "biu", "i": "iu", "u": "iu", "f": "iuf"}
 """By the kind of an expected dtype: the kinds that the numbers of lists may have."""
+LARGE = 1 << 15
+"""Characters of a message that is read beside the event loop, which then serves others meanwhile."""
 MOST_SECONDS = 1e15
 """Times are less than this, either way."""
 
 
 class Request(NamedTuple):
-    """A request: what the client called it, which is sent back; one of the methods; its parameters, checked so far."""
+    """A request: what the client called it, which is sent back; one of the methods; its parameters, checked so far.
+
+    ``large`` says that reading it takes longer than others should wait.
+    """
 
     id: int | str | None
     method: str
     params: Mapping[str, Any]
+    large: bool = False
 
 
-def read_request(text: str | bytes, methods: Methods = METHODS) -> Request:
-    """Read one message.
+def read_request(text: str | bytes, methods: Methods = METHODS, values: int = MAX_VALUES) -> Request:
+    """Read one message of at most so many values.
 
     Raises:
         ProtocolError: it is no request; ``request_id`` is set on the error if the message had one.
     """
     if isinstance(text, bytes):
         raise ProtocolError("a request is a text message, not a binary one.")
+    if most_values(text.encode(errors="replace")) > values:
+        raise ProtocolError(f"a request has at most {values} values.")
     try:
         document = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
@@ -62,7 +71,7 @@ def read_request(text: str | bytes, methods: Methods = METHODS) -> Request:
     if not (name is None or isinstance(name, str) or (isinstance(name, int) and not isinstance(name, bool))):
         raise ProtocolError("a request's id is a number without fraction, a string, or left out.")
     try:
-        return Request(name, *_checked(document, methods))
+        return Request(name, *_checked(document, methods), len(text) > LARGE)
     except ProtocolError as error:
         error.request_id = name  # type: ignore[attr-defined]
         raise
@@ -95,12 +104,12 @@ def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
 
 
 def read_arrays(obs: Mapping[str, Any], dtypes: Mapping[str, str]) -> dict[str, Array]:
-    """The arrays of an observation, by key, of these dtypes where they are lists.
+    """The arrays of an observation, by key, of these dtypes where they are lists; of other keys nothing is read.
 
     Raises:
         ProtocolError: something is no array.
     """
-    return {key: _array(key, value, dtypes.get(key, "float32")) for key, value in obs.items()}
+    return {key: _array(key, one, dtypes[key]) if key in dtypes else np.zeros(0) for key, one in obs.items()}
 
 
 def _array(key: str, value: Any, dtype: str) -> Array:
