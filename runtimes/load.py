@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 
-from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.files import check_file
+from ttscompile.artifact.load import Artifact, load_artifact, read_manifest
+from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.core.paths import on_hub
 from ttscompile.core.plan import Plan
-from ttscompile.errors import ArtifactChangedError
+from ttscompile.errors import ArtifactChangedError, ArtifactError
 from ttscompile.hub import fetch_artifact
 
 from .arrays import check_seed
@@ -38,8 +39,8 @@ def load(
         runtime: ``onnxruntime``; ``torch``, which needs torch and computes on any device that it has; or ``reference``,
             which is slow and needs torch.
         threads: threads of arithmetic, of this policy alone. 1 computes on the caller's thread and makes none. With
-            more, ``threads - 1`` of them look for work for 50 us after each block, and then sleep: a loaded policy that
-            is not called takes no processor time.
+            more, ``threads - 1`` are made for single blocks and as many for whole steps. They look for work for 50 us
+            after each block, and then sleep: a loaded policy that is not called takes no processor time.
         seed: of the noise that is drawn when none is given; None for another sequence every time.
         plan: what ``predict_action`` computes when it is given no plan: the name of a plan of the artifact, ``dense``
             among them, or a ``ttscompile.Plan``; None for the artifact's default.
@@ -67,9 +68,25 @@ def load(
         return open_policy(load_artifact(path), runtime, threads, seed, plan, device, tokenizer, origin)
 
     for _ in range(TRIES - 1):
-        with suppress(ArtifactChangedError):
+        try:
             return once()
+        except ArtifactChangedError:
+            continue
+        except ArtifactError:
+            if origin is None or not _damaged(Path(path)):
+                raise
+            fetch_artifact(origin, anew=True)  # a file of the cache, where the library looks at names alone
     return once()
+
+
+def _damaged(folder: Path) -> bool:
+    """Whether a file is not what the manifest says."""
+    try:
+        for name, record in read_manifest(folder).files.items():
+            check_file(folder / name, record)
+    except ArtifactError:
+        return (folder / MANIFEST).is_file()
+    return False
 
 
 def open_policy(

@@ -9,6 +9,11 @@ def main(prog_name: str | None = None) -> None:
         from ttscompile.cli import main as commands
     except KeyboardInterrupt:
         sys.exit(130)
+    except (MemoryError, ImportError, SystemError, OSError) as error:  # SystemError: Python's own, without memory
+        sys.stderr.write(
+            f"ttscompile cannot be loaded: {type(error).__name__}: {error!s:.200}. Is there memory for it?\n"
+        )
+        sys.exit(2)
     commands(prog_name=prog_name)
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
+from numbers import Real
 from types import TracebackType
 from typing import Any, Self
 
@@ -96,11 +97,12 @@ class AsyncExecutor:
 
         Raises:
             ObservationError: it does not fit the policy, is not finite, or comes from the future.
+            ExecutorError: ``t`` is no number.
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
         worker = self._here()
-        frame = self._resolved.frames.check(obs)
+        frame, t = self._resolved.frames.check(obs), _seconds(t, "t")
         with worker.lock:
             state = self._checked()
             now = self._clock.now()
@@ -121,10 +123,11 @@ class AsyncExecutor:
         Raises:
             DeadlineMissedError: there is none, and the last one was held for as long as it may be.
             StaleObservationError: the same, because no recent observation came.
+            ExecutorError: ``t`` or ``timeout`` is no number.
             WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
             ExecutorClosedError: after ``close``.
         """
-        worker = self._here()
+        worker, t, timeout = self._here(), _seconds(t, "t"), _seconds(timeout, "timeout")
         with worker.lock:
             state = self._checked()
             start = now = self._clock.now()
@@ -280,3 +283,9 @@ class AsyncExecutor:
             raised = f"a call raised {type(failure).__name__}: {failure}"
             remedy = "Stop the robot safely; close this executor, and make another one when the cause is gone."
             raise WorkerDeadError(f"the thread that owns the policy has ended, because {raised}. {remedy}") from failure
+
+
+def _seconds(value: Any, what: str) -> Any:
+    if value is None or isinstance(value, Real):
+        return value
+    raise ExecutorError(f"{what} is a number of seconds on the executor's clock, or None; found {value!r:.80}.")

@@ -169,6 +169,9 @@ def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool) 
                 "other code of this process has made onnxruntime's global thread pool, and with it onnxruntime"
                 " refuses sessions with threads of their own. Load the policy in another process."
             ) from error
+        if "escapes model directory" in str(error):
+            problem = "a file beside it is a link that leads out of the artifact's folder"
+            raise ArtifactError(f"{path}: {problem}. Put the file there: cp -L.") from error
         raise ArtifactError(
             f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
             f" artifact asks for (>= {view.manifest.requires.onnxruntime}), or convert the checkpoint again."

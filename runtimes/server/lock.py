@@ -91,12 +91,15 @@ def read_token(path: Path) -> str:
     """The text of a file that holds a token and nothing else.
 
     Raises:
-        ExecutorError: there is no such file, or it is no text.
+        ExecutorError: there is no such file, it is too large, or it is no text.
     """
     require_path(path, ExecutorError, "Give a file with a token in it.")
     try:
         with path.open("rb") as file:
-            return file.read(MOST_BYTES + 1).decode("ascii")
+            content = file.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise ExecutorError(f"{path}: has more than {MOST_BYTES} bytes. Give a file with a token and nothing else.")
+        return content.decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "it is no text of plain letters"
         raise ExecutorError(f"{path}: cannot be read: {why}. Give a file with a token in it.") from error

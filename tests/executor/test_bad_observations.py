@@ -10,7 +10,7 @@ import pytest
 
 from ttscompile import Affine, ObservationSpec
 from ttscompile.core.values import check_values
-from ttscompile.errors import ObservationError, StaleObservationError
+from ttscompile.errors import ExecutorError, ObservationError, StaleObservationError
 from ttscompile.runtimes.executor import ExecutorSettings
 from ttscompile.runtimes.executor.window import FrameSpec
 
@@ -121,3 +121,17 @@ def test_a_frame_is_copied_before_it_is_looked_at(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr("ttscompile.runtimes.executor.window.check_values", spoiled)
     assert FrameSpec.of({"obs": ObservationSpec((2,))}, 1).check({"obs": given})["obs"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("wrong", ["x", [1.0], {}, 1j, np.zeros(2)])
+def test_times_are_numbers(wrong: Any) -> None:
+    with World() as world:
+        world.begin()
+        with pytest.raises(ExecutorError, match="t is a number of seconds"):
+            world.executor.observe({"obs": np.zeros(2)}, wrong)
+        with pytest.raises(ExecutorError, match="t is a number of seconds"):
+            world.executor.action(wrong)
+        with pytest.raises(ExecutorError, match="timeout is a number of seconds"):
+            world.executor.action(None, wrong)
+        world.tick()
+        world.executor.action(np.float32(world.clock.now()))

@@ -1,6 +1,7 @@
 """Some of what ``surroundings.py`` tries: each is a process, so that the suite has no time for all of them."""
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -54,3 +55,13 @@ def test_what_is_left_behind_is_found(tmp_path: Path) -> None:
     assert judged(0, "", tmp_path) == ""
     (tmp_path / f".page.html.{os.getpid():08x}.partial").touch()
     assert judged(0, "", tmp_path).startswith("left behind")
+
+
+def test_without_memory_to_be_loaded_the_program_says_so() -> None:
+    """Python's own errors come out of an import then, of several kinds."""
+    code = "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (150_000_000, 150_000_000));"
+    code += "from ttscompile.__main__ import main; sys.argv = ['ttscompile', 'inspect', 'nothing']; main()"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.splitlines()[-1].startswith("ttscompile cannot be loaded: ")
+    assert "Traceback" not in result.stderr

@@ -149,8 +149,14 @@ def test_what_is_no_token_is_refused_and_not_shown(token: str) -> None:
 
 def test_a_token_file_is_a_small_text(tmp_path: Path) -> None:
     (tmp_path / "token").write_bytes(b"\xff" * 30)
+    (tmp_path / "large").write_text("x" * 4097)
     os.mkfifo(tmp_path / "pipe")
-    for name, why in (("token", "it is no text"), ("pipe", "found a pipe"), ("none", "does not exist")):
+    for name, why in (
+        ("token", "it is no text"),
+        ("large", "has more than 4096 bytes"),
+        ("pipe", "found a pipe"),
+        ("none", "does not exist"),
+    ):
         with pytest.raises(ExecutorError, match=why):
             read_token(tmp_path / name)
 

@@ -92,6 +92,10 @@ class PathName(click.Path):
         if not _is_text(text):
             why = "is no text in UTF-8, and onnxruntime takes no other names. Rename it, or name it by a link."
             self.fail(f"{os.fsencode(text)!r:.300} {why}", param, ctx)
+        if on_hub(text):
+            self.fail(
+                f"{text:.200} is on the hub, and this takes what is on this machine: download it first.", param, ctx
+            )
         try:
             Path(text).stat()
         except (FileNotFoundError, NotADirectoryError):

@@ -53,11 +53,12 @@ class Fetched:
     licence: str | None
 
 
-def fetch_artifact(text: str) -> Fetched:
+def fetch_artifact(text: str, anew: bool = False) -> Fetched:
     """An artifact: its manifest, and the files that the manifest lists.
 
     Args:
         text: ``hf://org/name[@revision][/folder]``.
+        anew: whether to download what the cache has already, as where it is damaged.
 
     Raises:
         HubError: there is no such repository, no artifact in it, or no network and nothing in the cache.
@@ -71,7 +72,7 @@ def fetch_artifact(text: str) -> Fetched:
         if not manifest.is_file():
             raise HubError(f"{text}: there is no {MANIFEST} in it, so it is no artifact.")
         chosen = [inside + each for each in _listed(manifest, text)]
-        return _fetched(hub, name, text, folder.name, chosen)
+        return _fetched(hub, name, text, folder.name, chosen, anew)
 
 
 def fetch_checkpoint(text: str) -> Fetched:
@@ -124,7 +125,7 @@ def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
     raise HubError(f"{text}: there is no checkpoint in it; {expected}; found {has}.")
 
 
-def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str]) -> Fetched:
+def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str], anew: bool = False) -> Fetched:
     """Download these files, and nothing of another kind."""
     if len(chosen) > MOST_FILES:
         raise HubError(f"{text}: it lists {len(chosen)} files; expected {MOST_FILES} at most.")
@@ -132,16 +133,16 @@ def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str])
         if not plain(each) or not each.endswith(_ENDS):
             raise HubError(f"{text}: {each!r:.200} is no file of an artifact or a checkpoint.")
     # Patterns that are plain names match themselves, and nothing else.
-    folder = _snapshot(hub, name.repository, commit, [*_ABOUT, *chosen])
+    folder = _snapshot(hub, name.repository, commit, [*_ABOUT, *chosen], anew)
     if missing := [each for each in chosen if not (folder / each).is_file()]:
         raise HubError(f"{text}: {missing[0]} is not there: the repository is not whole.")
     single = len(chosen) == 1 and chosen[0].endswith(_CHECKPOINT)
     return Fetched(folder / (chosen[0] if single else name.inside), name.at(commit), _licence(folder / CARD))
 
 
-def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str]) -> Path:
+def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str], anew: bool = False) -> Path:
     """The folder of a commit in the cache, which has its name, with these files of those that there are."""
-    return Path(hub.snapshot_download(repository, revision=revision, allow_patterns=files))
+    return Path(hub.snapshot_download(repository, revision=revision, allow_patterns=files, force_download=anew))
 
 
 def _listing(hub: Any, repository: str, commit: str) -> list[str]:
