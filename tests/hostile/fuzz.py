@@ -247,7 +247,7 @@ def _warm_up(target: str, make: Callable[..., Callable[[], None]], corpus: Path,
     from tests.hostile import messages
     from tests.hostile.targets import READ_APART, outcome
 
-    if target in ("checkpoint", "lerobot", "artifact", "mixed"):
+    if target in ("checkpoint", "lerobot", "artifact", "swollen", "mixed"):
         import torch
 
         torch.set_num_threads(1)

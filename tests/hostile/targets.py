@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
-from tests.hostile import dataset_changes, forged, hdf5_changes, messages, pickles, zarr_changes
+from tests.hostile import dataset_changes, forged, hdf5_changes, messages, pickles, swollen, zarr_changes
 from tests.hostile.archives import write, write_hostile
 from tests.hostile.hdf5_changes import SECRET
 from tests.hostile.mutate import changed, damaged
@@ -29,6 +29,12 @@ def artifact(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], Non
     if rng.random() < 0.25:
         return _damaged_artifact(rng, path)
     return forged.artifact(rng, path)
+
+
+def swell(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """A directory or a zip, sound in form and far too large; see ``swollen``."""
+    source = rng.choice(sorted((corpus / "artifacts").iterdir()))
+    return swollen.artifact(rng, Path(shutil.copytree(source, folder / "compiled")))
 
 
 def _damaged_artifact(rng: random.Random, path: Path) -> Callable[[], None]:
@@ -181,6 +187,7 @@ def state(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
 
 TARGETS: dict[str, Case] = {
     "artifact": artifact,
+    "swollen": swell,
     "zip": zipped,
     "checkpoint": checkpoint,
     "lerobot": lerobot,
