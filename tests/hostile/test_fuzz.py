@@ -1,14 +1,20 @@
 """A few hundred cases of the fuzzer; the record of the long run is in docs/security.md."""
 
 import json
+import random
+import resource
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from tests.artifact.tiny import write_tiny
+from tests.hostile import swollen
 from tests.hostile.corpus import make
-from tests.hostile.guard import Violation
+from tests.hostile.fuzz import LIMIT
+from tests.hostile.guard import MORE_BYTES, Violation, address_space
 from tests.hostile.targets import Accepted, outcome
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,6 +31,21 @@ def test_nothing_but_errors_of_its_own(tmp_path: Path) -> None:
     assert (result.returncode, result.stderr, lines[:-1]) == (0, "", [])
     assert lines[-1]["refused"] + lines[-1]["accepted"] == CASES
     assert min(lines[-1]["refused"], lines[-1]["accepted"]) > 20
+
+
+@pytest.mark.parametrize("case", range(8))
+def test_an_artifact_that_is_swollen_takes_no_more_than_is_promised(tmp_path: Path, case: int) -> None:
+    """The first cases of many: ``python -m tests.hostile.fuzz --target swollen --cases 2500``."""
+    write_tiny(tmp_path / "compiled")
+    use = swollen.artifact(random.Random(case), tmp_path / "compiled")
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (address_space() + MORE_BYTES, hard))
+    began = time.process_time()
+    try:
+        outcome(use)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert time.process_time() - began < LIMIT
 
 
 def test_a_case_that_is_no_error_of_its_own_is_a_defect() -> None:
