@@ -18,7 +18,7 @@ from collections.abc import Callable, Coroutine
 from contextlib import ExitStack
 from functools import partial
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError, TtscompileError
@@ -130,7 +130,7 @@ class Listener(ABC):
                 ping_interval=None,  # clients stay simple; the idle timeout finds those that are gone
                 max_size=limits.message_bytes,
                 max_queue=1,
-                create_connection=partial(CountedConnection, self._admission, limits),
+                create_connection=cast(Any, partial(CountedConnection, self._admission, limits)),
                 logger=quiet,
                 ssl=tls,
                 **timeouts,

@@ -18,7 +18,7 @@ from tests.hostile import forged
 from tests.hostile.mutate import NUMBERS, TEXTS, _places, anything, nested
 
 COUNTS = (3, 300, 5_000, 60_000, 400_000)
-TINY = ([], {}, 0, "", None, [[]], {"a": []}, 1e300, 10**400, "x" * 50)
+TINY: tuple[Any, ...] = ([], {}, 0, "", None, [[]], {"a": []}, 1e300, 10**400, "x" * 50)
 HIDDEN = ("\x1b[31m", "a\nb", "\u202e", "\ud800", "\x9b2J", "\x07")
 RECORD = ("plans", "learned", "told", "skipped", "episodes", "calls", "other_noise", "budget", "seed", "strategy")
 FIELDS = (1, 2, 3, 5, 7, 8, 11, 13, 14, 16, 20, 25)

@@ -231,7 +231,13 @@ def test_cells_that_no_file_holds(written: Path) -> None:
         piece = document["pieces"]["block_00"]
         document["pieces"] |= {f"block_{i:02d}": piece for i in range(1000)}
         del document["files"]["block_01.onnx"]
-        record = {"kind": "all", "loop": "original", "weights": "original", "precision": {}, "tokens": None}
+        record: dict[str, Any] = {
+            "kind": "all",
+            "loop": "original",
+            "weights": "original",
+            "precision": {},
+            "tokens": None,
+        }
         record |= {"otherwise": None, "sparsity": 0.0, "flops_sparsity": 0.0}
         document["plans"] = {f"p{i}": record for i in range(200)}
 

@@ -19,6 +19,8 @@ from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.protocol import LARGE, read_request
 
+PATIENT = replace(LIMITS, idle_timeout=30.0, handshake_timeout=10.0, send_timeout=10.0)
+"""So that it does not matter what else the machine does."""
 PING = b"\x89\x80mask"
 EMPTY = {"pings": PING, "pongs": b"\x8a\x80mask", "fragments": b"\x00\x80mask"}
 
@@ -27,29 +29,33 @@ EMPTY = {"pings": PING, "pongs": b"\x8a\x80mask", "fragments": b"\x00\x80mask"}
 def test_frames_without_content_have_a_pace(kind: str) -> None:
     """100 at once are answered; a few hundred more than that in no time are the end of this client alone."""
     begin = b"\x01\x80mask" if kind == "fragments" else b""
-    with serving() as url, connected(url) as other:
+    with serving(limits=PATIENT) as url, connected(url) as other:
         with raw(url) as sock:
             sock.sendall(handshake() + begin + 50 * EMPTY[kind])
             time.sleep(0.05)
             assert other("info")["n_obs_steps"] == 2
             if kind != "fragments":  # which are half a message
                 sock.sendall(struct.pack("!BB", 0x81, 0x80 | 20) + bytes(4) + b'{"method": "info"}  ')
-                assert b'"n_obs_steps": 2' in sock.recv(65536) + sock.recv(65536)
+                found = b""
+                while b'"n_obs_steps": 2' not in found:
+                    found += sock.recv(65536)
         with raw(url) as sock:
             sock.sendall(handshake())
-            began, sent = time.monotonic(), 0
-            with pytest.raises(OSError):  # noqa: PT012  # reset, or a broken pipe
-                while time.monotonic() - began < 10:
+            sent, ended = 0, False
+            while not ended and sent < 50 * 1000 * len(EMPTY[kind]):
+                try:
                     sent += sock.send(begin + 1000 * EMPTY[kind])
-                    assert other("info")["n_obs_steps"] == 2
-            assert sent < 50 * 1000 * len(EMPTY[kind])
+                except OSError:  # reset, or a broken pipe
+                    ended = True
+                assert other("info")["n_obs_steps"] == 2
+            assert ended
         assert other("info")["n_obs_steps"] == 2
 
 
 def test_others_are_answered_while_pings_come() -> None:
     """The flood is cut off within its first bytes, over and over: an answer takes as long as without it, but for tens
     of milliseconds where the flood was just read."""
-    with serving(limits=replace(LIMITS, clients=8)) as url, connected(url) as other:
+    with serving(limits=replace(PATIENT, clients=8)) as url, connected(url) as other:
         done = Event()
 
         def flood() -> None:
@@ -77,7 +83,7 @@ def test_others_are_answered_while_pings_come() -> None:
 
 
 def test_an_address_that_floods_is_cut_off() -> None:
-    with serving(limits=replace(LIMITS, refusals_per_minute=2)) as url, connected(url) as other:
+    with serving(limits=replace(PATIENT, refusals_per_minute=2)) as url, connected(url) as other:
         for _ in range(2):
             with raw(url) as sock:
                 sock.sendall(handshake() + 5000 * PING)
@@ -97,7 +103,7 @@ def test_large_fragments_are_no_flood() -> None:
         + piece
         for i, piece in enumerate(pieces)
     ]
-    with serving(limits=replace(LIMITS, message_bytes=1 << 20)) as url, connected(url) as call:
+    with serving(limits=replace(PATIENT, message_bytes=1 << 20)) as url, connected(url) as call:
         call._socket.sendall(b"".join(frames))
         assert json.loads(call._receive())["result"]["n_obs_steps"] == 2
 
@@ -118,7 +124,7 @@ def test_a_request_has_as_many_values_as_its_observation_may_need() -> None:
 
 def test_many_keys_are_refused_and_hinder_nobody() -> None:
     document = {"method": "observe", "obs": {f"k{i}": [0] for i in range(9_000)}}
-    with serving(limits=replace(LIMITS, message_bytes=1 << 20)) as url, connected(url) as call:
+    with serving(limits=replace(PATIENT, message_bytes=1 << 20)) as url, connected(url) as call:
         call._send(client.TEXT, json.dumps(document).encode())
         error = json.loads(call._receive())["error"]
         assert error["type"] == "ObservationError"

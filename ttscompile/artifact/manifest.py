@@ -6,8 +6,9 @@ Frozen records; ``codec`` writes and reads them. ``docs/design.md`` section 5.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from ..core.correction import Correction, numbers_of
@@ -25,6 +26,11 @@ SCHEMA_VERSION = 11
 MANIFEST = "manifest.json"
 _SHOWN = 12
 
+
+def _at_most(most: int, them: Sized) -> bool:
+    return len(them) <= most
+
+
 FileName = Annotated[
     str,
     Rule(
@@ -35,7 +41,7 @@ FileName = Annotated[
 PLAN_NAME = Rule("letters, digits and _ . % -", re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}").fullmatch)
 PlanName = Annotated[str, PLAN_NAME]
 Version = Annotated[str, Rule("a version like 1.23", re.compile(r"[0-9]{1,9}(\.[0-9]{1,9}){0,9}").fullmatch)]
-FEW, MANY = (Rule(f"at most {most} entries", lambda them, most=most: len(them) <= most) for most in (256, 4096))
+FEW, MANY = (Rule(f"at most {most} entries", partial(_at_most, most)) for most in (256, 4096))
 """Of what each is held against the others, and of what there is one a block or a piece. Push-T has 24 blocks."""
 OfContext = Annotated[
     Binding, Rule("table, condition or step", (Binding.TABLE, Binding.CONDITION, Binding.STEP).__contains__)

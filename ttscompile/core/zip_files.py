@@ -34,7 +34,7 @@ def open_zip(file: IO[bytes]) -> zipfile.ZipFile:
         BadZipFile: none that can be read, or one with too many entries.
     """
     limited = _Limited(file)
-    archive = zipfile.ZipFile(limited)  # type: ignore[arg-type]  # all that it asks of a file
+    archive = zipfile.ZipFile(limited)  # all that it asks of a file
     if (found := len(archive.filelist)) > MAX_ENTRIES:
         raise zipfile.BadZipFile(f"expected at most {MAX_ENTRIES:,} entries; found {found:,}")
     limited.limit = None
