@@ -84,7 +84,7 @@ def test_the_hand_made_file_is_good(tmp_path: Path) -> None:
         ({"a": entry(shape=[-2])}, "at least 0"),
         ({"a": entry(shape=[2**62, 2**62])}, "begin, begin"),
         ({"a": entry(shape=[2**64])}, "64-bit"),
-        ({"a": entry(shape=[1] * 17, end=4)}, "at most 16 sizes"),
+        ({"a": entry(shape=[1] * 17, end=4)}, "at most 16 items"),
         ({"a": entry(shape=[True, 2])}, "integer"),
         ({"a": entry(begin=8, end=16)}, "'a' at byte"),
         ({"a": entry(begin=8, end=0)}, "begin, begin"),

@@ -117,7 +117,10 @@ def _exchange(rng: random.Random, path: Path, document: Any) -> Any:
 
 
 def _program(rng: random.Random, path: Path, document: Any) -> Any:
-    content = json.loads((path / "program.json").read_text())
+    try:
+        content = json.loads((path / "program.json").read_bytes())
+    except ValueError:  # another file's content, by an exchange
+        return document
     _manifest(rng, path, content)
     (path / "program.json").write_text(json.dumps(content))
     return document
@@ -127,8 +130,11 @@ def _header(rng: random.Random, path: Path, document: Any) -> Any:
     """Many tensors of nothing, or of many sizes."""
     victim = rng.choice(sorted(path.glob("*.safetensors")))
     content = victim.read_bytes()
-    length = int.from_bytes(content[:8], "little")
-    header, count = json.loads(content[8 : 8 + length]), rng.choice(COUNTS)
+    length, count = int.from_bytes(content[:8], "little"), rng.choice(COUNTS)
+    try:
+        header = json.loads(content[8 : 8 + length])
+    except ValueError:  # another file's content, by an exchange
+        return document
     if rng.random() < 0.7:
         end = len(content) - 8 - length
         empty = {"dtype": "F32", "shape": [0], "data_offsets": [end, end]}

@@ -1,5 +1,6 @@
 """Small files that would take gigabytes or minutes if they were parsed before they are measured."""
 
+import hashlib
 import json
 import resource
 import struct
@@ -22,6 +23,7 @@ from ttscompile.artifact import load_artifact, tensors
 from ttscompile.artifact.codec import MAX_MANIFEST_VALUES
 from ttscompile.artifact.files import read_file
 from ttscompile.artifact.onnx_files import _FIELDS, MAX_BYTES
+from ttscompile.artifact.strict_json import dump_compact
 from ttscompile.core import untrusted_json
 from ttscompile.core.spec import SamplerTable
 from ttscompile.core.untrusted_json import MAX_VALUES, parse_json
@@ -257,3 +259,28 @@ def test_rehash_is_what_the_loader_expects(written: Path) -> None:
     """The control: forging alone is no reason to refuse."""
     rehash(written, json.loads((written / "manifest.json").read_text()))
     load_artifact(written)
+
+
+@pytest.mark.parametrize("place", ["timesteps", "type", "observation", "kept"])
+def test_a_shape_of_thousands_of_sizes(written: Path, place: str) -> None:
+    """Their product has a million digits, and takes long to have."""
+    sizes = [2**62] * 150_000
+
+    def long(document: dict[str, Any]) -> None:
+        spec = document["spec"]
+        if place == "timesteps":
+            spec["sampler"]["timesteps"] = {"dtype": "int64", "shape": sizes, "values": []}
+        elif place == "type":
+            document["blocks"][0]["type"]["shape"] = sizes
+        elif place == "observation":
+            spec["observations"]["goal"]["shape"] = sizes
+        else:
+            one = {"dtype": "float32", "shape": sizes}
+            document["tokens"] = {"frame_00": {"tokens": 1, "fixed": 0, "patch": [1, 1], "kept": {"a": one}}}
+
+    document = json.loads((written / "manifest.json").read_text())
+    long(document)
+    document.pop("checksum")
+    checksum = hashlib.sha256(dump_compact(document)).hexdigest()
+    (written / "manifest.json").write_text(json.dumps({**document, "checksum": checksum}))
+    refused(lambda: load_artifact(written), "expected a(t most 16 sizes| list of at most 16 items)")

@@ -13,13 +13,13 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from ..core.rules import MAX_RANK
 from ..errors import ArtifactError
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from .strict_json import Value
 
 MAX_LIST = 200_000
 MAX_NAME = 512
-MAX_RANK = 16
 MAX_DEPTH = 3
 MAX_ITEMS = 65_536
 MAX_SIZE = 2**40

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.rules import MAX_RANK
 from ..core.untrusted_json import MAX_VALUES, most_values
 from ..errors import ArtifactError
 from .files import opened, write_synced
@@ -28,7 +29,6 @@ from .strict_json import REMEDY, Value, parse
 Array = npt.NDArray[Any]
 
 MAX_HEADER_BYTES = 64 * 2**20
-MAX_RANK = 16
 
 _PREFIX = 8
 _DTYPES: Mapping[str, np.dtype[Any]] = MappingProxyType(
@@ -201,9 +201,7 @@ def _chunks(arrays: Mapping[str, Array]) -> Iterator[bytes | memoryview]:
 def _entry(value: Value, start: int) -> Entry:
     fields = value.keys("dtype", "shape", "data_offsets")
     dtype = _DTYPES[fields["dtype"].text(*_DTYPES)]
-    shape = tuple(item.integer() for item in fields["shape"].items())
-    if len(shape) > MAX_RANK:
-        fields["shape"].fail(f"at most {MAX_RANK} sizes")
+    shape = tuple(item.integer() for item in fields["shape"].items(MAX_RANK))
     span = [item.integer() for item in fields["data_offsets"].items()]
     length = math.prod(shape) * dtype.itemsize  # Python's integers do not overflow
     if len(span) != 2 or span[1] - span[0] != length:

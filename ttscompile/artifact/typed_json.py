@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 import numpy as np
 import numpy.typing as npt
 
-from ..core.rules import DType
+from ..core.rules import MAX_RANK, DType
 from ..errors import ArtifactError, SpecError
 from ..ir.graph import Batch, Size, TensorType
 from .strict_json import REMEDY, Value
@@ -81,7 +81,7 @@ def read_as(kind: Any, value: Value) -> Any:
         return {read_as(key, Value(name, value.path)): read_as(item, one) for name, one in value.members().items()}
     if kind is TensorType:
         parts = value.keys("dtype", "shape")
-        return TensorType(tuple(map(_size, parts["shape"].items())), read_as(DType, parts["dtype"]))
+        return TensorType(tuple(map(_size, parts["shape"].items(MAX_RANK))), read_as(DType, parts["dtype"]))
     if isinstance(kind, enum.EnumMeta):
         members = {str(one.value): one for one in cast(type[enum.Enum], kind)}
         return members[value.text(*members)]
@@ -136,7 +136,7 @@ def _array(value: Value) -> npt.NDArray[Any]:
     if isinstance(value.data, list):
         return _vector(value, "float32")
     members = value.keys("dtype", "shape", "values")
-    shape = tuple(item.integer() for item in members["shape"].items())
+    shape = tuple(item.integer() for item in members["shape"].items(MAX_RANK))
     array = _vector(members["values"], members["dtype"].text("float32", "int64"))
     if array.size != math.prod(shape):
         value.fail(f"{math.prod(shape)} numbers, for the shape {list(shape)}")

@@ -24,6 +24,9 @@ class Rule:
     holds: Callable[[Any], object]
 
 
+MAX_RANK = 16
+"""Sizes of a shape that somebody else wrote: the product of thousands takes minutes, and cannot be printed."""
+
 _DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "uint8", "bool")
 
 DType = Annotated[str, Rule(f"one of {', '.join(_DTYPES)}", _DTYPES.__contains__)]
@@ -31,5 +34,6 @@ LOOP_NAME = Rule("a name of lower-case letters, digits and + . -", re.compile(r"
 LoopName = Annotated[str, LOOP_NAME]
 NotNegative = Annotated[float, Rule("a number that is not negative", lambda x: x >= 0)]
 Positive = Annotated[int, Rule("a 64-bit integer of at least 1", lambda n: n >= 1)]
+Shape = Annotated[tuple[Positive, ...], Rule(f"at most {MAX_RANK} sizes", lambda sizes: len(sizes) <= MAX_RANK)]
 Sha256 = Annotated[str, Rule("64 hexadecimal digits", re.compile(r"[0-9a-f]{64}").fullmatch)]
 Share = Annotated[float, Rule("a number in 0..1", lambda x: 0 <= x <= 1)]

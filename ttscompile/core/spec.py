@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..errors import SpecError
 from .coercion import integer, numbers
-from .rules import LOOP_NAME, DType, LoopName, Positive
+from .rules import LOOP_NAME, DType, LoopName, Positive, Shape
 from .sampler import FloatArray as FloatArray
 from .sampler import SamplerTable as SamplerTable
 
@@ -89,7 +89,7 @@ class ObservationSpec:
             left is black: ``start``, at the top and the left; ``centre``, on both sides. None: no other size is taken.
     """
 
-    shape: tuple[Positive, ...]
+    shape: Shape
     normalizer: Affine | None = None
     dtype: DType = "float32"
     window: bool = True
