@@ -13,6 +13,7 @@ import pytest
 
 from tests.artifact.folders import Edit, flip, packed
 from ttscompile.artifact import archive, load_artifact
+from ttscompile.core.zip_files import MAX_ENTRIES
 from ttscompile.errors import ArtifactChangedError, ArtifactError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -177,10 +178,10 @@ def test_an_archive_out_of_proportion(written: Path, monkeypatch: pytest.MonkeyP
 
 def test_too_many_entries(written: Path) -> None:
     def edit(file: zipfile.ZipFile) -> None:
-        for i in range(archive.MAX_ENTRIES):
+        for i in range(MAX_ENTRIES):
             file.writestr(f"{i}", b"")
 
-    with pytest.raises(ArtifactError, match="at most 4096 entries"):
+    with pytest.raises(ArtifactError, match="at most 10,000 entries"):
         load_artifact(packed(written, edit=edit))
 
 

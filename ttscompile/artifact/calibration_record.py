@@ -25,11 +25,7 @@ _RECORD: Mapping[str, Any] = {
 
 
 def check_record(record: Value) -> None:
-    """Raise unless what commands read of a calibration record is of the type that they expect, where it is there.
-
-    Raises:
-        ArtifactError: it is not; says where.
-    """
+    """Raise ArtifactError unless what commands read of a calibration record is of its type, where it is there."""
     members = record.members()
     _check(members, _RECORD)
     if "budget" in members:

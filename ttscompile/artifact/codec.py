@@ -61,10 +61,12 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
         )
     found, writer = document.get("schema_version"), document.get("ttscompile_version")
     if found not in (SCHEMA_VERSION, SCHEMA_VERSION - 1) or type(found) is not int:
-        install = f"ttscompile=={writer}, which wrote it" if isinstance(writer, str) else "the ttscompile that wrote it"
+        install = (
+            f"ttscompile=={writer:.40}, which wrote it" if isinstance(writer, str) else "the ttscompile that wrote it"
+        )
         raise ArtifactError(
             f"{where}: schema_version: expected {SCHEMA_VERSION} or the one before, which this ttscompile reads; found"
-            f" {found!r}. Convert the checkpoint again with this version, or install {install}."
+            f" {found!r:.40}. Convert the checkpoint again with this version, or install {install}."
         )
     checksum = document.pop("checksum", None)
     if checksum != _checksum(document):

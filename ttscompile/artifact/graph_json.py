@@ -18,7 +18,6 @@ from ..errors import ArtifactError
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from .strict_json import Value
 
-MAX_LIST = 200_000
 MAX_NAME = 512
 MAX_DEPTH = 3
 MAX_ITEMS = 65_536
@@ -54,7 +53,7 @@ def graph_from_json(document: Value) -> Graph:
     inputs = _typed_names(members["inputs"], results)
     constants = _typed_names(members["constants"], results)
     nodes = []
-    for item in members["nodes"].items(MAX_LIST):
+    for item in members["nodes"].items():
         parts = item.keys("name", "op", "args", "kwargs", "types")
         node = _node(parts)
         unknown = [name for name in node.refs() if name not in results]
@@ -64,7 +63,7 @@ def graph_from_json(document: Value) -> Graph:
             item.fail("getitem of a value and the number of one of its results")
         _define(results, parts["name"], len(node.types))
         nodes.append(node)
-    outputs = members["outputs"].items(MAX_LIST)
+    outputs = members["outputs"].items()
     for output in outputs:
         if _name(output) not in results:
             output.fail("the name of a value")
@@ -106,7 +105,7 @@ def _argument_to_json(argument: Argument) -> Any:
 
 def _typed_names(value: Value, results: dict[str, int]) -> dict[str, TensorType]:
     typed = {}
-    for item in value.items(MAX_LIST):
+    for item in value.items():
         members = item.keys("name", "type")
         typed[_define(results, members["name"], 1)] = _type(members["type"])
     return typed

@@ -57,16 +57,7 @@ class _Left:
 
 
 def check_models(directory: Path, names: Iterable[str], files: Mapping[str, FileRecord]) -> None:
-    """Raise unless all weights of models are in them, or in ranges of the artifact's files, which were checked.
-
-    Args:
-        directory: of the artifact.
-        names: of the models.
-        files: of the artifact.
-
-    Raises:
-        ArtifactError: unreadable, no such model, too much of it, or weights elsewhere.
-    """
+    """Raise ArtifactError unless all weights of models are in them, or in ranges of these files, which were checked."""
     left, names = _Left(), sorted(names)
     if (total := sum(files[name].bytes for name in names)) > MAX_BYTES:
         raise ArtifactError(f"{directory}: expected ONNX models of {MAX_BYTES} bytes at most; found {total}. {REMEDY}")

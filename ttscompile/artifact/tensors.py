@@ -79,16 +79,13 @@ def read_header(path: Path) -> dict[str, Entry]:
 
 
 def require_few(paths: Iterable[Path], where: object) -> None:
-    """Raise if the headers of these files together have more values than JSON may have.
+    """Raise ArtifactError if the headers of these files together have more values than JSON may have."""
 
-    Raises:
-        ArtifactError: they have, or are none.
-    """
-    total = 0
-    for path in paths:
+    def values(path: Path) -> int:
         with opened(path) as file:
-            total += most_values(_content(file, path))
-    if total > MAX_VALUES:
+            return most_values(_content(file, path))
+
+    if (total := sum(map(values, paths))) > MAX_VALUES:
         raise ArtifactError(f"{where}: expected headers with at most {MAX_VALUES:,} values; found {total:,}. {REMEDY}")
 
 

@@ -25,8 +25,8 @@ def parse_json(
 
     Args:
         content: the document.
-        limit: largest accepted size in bytes.
-        values: largest accepted number of values, as ``most_values`` counts them.
+        limit: of bytes.
+        values: limit of those, as ``most_values`` counts them.
         allow_nan: accept NaN and infinity, as ``json.dumps`` writes them.
         shown: refuse texts and keys that a terminal does not show as they are: control characters, and those that turn
             the direction of writing.

@@ -28,11 +28,7 @@ class _Limited:
 
 
 def open_zip(file: IO[bytes]) -> zipfile.ZipFile:
-    """An archive to read from; ``zipfile`` reads the whole directory, at once, when it opens one.
-
-    Raises:
-        BadZipFile: none that can be read, or one with too many entries.
-    """
+    """An archive to read from, or BadZipFile; ``zipfile`` reads the whole directory, at once, when it opens one."""
     limited = _Limited(file)
     archive = zipfile.ZipFile(limited)  # all that it asks of a file
     if (found := len(archive.filelist)) > MAX_ENTRIES:
