@@ -22,7 +22,7 @@ UNREAD = 2**18
 
 
 class CountedConnection(ServerConnection):
-    """Ends, as by the network, when its client sends more pings and empty fragments than it may, or reads no answers."""
+    """Ends, as by the network, when its client sends too many pings or empty fragments, or reads no answers."""
 
     def __init__(self, admission: Admission, limits: ServerLimits, *library: Any, **more: Any) -> None:
         super().__init__(*library, **more)

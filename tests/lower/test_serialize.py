@@ -115,7 +115,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         setter("nodes", 0, "source", to="/home/me/x.py"),
         r"nodes\[0\]: .*the keys .*unknown: \['source'\]",
     ),
-    "nodes not a list": (setter("nodes", to={}), "nodes: .*a list of at most"),
+    "nodes not a list": (setter("nodes", to={}), "nodes: .*a list; found"),
     "node not an object": (setter("nodes", 0, to=[]), r"nodes\[0\]"),
     "python op": (setter("nodes", 0, "op", to="os.system"), r"nodes\[0\].op: .*found 'os.system'"),
     "dunder path": (setter("nodes", 0, "op", to="aten.add.Tensor.__globals__"), r"nodes\[0\].op"),
