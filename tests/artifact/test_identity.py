@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import pytest
 
-from tests.artifact.test_update import PLAN, update
+from tests.artifact.updates import PLAN, update
 from tests.hostile.forged import rehash
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.block_weights import BlockWeights

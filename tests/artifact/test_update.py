@@ -13,35 +13,16 @@ import pytest
 
 from tests.artifact.folders import contents, failing, packed
 from tests.artifact.tiny import tiny_program, write_tiny
-from tests.plans import store_schedules
+from tests.artifact.updates import PLAN, RECORD, new_pruner, update
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.block_weights import BlockWeights
-from ttscompile.artifact.manifest import Manifest, PlanRecord, StartRecord
+from ttscompile.artifact.manifest import PlanRecord, StartRecord
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.plan import Plan, TokenReuse
 from ttscompile.errors import ArtifactError, IllegalPlanError
 
 ROOT = Path(__file__).resolve().parents[2]
-PLAN = np.array([[0, 0], [1, 2], [0, 3]], np.int8)
-RECORD = {"strategy": "tts", "plans": {"tts": {"sparsity": 0.75}, "mine": {"sparsity": 0.5}}, "losses": [1.5, None]}
-
-
-def new_pruner(path: Path, by: float = 1) -> dict[str, np.ndarray]:
-    pruner = {name: np.array(value) for name, value in load_artifact(path).pruner.items()}
-    pruner["pruner.weight"] += by
-    pruner["pruner.bias"] += by
-    return pruner
-
-
-def update(path: Path, by: float = 1, **changes: Any) -> Manifest:
-    arguments: dict[str, Any] = {
-        "pruner_weights": new_pruner(path, by),
-        "schedules": {"mine": PLAN},
-        "default_plan": "tts",
-        "record": RECORD,
-    }
-    return store_schedules(path, **{**arguments, **changes})
 
 
 def logits(path: Path) -> np.ndarray:
@@ -274,7 +255,7 @@ def test_a_process_that_is_killed_anywhere_leaves_the_old_or_the_new(written: Pa
         import os, sys
         sys.path.insert(0, sys.argv[1])
         from pathlib import Path
-        from tests.artifact.test_update import update
+        from tests.artifact.updates import update
         from ttscompile.artifact import load_artifact
 
         path, left, seen = Path(sys.argv[2]), 0, []

@@ -15,10 +15,9 @@ import onnx
 import pytest
 
 from tests.artifact.tiny import write_tiny
-from tests.hostile.forged import rehash
+from tests.hostile.forged import forge, rehash
 from tests.hostile.fuzz import LIMIT
 from tests.hostile.guard import MORE_BYTES, address_space
-from tests.hostile.test_loaders import forge
 from ttscompile.artifact import load_artifact, tensors
 from ttscompile.artifact.codec import MAX_MANIFEST_VALUES
 from ttscompile.artifact.files import read_file

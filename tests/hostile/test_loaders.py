@@ -1,7 +1,6 @@
 """What the fuzzer found, one test each, and attacks that chance would not find."""
 
 import io
-import json
 import shutil
 import struct
 import zipfile
@@ -17,7 +16,7 @@ import torch
 import ttscompile
 from tests.artifact.tiny import write_tiny
 from tests.frontends.conftest import _config, _weights
-from tests.hostile.forged import rehash
+from tests.hostile.forged import forge
 from ttscompile.artifact import load_artifact
 from ttscompile.calibration.state import StateFile
 from ttscompile.core.spec import ObservationSpec
@@ -28,20 +27,11 @@ from ttscompile.frontends.interpolation import Config
 from ttscompile.trajectories import frames as trajectories_frames
 from ttscompile.trajectories import load_trajectories
 
-Change = Callable[[dict[str, Any]], object]
-
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     write_tiny(tmp_path / "compiled")
     return tmp_path / "compiled"
-
-
-def forge(path: Path, change: Change = lambda document: None) -> None:
-    """Change the manifest; its hashes are right afterwards."""
-    document = json.loads((path / "manifest.json").read_text())
-    change(document)
-    rehash(path, document)
 
 
 def external(path: Path, name: str, **entries: str) -> None:
