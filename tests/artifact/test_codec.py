@@ -180,6 +180,7 @@ def plan(kind: str, **fields: Any) -> dict[str, Any]:
         (lambda d: d["requires"].update(onnxruntime="latest"), "a version like"),
         (lambda d: d["requires"].update(opset=0), "at least 1"),
         (lambda d: d.update(calibration=[]), "calibration: expected an object"),
+        (lambda d: d.update(features=["memory", "none"]), r"features: expected some of the contexts \['memory', "),
     ],
 )
 def test_contents_that_are_refused(manifest: Manifest, edit: Change, message: str) -> None:

@@ -208,8 +208,8 @@ def plan_fault(manifest: Manifest, plan: PlanRecord) -> str | None:
     return None
 
 
-# C901: a condition for each part
-def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # noqa: C901
+# C901, PLR0912: a condition for each part
+def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # noqa: C901, PLR0912
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")
@@ -221,6 +221,8 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
             fields["pieces"].members()[name].members()["stream"].fail(f"one of {', '.join(map(repr, piece.inputs))}")
         if not set(piece.contexts) <= set(manifest.contexts):
             fields["pieces"].fail(f"contexts of {name} that are among {list(manifest.contexts)}")
+    if not set(manifest.features) <= set(manifest.contexts):
+        fields["features"].fail(f"some of the contexts {list(manifest.contexts)}")
     rows = manifest.pieces[FRAMES].outputs if FRAMES in manifest.pieces else ()
     read = [name for piece in frame_pieces(manifest.pieces) for name in manifest.pieces[piece].inputs]
     if sorted(read) != sorted(rows):
