@@ -9,7 +9,7 @@ import json
 import random
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -61,10 +61,10 @@ def _manifest(rng: random.Random, path: Path, document: Any) -> Any:
     value, count = container[key], rng.choice(COUNTS)
     kind = rng.randrange(5)
     if kind == 0 and isinstance(value, dict):
-        model = next(iter(value.values()), rng.choice(TINY))
+        model = _small(rng, value.values())
         value.update({f"{rng.choice(('x', 'block_', 'a.'))}{i}": model for i in range(count)})
     elif kind <= 1 and isinstance(value, list):
-        value.extend([value[0] if value and rng.random() < 0.7 else rng.choice(TINY)] * count)
+        value.extend([_small(rng, value)] * count)
     elif kind == 2:
         container[key] = rng.choice(
             ([rng.choice(TINY)] * count, dict.fromkeys(map(str, range(count)), rng.choice(TINY)))
@@ -74,6 +74,12 @@ def _manifest(rng: random.Random, path: Path, document: Any) -> Any:
     else:
         container[key] = rng.choice((nested(rng.choice((60, 500))), "s" * count, rng.choice(NUMBERS)))
     return document
+
+
+def _small(rng: random.Random, values: Iterable[Any]) -> Any:
+    """The first of some values, unless there is none or it has been swollen itself."""
+    first = next(iter(values), None)
+    return first if rng.random() < 0.7 and len(str(first)) < 500 else rng.choice(TINY)
 
 
 def _record(rng: random.Random, path: Path, document: Any) -> Any:
