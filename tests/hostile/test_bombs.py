@@ -130,8 +130,8 @@ def test_a_manifest_of_as_many_values_as_may_be(written: Path) -> None:
 
     def many(document: dict[str, Any]) -> None:
         record = document["files"].popitem()[1]
-        document["files"] |= {f"f{i}": record for i in range(20_000)}
-        document["calibration"] = {"a": [[]] * 40_000}
+        document["files"] |= {f"f{i}": record for i in range(10_000)}
+        document["calibration"] = {"a": [[]] * 20_000}
 
     forge(written, many)
     refused(lambda: load_artifact(written), "files: expected at most 4096 entries")
@@ -220,7 +220,7 @@ def test_cells_that_no_file_holds(written: Path) -> None:
 
     def many(document: dict[str, Any]) -> None:
         sampler = document["spec"]["sampler"]
-        steps = 12_000
+        steps = 8_000
         for name in SamplerTable.COLUMNS:
             sampler[name] = [0.5] * steps
         sampler["timesteps"] = {"dtype": "int64", "shape": [steps], "values": [1] * steps}
@@ -263,7 +263,7 @@ def test_rehash_is_what_the_loader_expects(written: Path) -> None:
 @pytest.mark.parametrize("place", ["timesteps", "type", "observation", "kept"])
 def test_a_shape_of_thousands_of_sizes(written: Path, place: str) -> None:
     """Their product has a million digits, and takes long to have."""
-    sizes = [2**62] * 150_000
+    sizes = [2**62] * 80_000
 
     def long(document: dict[str, Any]) -> None:
         spec = document["spec"]

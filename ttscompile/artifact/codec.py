@@ -37,7 +37,7 @@ from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, Pr
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
 from .upgrade import upgraded
 
-MAX_MANIFEST_BYTES, MAX_MANIFEST_VALUES = 32 * 2**20, 200_000
+MAX_MANIFEST_BYTES, MAX_MANIFEST_VALUES = 32 * 2**20, 100_000
 """Of Push-T it has 41 KB and 2,000 values."""
 
 
