@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT = 5.0
 """Seconds that a case may take of the processor, so that it does not matter what else the machine does."""
-STUCK = 20.0
+STUCK = 60.0
 """Seconds after which a case that is not done is killed: more than ``LIMIT``, so that slow and stuck are told apart."""
 PORTION = 2500
 """Cases of one process."""

@@ -35,7 +35,7 @@ def test_nothing_but_errors_of_its_own(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("case", range(8))
 def test_an_artifact_that_is_swollen_takes_no_more_than_is_promised(tmp_path: Path, case: int) -> None:
-    """The first cases of many: ``python -m tests.hostile.fuzz --target swollen --cases 2500``."""
+    """The first cases of many: ``python -m tests.hostile.fuzz --target swollen --cases 1400``."""
     write_tiny(tmp_path / "compiled")
     use = swollen.artifact(random.Random(case), tmp_path / "compiled")
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
