@@ -8,7 +8,7 @@ scores are of the same calls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,8 @@ import torch
 
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
-from ..core.plan import DENSE, FULL, Plan
+from ..core.lattice import dense_plan
+from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..pool import Here, Pool
 from ..runtimes.random_calls import Observation, normalized
@@ -29,7 +30,7 @@ from .clock import Clock
 from .execute import Executor
 from .progress import Bar
 from .state import StateFile
-from .targets import dense_rounds, draw_calls, with_targets
+from .targets import SHARE, dense_rounds, draw_calls, with_targets
 
 DRAWS = 4
 """Of noise for each observation."""
@@ -86,6 +87,7 @@ class Trials:
         limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
         observations: that the original answers, at most, of either part.
         name: of the best plan so far.
+        until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
         clock: of all work.
@@ -111,6 +113,7 @@ class Trials:
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
     observations: int = OBSERVATIONS
     name: str = DENSE
+    until: float = SHARE
     _calls: dict[int, Calls] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
 
@@ -131,6 +134,14 @@ class Trials:
         split = split_episodes(len(episodes), fraction, seed)
         return cls(artifact, episodes, split, seed, base, executor, state, **others)
 
+    def of_loop(self, loop: str) -> Trials:
+        """The same episodes, noise and answers of the original; to learn from are calls of a loop."""
+        if loop == self.base.loop:
+            return self
+        manifest = self.artifact.manifest
+        base = replace(self.base, loop=loop, cells=dense_plan(manifest.steps_of(loop), len(manifest.blocks)))
+        return replace(self, base=base, executor=Executor(view_of(self.artifact, base.exact), self.device), _calls={})
+
     @property
     def calls(self) -> Calls:
         """Calls of the episodes that are learned from, and the base's way to its answer with the same noise."""
@@ -145,9 +156,11 @@ class Trials:
         if window not in self._calls:
             spec, (fewest, most) = self.executor.view.manifest.spec, self.limits
             calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
-            name = "calibration" if window == 1 else "windows"
+            loop = self.base.loop
+            name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
+            clock = self.clock.until(self.until / SHARE)
             self._calls[window] = with_targets(
-                self.executor, name, calls, fewest, self.state, self.clock, self.bar, self.pool
+                self.executor, name, calls, fewest, self.state, clock, self.bar, self.pool
             )
             if self.clock.left() < 0:
                 self.bar.warn(
