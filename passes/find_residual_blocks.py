@@ -67,10 +67,6 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
     that is added but does not depend on the stream, a normalisation of the stream itself), what lies between them is
     one coarse block, whose residual is the difference.
 
-    Args:
-        graph: one evaluation of the denoiser.
-        sample: name of its noisy sample.
-
     Raises:
         NoResidualBlocksError: there is no such addition, and names the node at which the search ended; or what is
             outside the blocks and depends on the sample holds most of the work, as with a U-Net.

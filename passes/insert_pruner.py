@@ -39,10 +39,6 @@ class InsertPruner(Pass[Program, Program]):
     What depends on step and block alone is a constant; only ``code`` depends on the observation. The plan is the
     argmax over the sources. Before calibration it is dense. A loop of another number of steps than the original's has a
     head of its own.
-
-    Attributes:
-        rank: number of observation-dependent directions in the space of plans.
-        width: of the hidden layer.
     """
 
     rank: int = 16

@@ -30,9 +30,6 @@ class OneBlock(Pass[Captured, Captured]):
         %prediction = aten.slice(%updated, -1, D, 2 D)
 
     Nothing is computed but copies, and no number changes. A reused residual is the prediction of an earlier step.
-
-    Attributes:
-        reason: why no finer blocks were found.
     """
 
     reason: str

@@ -27,9 +27,6 @@ class Partition(Pass[Captured, Cut]):
         stream     = stem(sample, contexts)
         residual_i = block_i(stream, contexts)          # stream <- stream + residual_i
         prediction = tail(stream, contexts)
-
-    Attributes:
-        blocks: from ``find_residual_blocks``.
     """
 
     blocks: tuple[Block, ...]

@@ -24,11 +24,7 @@ _MISSING = object()
 
 
 def check_seed(seed: int | None) -> int | None:
-    """The seed as Python's integer, or None for none.
-
-    Raises:
-        TtscompileError: not a whole number of at least 0.
-    """
+    """The seed as Python's integer, or None for none. Raises TtscompileError: not a whole number of at least 0."""
     return None if seed is None else integer(seed, "seed", TtscompileError, more=", or None for another sequence")
 
 
@@ -45,8 +41,6 @@ def read_observation(
     """The arrays of an observation by key, each taken from the mapping once: it may give something else the next time.
 
     Args:
-        obs: the caller's.
-        specs: by key, of the policy.
         others: leave keys alone that are not the policy's, rather than refuse them.
 
     Returns:
@@ -77,10 +71,6 @@ def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, Observati
     """Copies of arrays ``[B, ...]`` of their specified shapes and dtypes, with numbers that can be, and one B.
 
     They are copied before their numbers are looked at: another thread may write into the caller's.
-
-    Args:
-        arrays: from ``read_observation``.
-        specs: by key, of the policy.
 
     Raises:
         ObservationError: names the key, what was expected, what was found and the remedy.
@@ -129,8 +119,6 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
         noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
             sampler draws no noise in its steps, ``noise.steps`` is not looked at; of those of a longer loop the first
             K are taken.
-        streams: B of the observation.
-        spec: of the policy.
 
     Raises:
         ObservationError: missing, of the wrong shape or dtype, or not finite.

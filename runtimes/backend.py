@@ -63,11 +63,7 @@ class Backend(Protocol[Lowered]):
     keeps: BoolArray
 
     def lower(self, plan: PlanArray) -> Lowered:
-        """What ``other_steps`` needs of the plan of one stream. The runtime keeps it, and gives it again.
-
-        Args:
-            plan: int8 ``[K, blocks]``, legal.
-        """
+        """What ``other_steps`` needs of the plan of one stream. The runtime keeps it, and gives it again."""
 
     def prepare(self, streams: int, plans: Sequence[Lowered] | None) -> None:
         """Have everything that a call needs beside its inputs: memory, for the most part. It is not timed.
@@ -88,9 +84,6 @@ class Backend(Protocol[Lowered]):
 
     def other_steps(self, plans: Sequence[Lowered]) -> FloatArray:
         """The rest of the call.
-
-        Args:
-            plans: of each stream.
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``: an array that no later call changes.

@@ -11,27 +11,14 @@ from .inpainting import Known
 
 
 def fill_initial(initial: FloatArray, noise: Noise, known: Known | None) -> None:
-    """The sample at step 0.
-
-    Args:
-        initial: ``[B, T, D]``, written.
-        noise: of the call.
-        known: what a prefix makes known.
-    """
+    """Write the sample at step 0, ``[B, T, D]``."""
     np.copyto(initial, noise.initial)
     if known is not None:
         initial[:, known.positions, known.channels] = known.values[0]
 
 
 def fill_offset(offset: FloatArray, sampler: SamplerTable, noise: Noise, correction: Correction | None) -> None:
-    """What every step adds to the sample that depends neither on it nor on the observation.
-
-    Args:
-        offset: ``[K, D, B, T]``, written.
-        sampler: of the policy.
-        noise: of the call.
-        correction: of the sampler's steps.
-    """
+    """What every step adds to the sample that depends neither on it nor on the observation, ``[K, D, B, T]``."""
     if sampler.stochastic and noise.steps is not None:
         column = sampler.noise_to_next[:, None, None, None]
         np.multiply(noise.steps.transpose(0, 3, 1, 2), column, out=offset)

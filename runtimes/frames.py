@@ -40,7 +40,6 @@ class Computed:
 
     Attributes:
         values: ``[1, ...]`` each.
-        tokens: for how many tokens it was computed.
         of: how many tokens it has; 0 where the whole frame is the unit.
     """
 
@@ -145,11 +144,6 @@ def contents_of(rows: Sequence[Array], lanes: Sequence[Lane] = ()) -> list[Conte
 
 class FramePieces:
     """What depends on one frame alone, for the rows of all streams: only frames that are new are computed.
-
-    Args:
-        pieces: of the artifact; without frame pieces nothing is done.
-        run: executes one of them.
-        tokens: by frame piece, those of which only some tokens are computed.
 
     Attributes:
         work: what the last ``values`` did.

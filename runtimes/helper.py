@@ -18,9 +18,6 @@ class Helper:
 
     ``ThreadPoolExecutor`` takes no more work once the program's main thread has ended, although a control loop on
     another thread may go on for hours.
-
-    Args:
-        name: of the thread.
     """
 
     def __init__(self, name: str) -> None:

@@ -50,10 +50,6 @@ class MaskedUpdates:
 
     One copy serves prefixes of every length: from call to call columns are put back, or made zeros.
 
-    Args:
-        updates: float32 ``[K, G, R, (1 + S) T]``, as they are without a prefix; G is 1 or D.
-        chunk: of the policy.
-
     Attributes:
         updates: the same for the prefix of the moment.
     """
@@ -120,12 +116,6 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
 def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
     """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, a copy of the caller's.
 
-    Args:
-        prefix: the caller's.
-        streams: B.
-        spec: of the policy.
-        refusal: see ``prefix_refusal``.
-
     Raises:
         ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
     """
@@ -151,7 +141,6 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
     """What a prefix makes known of the samples of a call; None if it is empty.
 
     Args:
-        spec: of a policy that takes prefixes.
         prefix: from ``check_prefix``, then normalised.
         initial: the noise that the call starts from, ``[B, T, D]``.
     """

@@ -17,15 +17,7 @@ TASK = "task"
 
 
 class Instruct:
-    """Puts the tokens of a task into an observation.
-
-    Args:
-        spec: of the policy.
-        path: of ``tokenizer.json``, or of the folder that has it.
-
-    Raises:
-        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
-    """
+    """Puts the tokens of a task into an observation."""
 
     def __init__(self, spec: PolicySpec, path: str | os.PathLike[str]) -> None:
         if spec.instruction is None:
@@ -37,11 +29,7 @@ class Instruct:
         self._made: dict[str, list[int]] = {}
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is.
-
-        Raises:
-            ObservationError: the task is no text, or has no tokens.
-        """
+        """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is."""
         if not isinstance(obs, Mapping) or TASK not in obs or self._told.tokens in obs:
             return obs
         rest = {key: value for key, value in obs.items() if key != TASK}

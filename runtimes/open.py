@@ -29,7 +29,6 @@ class Options:
 
     Attributes:
         threads: of arithmetic, one of which is the caller's. The reference runs with torch's own setting.
-        device: where it computes.
     """
 
     threads: int = 1
@@ -112,11 +111,7 @@ def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
 
 
 def kind_of(runtime: str) -> Kind:
-    """The kind of this name.
-
-    Raises:
-        RuntimeUnavailableError: there is none.
-    """
+    """The kind of this name. Raises RuntimeUnavailableError: there is none."""
     if runtime not in RUNTIMES:
         raise RuntimeUnavailableError(f"no runtime is called {runtime!r}; expected one of {', '.join(RUNTIMES)}.")
     return RUNTIMES[runtime]
@@ -130,13 +125,6 @@ def open_runtime(
     plan: Plan | None = None,
 ) -> Runtime:
     """Make a runtime for an artifact.
-
-    Args:
-        artifact: loaded and checked.
-        runtime: a name in ``RUNTIMES``.
-        threads: see ``Options``.
-        device: see ``Options``; None for the CPU.
-        plan: see ``Runtime``.
 
     Raises:
         RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or what the plan

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ttscompile.artifact.load import Artifact
 from ttscompile.core.coercion import integer
 from ttscompile.core.plan import Plan
-from ttscompile.core.spec import FP32, FloatArray, Noise, PolicySpec
+from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import NonFiniteActionsError, TtscompileError
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
@@ -68,11 +68,7 @@ class CompiledPolicy:
         self._exit = weakref.finalize(self, _end_calls, self._lock, self._process)
 
     def __getstate__(self) -> None:
-        """Refuse to be copied, and to be sent to another process.
-
-        Raises:
-            TtscompileError: always.
-        """
+        """Refuse to be copied, and to be sent to another process. Raises TtscompileError: always."""
         remedy = "Load it again, where it is called: ttscompile.load(DIR)."
         raise TtscompileError(f"a compiled policy cannot be copied, nor sent to another process. {remedy}")
 
@@ -86,7 +82,7 @@ class CompiledPolicy:
         """What this policy is: with the plan that it was loaded with."""
         view, default = self._runtime.view(self._default), self._default
         manifest, blocks = view.manifest, []
-        begun = self._whole_loop(default).sampler
+        begun = self._runtime.noise_spec(default).sampler
         for block in manifest.blocks:
             shape = tuple(n for i, n in enumerate(block.type.at(1)) if i != block.type.batch_axis)
             blocks.append(BlockInfo(block.kind, shape, block.flops))
@@ -216,9 +212,6 @@ class CompiledPolicy:
 
         It matters to plans that begin with the chunk of the call before: they move it by as many. A call that is late,
         since more steps were due than ``action`` has, begins with noise.
-
-        Args:
-            executed: steps at the policy's rate.
         """
         executed = integer(executed, "executed", TtscompileError)
         with self._turn():
@@ -237,8 +230,6 @@ class CompiledPolicy:
         Args:
             batch: one frame of every stream by key, ``[B, ...]``, not normalised; ``reset`` forgets earlier ones. Keys
                 that are not the policy's are left alone.
-            noise: of the chunk, if this call computes one.
-            plan: the same.
 
         Returns:
             ``[B, Da]`` of the kind that came in.
@@ -269,9 +260,6 @@ class CompiledPolicy:
             batch: whole windows ``[B, To, ...]``; or one frame of every stream ``[B, ...]``, which is added to the
                 frames that this method and ``select_action`` were given since ``reset``. Keys that are not the policy's
                 are left alone.
-            noise: of the call.
-            plan: of the call.
-            prefix: of the call, as ``predict_action`` takes it.
 
         Raises:
             ObservationError: a window, a frame, noise or a prefix that does not fit; nothing was executed or kept.
@@ -332,7 +320,7 @@ class CompiledPolicy:
 
     def _draw(self, streams: int, plan: Plan) -> Noise:
         """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
-        spec = self._whole_loop(plan)
+        spec = self._runtime.noise_spec(plan)
         shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
         initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
         if not spec.sampler.stochastic:
@@ -349,10 +337,6 @@ class CompiledPolicy:
         own = self._default.otherwise or self._default
         cells: Any = plan  # whatever it is: the runtime checks it
         return Plan(own.loop, cells, precision=own.precision, tokens=own.tokens)
-
-    def _whole_loop(self, plan: Plan) -> PolicySpec:
-        """With the loop that the noise of a call is for: that of ``otherwise``, where a plan begins with a chunk."""
-        return self._runtime.view(plan.otherwise or plan).manifest.spec
 
     def _prefix_refusal(self, plan: Plan) -> str | None:
         """Why a call with this plan takes no prefix; None if it does."""

@@ -20,11 +20,7 @@ Frames = dict[str, deque[Array]]
 
 
 class Queues:
-    """Frames and actions of one episode.
-
-    Args:
-        specs: of the policy's observations.
-    """
+    """Frames and actions of one episode."""
 
     def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
         self._specs = specs
@@ -41,9 +37,6 @@ class Queues:
 
         A call that fails after this, and is made again, must not push its frame twice: ``keep`` what it used when it
         succeeded.
-
-        Args:
-            frame: by key ``[B, ...]``, from ``read_observation``: of a window's key one frame.
 
         Raises:
             ObservationError: an array does not fit.

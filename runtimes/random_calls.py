@@ -13,13 +13,7 @@ Observation = dict[str, npt.NDArray[Any]]
 
 
 def random_calls(spec: PolicySpec, count: int, seed: int) -> list[tuple[Observation, Noise]]:
-    """Observations of one stream as ``ObservationSpec.draw`` makes them, and noise, for consecutive calls.
-
-    Args:
-        spec: of the policy.
-        count: how many calls.
-        seed: the same calls come of the same seed; more of them begin with the same ones.
-    """
+    """Observations of one stream, and noise, for consecutive calls; more of a seed begin with the same ones."""
     return [random_call(spec, number, seed) for number in range(count)]
 
 
@@ -31,10 +25,14 @@ def random_call(spec: PolicySpec, number: int, seed: int) -> tuple[Observation, 
 
 
 def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
-    """Noise of one stream; as many numbers are drawn whether or not the sampler is stochastic."""
+    """Noise of one stream for a call in any loop of a policy: each takes of the draws what it needs (``check_noise``).
+
+    As many numbers are drawn whether or not a sampler is stochastic.
+    """
+    loops = spec.all_loops.values()
     initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
-    draws = rng.standard_normal((spec.sampler.steps, *initial.shape), dtype=np.float32)
-    return Noise(initial, draws if spec.sampler.stochastic else None)
+    draws = rng.standard_normal((max(loop.steps for loop in loops), *initial.shape), dtype=np.float32)
+    return Noise(initial, draws if any(loop.stochastic for loop in loops) else None)
 
 
 def normalized(spec: PolicySpec, obs: Observation) -> Observation:

@@ -74,11 +74,6 @@ class Runtime:
 
     A plan whose loop begins with the chunk of the call before has that of the last call of the episode, moved by what
     is executed of it. Where there is none, its ``otherwise`` is executed.
-
-    Args:
-        artifact: loaded and checked.
-        open_backend: on a view of the artifact; refuses what it cannot do.
-        plan: that most calls will have; None for the artifact's default.
     """
 
     def __init__(
@@ -185,7 +180,6 @@ class Runtime:
         Args:
             obs: normalised observation by key, ``[B, ...]`` each, of the dtype of its specification.
             noise: see ``arrays.check_noise``; of the whole loop, also where the call begins with the chunk before.
-            plan: what to compute.
             prefix: normalised actions that are committed already, ``[B, N, Da]``; see ``inpainting``. None for none.
 
         Returns:
@@ -205,7 +199,7 @@ class Runtime:
         opened = self._opened_for(plan)
         view, backend = opened.view, opened.backend
         spec, manifest = view.manifest.spec, view.manifest
-        noise = check_noise(noise, streams, self._noise_spec(plan))
+        noise = check_noise(noise, streams, self.noise_spec(plan))
         if view.start is not None and self._chunk is not None:
             noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
@@ -259,7 +253,7 @@ class Runtime:
         )
         return sample, report
 
-    def _noise_spec(self, plan: Plan) -> PolicySpec:
+    def noise_spec(self, plan: Plan) -> PolicySpec:
         """What noise has to fit: of the loop whose last steps these are, where the plan begins with a chunk."""
         return self.view(plan if plan.otherwise is None else plan.otherwise).manifest.spec
 

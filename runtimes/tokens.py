@@ -45,7 +45,6 @@ class _Kept:
     Attributes:
         pixels: that each token was computed for, ``[C, H, W]``.
         arrays: rows ``[T, ...]`` by input of the piece.
-        values: what the tower gave last.
         age: new frames since all tokens were computed.
     """
 
@@ -83,10 +82,6 @@ class TokenTower:
 
     def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
         """What the tower gives for a new frame, and for how many tokens it was computed.
-
-        Args:
-            lane: of the frame. What is kept of it is gone if this fails.
-            row: ``[1, ...]``, by the input of the frame piece.
 
         Raises:
             ArtifactError: the manifest cuts the picture into other patches than there are tokens.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import re
@@ -11,9 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import click
@@ -22,36 +19,16 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
-from tests.calibration import policies, tasks
 from tests.commands_of_docs import NOT_RUN, SHORTER
-from tests.once import Once
+from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
-from ttscompile.calibration import proposer, strategies
-from ttscompile.calibration.pipeline import calibrate
 from ttscompile.cli import main
-from ttscompile.frontends import families
-from ttscompile.runtimes import open as open_module
 
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def load(path: Path, name: str) -> ModuleType:
-    """A script that is no part of a package."""
-    found = importlib.util.spec_from_file_location(name, path)
-    assert found is not None and found.loader is not None
-    module = importlib.util.module_from_spec(found)
-    sys.modules[name] = module
-    found.loader.exec_module(module)
-    return module
-
-
-examples = load(ROOT / "docs" / "examples.py", "docs_examples")
 PAGES = examples.pages()
 BLOCKS = [block for page in PAGES for block in examples.blocks(page)]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 COMMANDS = [command for block in BLOCKS if block.language == "console" for command in examples.commands(block)]
 COMMANDS.sort(key=lambda command: command.block.page != TUTORIAL)
-EXTENDING = ROOT / "docs" / "extending"
 FOLLOWED = sorted(
     {b.page for b in BLOCKS if b.language in ("console", "python") and b.page.parent != EXTENDING}
     - {ROOT / "CONTRIBUTING.md"}
@@ -279,101 +256,6 @@ def test_every_page_is_in_the_navigation() -> None:
     text = (ROOT / "mkdocs.yml").read_text()
     listed = set(re.findall(r"[\w/-]+\.md", text))
     assert listed == {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
-
-
-def guide(page: str) -> list[str]:
-    """The Python files that a worked example shows, in order."""
-    shown = [block for block in examples.blocks(EXTENDING / f"{page}.md") if block.language == "python"]
-    return ["\n".join(block.lines) + "\n" for block in shown]
-
-
-def contributed(text: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """A file of the guide as a module, which is taken out again after the test."""
-    monkeypatch.setitem(sys.modules, name, None)
-    file = folder / f"{name}.py"
-    file.write_text(text)
-    return load(file, name)
-
-
-def test_the_pass_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both files as they stand in the guide, in the place that it gives them."""
-    written, its_test = guide("pass")
-    contributed(written, "ttscompile.passes.drop_unit_scale", tmp_path, monkeypatch)
-    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
-    test.test_a_multiplication_by_one_is_gone_and_the_numbers_stay()
-    near_misses = test.test_what_is_not_by_one_or_is_an_output_stays
-    cases = near_misses.pytestmark[0].args[1]
-    assert len(cases) == 2
-    for graph in cases:
-        near_misses(graph)
-
-
-@pytest.mark.slow
-def test_the_policy_family_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its module, its row and its test as they stand in the guide."""
-    module, row, its_test = guide("family")
-    rows = eval(f"({row})", vars(families).copy())
-    monkeypatch.setattr(families, "FAMILIES", (*rows, *families.FAMILIES))
-    contributed(module, "ttscompile.frontends.action_dit", tmp_path, monkeypatch)
-    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
-    for name in ("compiled", "options"):
-        (tmp_path / name).mkdir()
-    test.test_the_compiled_policy_is_the_network_that_was_saved(tmp_path / "compiled")
-    test.test_options_of_other_families_are_refused(tmp_path / "options")
-    refused = test.test_a_file_that_is_no_such_policy_is_refused
-    cases = refused.pytestmark[0].args[1]
-    assert len(cases) == 5
-    for changes, message in cases:
-        refused(tmp_path, changes, message)
-
-
-@pytest.mark.slow
-def test_the_strategy_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The module, its row and its test as they stand in the guide."""
-    written, row, its_test = guide("strategy")
-    contributed(written, "ttscompile.rivals.ends", tmp_path, monkeypatch)
-    monkeypatch.setattr(strategies, "STRATEGIES", (*strategies.STRATEGIES, eval(row, vars(strategies))))
-    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
-    make_task = partial(tasks.make_task, policies.compiled(once), policies.record(tmp_path / "calls.npz"))
-    test.test_whole_steps_are_at_both_ends_where_the_calls_want_them(make_task)
-    for budget in test.test_a_budget_of_one_step_leaves_step_0.pytestmark[0].args[1]:
-        test.test_a_budget_of_one_step_leaves_step_0(make_task, budget)
-
-
-@pytest.mark.slow
-def test_the_proposer_of_the_contributing_guide(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The module, its row and its test as they stand in the guide."""
-    written, row, its_test = guide("proposer")
-    contributed(written, "ttscompile.calibration.proposers.fewer", tmp_path, monkeypatch)
-    rows = (*proposer.PROPOSERS, eval(row, vars(proposer)))
-    monkeypatch.setattr(proposer, "PROPOSERS", rows)
-    monkeypatch.setattr(proposer, "NAMES", tuple(one.name for one in rows))
-    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
-    directory = shutil.copytree(policies.compiled(once), tmp_path / "compiled")
-    recording = policies.record(tmp_path / "calls.npz")
-    test.test_the_step_that_matters_least_is_left_out(directory, recording)
-    test.test_of_step_0_alone_nothing_is_left_out(directory, recording)
-    learned = ("schedule", "fewer")
-    result = calibrate(directory, [recording], 0.6, learn=learned, max_distance=9.0, progress=False)
-    assert result.default_plan == "fewer"
-    assert result.plans["fewer"].sparsity == pytest.approx(result.plans["schedule"].sparsity + 0.1)
-    assert result.told["fewer"].endswith("is left out")
-
-
-@pytest.mark.slow
-def test_the_runtime_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its module, how it is opened, its row and its test as they stand in the guide."""
-    module, opening, row, its_test = guide("runtime")
-    contributed(module, "ttscompile.runtimes.resolved", tmp_path, monkeypatch)
-    names = vars(open_module).copy()
-    exec(opening, names)
-    for name, kind in eval(f"{{{row}}}", names).items():
-        monkeypatch.setitem(open_module.RUNTIMES, name, kind)
-    test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
-    agrees = test.test_it_agrees_with_the_reference
-    for streams in agrees.pytestmark[0].args[1]:
-        agrees(tmp_path / str(streams), streams)
-    test.test_the_pruners_plan_and_reuse_over_calls(tmp_path / "pruned")
 
 
 @pytest.mark.slow

@@ -56,13 +56,9 @@ RIVALS_READ = {
     for name in (
         "calls",
         "execute",
-        "fit_correction",
-        "progress",
         "pruner.head",
         "spacing",
-        "targets",
         "task",
-        "trials",
         "tts",
     )
 }

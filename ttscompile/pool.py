@@ -33,7 +33,6 @@ class Work:
     """What is done with each part.
 
     Attributes:
-        here: in this process.
         elsewhere: makes the same function in another process; importable there.
         given: what it is made from. Sent once, and not with each part.
         threads: whether ``here`` may run in several threads at once.
@@ -172,11 +171,7 @@ def opened_pool(address: str | None) -> Iterator[Pool]:
 
 
 def artifact_elsewhere(path: str, identity: str) -> Artifact:
-    """The artifact in another process, which may be on another machine.
-
-    Raises:
-        CalibrationError: there is another one, or none.
-    """
+    """The artifact in another process, which may be on another machine."""
     try:
         artifact = load_artifact(Path(path))
     except TtscompileError as error:

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import click
+from foresight import Oracle, oracle
 
 from ttscompile.cli.output import counted_parts, print_json, results_console, run, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.rivals.oracle import Oracle, oracle
 
 
 @click.command(cls=FilesCommand, context_settings={"show_default": True})

@@ -38,7 +38,6 @@ class Feasibility:
 
     Attributes:
         latency: the longest call that has to be reckoned with.
-        control_hz: rate of the control loop.
         policy_hz: rate of observations and actions in the policy's own time.
         horizon_steps: actions of a chunk that the policy executes: ``play``.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
@@ -137,10 +136,6 @@ def fast_enough(judged: Mapping[str, Feasibility], refuse: bool) -> tuple[str, .
 class LatencyWindow:
     """What calls take, by the last ones. Warm-up calls are made, and left out, before there is one of these.
 
-    Args:
-        window: calls that count.
-        latencies: seconds of the first ones.
-
     Attributes:
         bound: the longest of them, in seconds.
     """
@@ -161,9 +156,6 @@ class LatencyWindow:
 
         An exception beyond that, because the host stood still, is no reason to give up the distance between calls until
         it is forgotten. Where most calls are beyond it, the longest counts.
-
-        Args:
-            most: the longest call that can be covered.
         """
         if self.bound <= most or self._typical > most:
             return self.bound
@@ -197,14 +189,7 @@ class Tiers:
         return self.plans[self._current]
 
     def after_call(self, missed: bool) -> int:
-        """Take note of a call.
-
-        Args:
-            missed: it was not done in time.
-
-        Returns:
-            1 if this leads to a faster plan, -1 if back to a slower one, else 0.
-        """
+        """Take note of a call: 1 if this leads to a faster plan, -1 if back to a slower one, else 0."""
         if missed:
             self._missed, self._in_time = self._missed + 1, 0
             if self._missed < self._down_after or self._current == len(self.plans) - 1:

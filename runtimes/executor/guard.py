@@ -45,10 +45,8 @@ class Guard:
     """Checks chunks.
 
     Args:
-        limits: what actions may be.
         normalizer: of the actions; None if the policy has none that knows their range (``ChunkSpec.ranged``), and so
             no bounds but the ones in ``limits``.
-        channels: Da.
 
     Raises:
         ExecutorError: a limit has another number of channels, or the bounds leave no room.
@@ -80,15 +78,7 @@ class Guard:
         return None
 
     def refuse_motion(self, played: FloatArray, scheduled: FloatArray) -> str | None:
-        """Why a schedule must not follow what was played.
-
-        Args:
-            played: the last actions that were given out, ``[N, Da]``, oldest first; at most three count.
-            scheduled: ``[M, Da]``, what would follow.
-
-        Returns:
-            The reason, or None.
-        """
+        """Why ``scheduled [M, Da]`` must not follow what was ``played [N, Da]``, of which three count; or None."""
         if self._max_step is None and self._max_jerk is None:
             return None
         for name, limit, order in (("step", self._max_step, 1), ("jerk", self._max_jerk, 3)):

@@ -33,10 +33,6 @@ class Clock(Protocol):
         """Wait until the condition is notified or ``timeout`` seconds of this clock have passed.
 
         May return early; callers look again at what they wait for.
-
-        Args:
-            condition: held by the caller; released while waiting.
-            timeout: seconds; None for no limit.
         """
 
 
@@ -93,11 +89,6 @@ class Jitter:
     """How late the ticks of a loop were, in milliseconds, and what the loop's own work took.
 
     Attributes:
-        hz: rate of the loop.
-        ticks: how many ticks were measured.
-        p50: median lateness.
-        p99: 99th percentile of the lateness.
-        max: the latest tick.
         late: ticks that were later than half a period.
         work_us: median of the work of a tick, microseconds.
     """
@@ -116,13 +107,7 @@ class Jitter:
 
 
 def measure_jitter(hz: float, seconds: float, work: Callable[[], object] = lambda: None) -> Jitter:
-    """Run a loop in real time, sleeping between ticks, and measure how late it wakes.
-
-    Args:
-        hz: rate of the loop.
-        seconds: how long it runs.
-        work: called in every tick.
-    """
+    """Run a loop in real time, sleeping between ticks, and measure how late it wakes."""
     ticks = max(int(seconds * hz), 1)
     late, took = np.empty(ticks), np.empty(ticks)
     start = time.perf_counter()

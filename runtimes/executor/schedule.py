@@ -20,11 +20,6 @@ FAR = 1e6
 class Schedule:
     """The actions of one episode by control tick.
 
-    Args:
-        settings: as given.
-        resolved: what follows from them and the policy.
-        guard: checks chunks before they are scheduled.
-
     Attributes:
         grid: from seconds to ticks.
         timeline: what is scheduled; None before the first chunk.
@@ -71,12 +66,7 @@ class Schedule:
         """Let a chunk join what is scheduled, if the guard has nothing against it.
 
         Args:
-            observed: time of the newest frame that it was computed from.
             actions: ``[horizon + reserve, Da]``; the reserve is left out where the guard refuses that alone.
-            now: when it came.
-
-        Returns:
-            ``scheduled``, ``refused`` or ``overdue``.
         """
         settings, resolved = self._settings, self._resolved
         self.refusal = self._guard.refuse(actions[: resolved.horizon])

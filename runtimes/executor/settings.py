@@ -177,11 +177,7 @@ class Resolved:
 
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
-    """Fit settings to a policy.
-
-    Raises:
-        ExecutorError: they do not fit.
-    """
+    """Fit settings to a policy. Raises ExecutorError: they do not fit."""
     _require_positive(control_hz, "control_hz")
     policy_hz = settings.policy_hz or control_hz
     ticks = control_hz / policy_hz

@@ -50,15 +50,7 @@ class Job:
 
 
 class ExecutorState:
-    """The state of one executor.
-
-    Args:
-        settings: as given.
-        resolved: what follows from them and the policy.
-        normalizer: maps actions to their normalised range; None if the policy has none with a range.
-        tiers: plans that are fast enough.
-        latencies: what calls of each tier took so far.
-    """
+    """The state of one executor."""
 
     def __init__(
         self,
@@ -108,11 +100,7 @@ class ExecutorState:
     # Observations
 
     def observe(self, frame: Frame, time: float, now: float) -> None:
-        """Take a frame.
-
-        Raises:
-            ObservationError: it comes from the future.
-        """
+        """Take a frame. Raises ObservationError: it comes from the future."""
         ahead = time - now
         if not ahead <= 0.5 / self._resolved.control_hz:
             what = f"the observation's time is {ahead:.6g} s ahead of the executor's clock, {now:.6f}"

@@ -10,11 +10,7 @@ import numpy.typing as npt
 
 
 class Samples:
-    """The last measurements of one quantity, and the extremes of all of them.
-
-    Args:
-        size: measurements that percentiles are made from.
-    """
+    """The last measurements of one quantity, and the extremes of all of them."""
 
     def __init__(self, size: int) -> None:
         self._ring = np.empty(size, np.float64)
@@ -154,11 +150,7 @@ class ExecutorStatistics:
 
 
 class Recorder:
-    """Counts and samples of an executor. Changed under its lock only; nothing here allocates while the loop runs.
-
-    Args:
-        window: measurements that percentiles are made from.
-    """
+    """Counts and samples of an executor. Changed under its lock only; nothing here allocates while the loop runs."""
 
     def __init__(self, window: int) -> None:
         self.counts = Counts()

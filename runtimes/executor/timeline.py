@@ -30,9 +30,6 @@ class TickGrid:
     than half a tick, so that the control loop stands in the middle of its ticks and its jitter skips none; those after
     it move it a little, so that a loop whose rate is not exactly what was declared stays there. A rate that is more
     than ``FOLLOW / 2`` off is not followed: then ticks are skipped, or asked for twice, to stay with the time.
-
-    Args:
-        hz: ticks a second.
     """
 
     def __init__(self, hz: float) -> None:
@@ -90,15 +87,9 @@ class Timeline:
 
 
 def expand(actions: FloatArray, ticks_per_step: int, interpolation: str) -> FloatArray:
-    """Actions at the policy's rate as actions at the control rate.
+    """Actions ``[Ta, Da]`` at the policy's rate as actions at the control rate, ``[Ta * ticks_per_step, Da]``.
 
-    Args:
-        actions: ``[Ta, Da]``.
-        ticks_per_step: control ticks that an action lasts.
-        interpolation: ``hold``: an action is repeated; ``linear``: it moves evenly to the next; the last is repeated.
-
-    Returns:
-        float32 ``[Ta * ticks_per_step, Da]``.
+    With ``hold`` an action is repeated; with ``linear`` it moves evenly to the next, and the last is repeated.
     """
     if ticks_per_step == 1:
         return actions

@@ -25,12 +25,7 @@ CONTROL, WORKER, PRUNER = 1, 2, 3
 
 
 class Trace:
-    """The last events. Adding one takes no lock: a deque's ``append`` is atomic.
-
-    Args:
-        events: that are kept; the oldest go first. 0 keeps none.
-        identity: of the artifact; empty for a policy that is none.
-    """
+    """The last events. Adding one takes no lock: a deque's ``append`` is atomic."""
 
     def __init__(self, events: int, identity: str = "") -> None:
         self.on = events > 0
@@ -68,11 +63,7 @@ class Trace:
         self.span(WORKER, "decode", at + before / 1e3, (timings.decode + within) / 1e3)
 
     def to_json(self, process: str = "ttscompile") -> dict[str, Any]:
-        """The document.
-
-        Args:
-            process: name of the process in the picture.
-        """
+        """The document."""
         events = sorted(self._events.copy(), key=lambda event: event[3])
         zero = events[0][3] if events else 0.0
         names = [
@@ -91,11 +82,7 @@ class Trace:
         }
 
     def write(self, path: str | Path, process: str = "ttscompile") -> None:
-        """Write the document to a file, whole or not at all.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write the document to a file, whole or not at all. Raises OSError: it cannot be written."""
         replace_file(Path(path), json.dumps(self.to_json(process), allow_nan=False).encode())
 
 

@@ -130,11 +130,6 @@ class ObservationWindow:
     def add(self, time: float, frame: Frame, now: float) -> str:
         """Take a frame.
 
-        Args:
-            time: when it was taken.
-            frame: checked, and nobody else's.
-            now: when it came.
-
         Returns:
             ``added``; ``replaced`` if there was one of the same time; or ``late``: too old to be part of a window, and
             thrown away.

@@ -29,18 +29,9 @@ from .window import Frame
 class Worker:
     """Owns a policy, and calls it when it is time.
 
-    Args:
-        policy: nobody else's until the thread has ended.
-        settings: as given.
-        resolved: what follows from them and the policy.
-        clock: what time it is.
-        trace: of the executor.
-
     Attributes:
         lock: of everything here that several threads use; held for microseconds.
         news: notified when a call has ended; a condition on ``lock``.
-        process: that the thread is in.
-        feasibility: the arithmetic of each tier.
         failure: what ended the thread; None if nothing did.
     """
 
@@ -74,10 +65,6 @@ class Worker:
 
         Args:
             latencies: seconds of the longest call of each tier, if they are known; None has them measured.
-            timeout: seconds, of real time.
-
-        Returns:
-            The state, which belongs to whoever holds the lock.
 
         Raises:
             ExecutorError: it takes longer than that, or something does not fit.

@@ -33,8 +33,6 @@ class FleetSettings:
     """How copies are made, and how they put requests together.
 
     Attributes:
-        copies: how many there are.
-        threads: of each.
         batch: streams of one call, at most.
         wait_ms: for which a request waits for others of its plan.
     """
@@ -50,11 +48,6 @@ class Copy:
 
     Each call is an episode of its own: the streams of a batch are other robots from call to call. An observation that
     the policy refuses fails alone.
-
-    Args:
-        artifact: its path, the same on every machine.
-        identity: of the artifact that is meant.
-        settings: see there.
 
     Raises:
         ArtifactChangedError: this machine has another artifact there.
@@ -99,12 +92,7 @@ class Copy:
 
 
 class RayCopies:
-    """``server.Copies`` behind a handle of Ray Serve.
-
-    Args:
-        handle: of the deployment of ``Copy``.
-        name: of its application.
-    """
+    """``server.Copies`` behind a handle of Ray Serve."""
 
     def __init__(self, handle: Any, name: str) -> None:
         self._handle, self._name = handle, name
@@ -140,12 +128,6 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
     """Start copies on a cluster, and end them.
 
     No port is opened by Ray Serve: robots come through the server, and its lock.
-
-    Args:
-        address: of the cluster, as ``ray.init`` takes it; ``local`` for one of this machine's cores.
-        artifact: its path, the same on every machine.
-        identity: of the artifact.
-        settings: see there.
 
     Raises:
         RuntimeUnavailableError: Ray is not installed.

@@ -65,11 +65,7 @@ class Plans(NamedTuple):
         return found._replace(default=found.known(found.default))
 
     def known(self, plan: str) -> str:
-        """The name, if it is one of these.
-
-        Raises:
-            IllegalPlanError: see above.
-        """
+        """The name, if it is one of these. Raises IllegalPlanError: see above."""
         if plan not in self.names:
             why = "plans that read the call before are left out, since that may be another robot's"
             raise IllegalPlanError(f"plan {plan[:40]!r} cannot run here: expected one of {list(self.names)}; {why}.")
@@ -94,15 +90,9 @@ class FleetServer(Listener):
     """Serves one artifact to many robots.
 
     Args:
-        artifact: loaded and checked; only what it says of itself is looked at.
-        copies: they compute.
         plan: of requests that name none; None for the artifact's default.
         waiting: requests that may be under way; further ones are refused.
-        limits: what clients may do; None for the defaults.
         lock: who may come in; None lets every program of this machine in, and nobody else.
-
-    Raises:
-        IllegalPlanError: see ``Plans.of``.
     """
 
     methods = METHODS

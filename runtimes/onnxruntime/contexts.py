@@ -19,14 +19,7 @@ from .sessions import Array, Bound, repeat_streams, run_named
 class ContextValues:
     """Arrays that stay where they are, so that sessions can be bound to them.
 
-    Args:
-        manifest: of the artifact.
-        sessions: by piece.
-        tables: TABLE contexts ``[K, ...]``.
-        streams: B.
-
     Attributes:
-        streams: B.
         values: by name; of the condition as they are, of steps and tables ``[K, ...]``.
     """
 
@@ -105,17 +98,7 @@ class ContextValues:
 
 
 class BoundBlock:
-    """A block bound to arrays for all streams, or for n of them.
-
-    Args:
-        session: of the block.
-        piece: of the block.
-        contexts: values for all streams.
-        axis: of the streams in the residual stream.
-        stream: what it reads.
-        residual: what it writes.
-        count: n.
-    """
+    """A block bound to arrays for all streams, or for n of them."""
 
     def __init__(
         self,

@@ -16,12 +16,7 @@ from .workspace import Workspace
 
 
 def decode_first(work: Workspace, keep: BoolArray) -> None:
-    """Step 0, which is dense in every plan, so that it need not wait for one.
-
-    Args:
-        work: observation and noise taken in.
-        keep: bool ``[K, blocks]``; computed residuals that go into the rollout cache.
-    """
+    """Step 0, which is dense in every plan, so that it need not wait for one; ``keep`` is of the rollout cache."""
     work.begin()
     _run_dense(work, 0, keep)
 
@@ -35,13 +30,7 @@ def _run_dense(work: Workspace, k: int, keep: BoolArray) -> None:
 
 
 def decode_rest(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) -> None:
-    """The steps after step 0; the sample is then ``work.sample[K % 2]``.
-
-    Args:
-        work: after ``decode_first``.
-        lowered: instructions of each stream.
-        keep: as above.
-    """
+    """The steps after step 0; the sample is then ``work.sample[K % 2]``."""
     if all(one is lowered[0] for one in lowered):
         _together(work, lowered[0], keep)
     else:

@@ -26,13 +26,6 @@ WORTH = 3
 class IdleSteps:
     """Arrays for B streams.
 
-    Args:
-        session: of the piece ``idle``.
-        sampler: of the policy.
-        sample: ``(T, D)``.
-        streams: B.
-        stream: shape of the residual stream of all streams.
-
     Attributes:
         total: what the steps add to the stream, of its shape; read by ``prepare``.
         history: of the correction, ``[D, B, 4 T]``, as it is after the last step that was run.
@@ -92,12 +85,7 @@ class IdleSteps:
     def run(self, first: int, stop: int, updates: Array, offsets: Array, anchors: Sequence[bool]) -> None:
         """The steps ``first`` to ``stop - 1``, which all add ``total``.
 
-        Args:
-            first: a step.
-            stop: a later one.
-            updates: float32 ``[K, G, R, (1 + S) T]``.
-            offsets: float32 ``[K, D, B, T]``.
-            anchors: of each step, whether it enters the history.
+        Updates are ``[K, G, R, (1 + S) T]``, offsets ``[K, D, B, T]``; ``anchors`` enter the history.
         """
         dot, add = np.dot, np.add
         (sample, prediction), product, base = self._parts[:2], self._product, self._base

@@ -76,11 +76,7 @@ those of onnxruntime, with a thread a core. No argument turns it off."""
 
 
 class Sessions:
-    """The sessions of one artifact's models; views that compute with the same model share its session.
-
-    Args:
-        threads: of arithmetic. With one thread all run on the caller's thread and make none.
-    """
+    """The sessions of one artifact's models; views that compute with the same model share its session."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -91,7 +87,6 @@ class Sessions:
         """What runs each ONNX piece of a view, by name: an ``InferenceSession``, or a ``JointBlock``.
 
         Args:
-            view: within its ``reading``.
             blocks: single blocks, too; else ``of_blocks`` may open them later.
 
         Raises:
@@ -238,10 +233,6 @@ class JointBlock:
 
     Attributes:
         session: an ``InferenceSession`` of the piece ``blocks``.
-        joint: its interface.
-        index: number of the block.
-        piece: of the block.
-        stream: type of the residual stream.
         blanks: by number of streams, zeros for contexts that a block does not read.
     """
 
@@ -273,11 +264,6 @@ class Bound:
     """A session tied to arrays that stay where they are: running it reads some and writes the others.
 
     Binding costs as much as several runs' overhead, and saves it in every run; so bindings are made once and kept.
-
-    Args:
-        session: an ``InferenceSession`` or ``JointBlock``.
-        inputs: by name; contiguous.
-        outputs: by name; contiguous.
     """
 
     __slots__ = ("_arrays", "_binding", "_session")
@@ -296,11 +282,7 @@ class Bound:
             self._binding.bind_output(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
 
     def run(self) -> None:
-        """Run once.
-
-        Raises:
-            ArtifactError: the graph does not do what the manifest says.
-        """
+        """Run once. Raises ArtifactError: the graph does not do what the manifest says."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's own classes, and what it raises itself

@@ -36,20 +36,13 @@ class Workspace:
     ``stem`` and ``advance`` write the stream of a step to ``fresh``; the blocks and ``advance`` read ``stream``. The
     sample has two buffers, taken in turn: step k reads that of ``k % 2``, and ``advance`` writes the other.
 
-    Args:
-        view: of an artifact.
-        sessions: by piece.
-        streams: B.
-
     Attributes:
-        streams: B.
         axis: the axis of the streams in the residual stream.
         sample: two arrays ``[D, B, T]``.
         fresh: the residual stream as a step begins.
         stream: the residual stream after what was added to it.
         current: float32 ``[blocks, *stream]``, what each block computed last.
         table: float32 ``[blocks, *stream]``, what each reused block adds at the moment.
-        rollout: entries of the rollout cache.
         idle: for steps without a computed block; None if the network is of another form.
     """
 
@@ -288,10 +281,6 @@ class RolloutStore:
     """Entries of the rollout cache: copies of computed residuals that a later call of the episode can read.
 
     Memory is taken when an entry is kept for the first time, and stays for the next episodes.
-
-    Args:
-        shape: of a residual of all streams.
-        axis: of the streams in it.
 
     Attributes:
         entries: by flat index ``k * blocks + b``.

@@ -18,16 +18,7 @@ from .reuse import RolloutCache
 
 
 class ReferenceBackend:
-    """A ``Backend`` on ``ReferenceModel``, without gradients; what fails is an error of the artifact.
-
-    Args:
-        view: of an artifact.
-        device: where the network computes; None for the CPU.
-
-    Attributes:
-        keeps: all entries of the rollout cache.
-        model: what it runs.
-    """
+    """A ``Backend`` on ``ReferenceModel``, without gradients; what fails is an error of the artifact."""
 
     def __init__(self, view: View, device: torch.device | None = None) -> None:
         self._view = view

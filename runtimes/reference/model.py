@@ -36,8 +36,6 @@ class Contexts:
     """What the loop reads beside the stream, for one observation.
 
     Attributes:
-        streams: B.
-        condition: condition values by name.
         steps: step values by name, one mapping for each step k; empty mappings if the policy has none.
     """
 
@@ -56,7 +54,6 @@ class Denoised:
 
     Attributes:
         samples: the sample ``[B, T, D]`` after each step, K of them.
-        cache: for the next call of the episode.
     """
 
     samples: tuple[Tensor, ...]
@@ -76,21 +73,12 @@ class ReferenceModel:
 
     Args:
         pieces: the denoiser cut up; the pruner may be missing.
-        spec: the policy beside its network.
-        types: type of each block's residual.
-        groups: FORWARD group of each block.
         weights: value of every constant of the pieces.
         device: where the pieces compute. Samples, and what the sampler does with them, are on the CPU wherever that is.
         first: values of constants that blocks have at step 0, where those are others.
 
     Attributes:
-        device: where the pieces compute.
-        steps: K.
-        blocks: number of residual blocks.
-        groups: FORWARD group of each block.
-        sampler: what moves the sample on.
         weights: every constant by name; at step 0 blocks may have others (``first``).
-        pruner_weights: the pruner's tensors by name.
     """
 
     def __init__(
@@ -145,14 +133,7 @@ class ReferenceModel:
         return {} if pruner is None else {n: self.weights[n] for n in pruner.constants if n.startswith("pruner.")}
 
     def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
-        """Everything that the observation decides before the loop starts.
-
-        Args:
-            obs: normalised observations by key, ``[B, ...]`` each.
-
-        Returns:
-            Tensors of the device.
-        """
+        """Everything that the observation decides before the loop starts."""
         graph = self._pieces.condition
         there = {key: value.to(self.device) for key, value in obs.items()}
         there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
@@ -166,12 +147,7 @@ class ReferenceModel:
         return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
 
     def joined(self, parts: Iterable[Contexts], streams: int) -> Contexts:
-        """What the loop reads for several batches of streams, as for one batch of all of them.
-
-        Args:
-            parts: one after the other; each is copied before the next is made.
-            streams: of all of them together, at least one.
-        """
+        """What the loop reads for several batches of streams, as for one batch of all of them."""
         read = [graph for graph in (self._pieces.condition, self._pieces.step) if graph is not None]
         axes = {name: one.batch_axis for graph in read for name, one in graph.types().items()}
 
@@ -205,7 +181,6 @@ class ReferenceModel:
         """The pruner: float32 ``[B, K, blocks, 4]``.
 
         Args:
-            contexts: of the observation.
             weights: tensors to use in place of the pruner's constants of the same names; gradients flow to them.
 
         Raises:
@@ -222,15 +197,7 @@ class ReferenceModel:
         return self._stem(self._bind(self._pieces.stem, sample.to(self.device), k, contexts))[0]
 
     def block(self, b: int, k: int, stream: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
-        """The residual of block b at step k: what is added to the stream, not the sum.
-
-        Args:
-            b: block.
-            k: step.
-            stream: residual stream of all B streams.
-            contexts: of the observation.
-            streams: which streams to evaluate; None for all. The result holds these only.
-        """
+        """The residual of block b at step k, for all ``streams`` or these: what is added to the stream, not the sum."""
         blocks = self._blocks if k else self._first
         return blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
 
@@ -259,11 +226,7 @@ class ReferenceModel:
         """The denoising loop, whatever the blocks do: what is carried after each step.
 
         Args:
-            contexts: from ``prologue``.
-            initial: the sample at step 0, ``[B, T, D]``.
             noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
-            blocks: asked once a step, in order.
-            correction: of the sampler's steps; None for none.
             known: what a prefix makes known of the samples; None for nothing.
             since: a step to begin with, and what is carried to it; None for the whole loop.
         """
@@ -296,15 +259,10 @@ class ReferenceModel:
         evaluated for the streams that compute them, and nothing else.
 
         Args:
-            contexts: see ``steps_of``.
-            initial: see ``steps_of``.
-            noise: see ``steps_of``.
             gates: one-hot ``[B, K, blocks, 4]``, float32; or a plan, int8 ``[K, blocks]`` or ``[B, K, blocks]``.
             cache: what the previous call of the episode left; None at its start.
             write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,
                 by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
-            correction: see ``steps_of``.
-            known: see ``steps_of``.
 
         Raises:
             IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.

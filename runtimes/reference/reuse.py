@@ -48,8 +48,6 @@ class Cell:
     """One cell for all streams: block b at step k.
 
     Attributes:
-        k: the step.
-        b: the block.
         group: the block's FORWARD group.
         plan: int8 ``[B]``, the source of each stream.
         gates: float32 ``[B, 4]``, the same one-hot, with or without a gradient.
@@ -92,11 +90,8 @@ def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: 
     """What one cell adds to the stream; writes the caches of the streams that compute it.
 
     Args:
-        cell: legal for every stream.
         computed: the block's residual, right for the streams that compute it, and where gates train for the others too;
             None if nobody needs it.
-        caches: changed.
-        write_gradients: see ``ReferenceModel.denoise``.
     """
     forward, timestep = caches.forward.get(cell.group), caches.timestep.get(cell.b)
     rollout = caches.rollout.get((cell.k, cell.b))
@@ -111,11 +106,7 @@ def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: 
 
 
 def stream_axis(kind: TensorType) -> int:
-    """The axis of the streams in a residual.
-
-    Raises:
-        IllegalPlanError: there is none.
-    """
+    """The axis of the streams in a residual. Raises IllegalPlanError: there is none."""
     if kind.batch_axis is None:
         problem = f"the residual stream has type {kind}, without an axis for the streams"
         raise IllegalPlanError(f"{problem}: plans cannot differ by stream.")

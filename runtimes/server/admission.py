@@ -34,13 +34,8 @@ class Connection:
     """A connection, from its socket's acceptance to its end.
 
     Attributes:
-        number: in the order in which they came.
-        peer: address and port.
         network: of the address, which limits are counted by.
-        since: time of the admission's clock.
-        client: whether its handshake was accepted.
         answered: whether its handshake was answered, and so told in the audit.
-        requests: that it has sent.
     """
 
     number: int
@@ -53,12 +48,7 @@ class Connection:
 
 
 class Admission:
-    """Counts and limits; used by the server's event loop alone.
-
-    Args:
-        limits: what clients may do.
-        clock: seconds that never go back.
-    """
+    """Counts and limits; used by the server's event loop alone."""
 
     def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits
@@ -74,13 +64,7 @@ class Admission:
         return sum(each.client for each in self._connections.values())
 
     def comes(self, peer: tuple[Any, ...], own: Any = None) -> bool:
-        """Whether the handshake of a new connection may begin.
-
-        Args:
-            peer: as ``accept`` gives it.
-            own: address of the server that it came to, as ``getsockname`` gives it; with ``peer`` it names the
-                connection, here and in what follows.
-        """
+        """Whether the handshake of a connection may begin; both addresses together name it, from here on."""
         network, now = network_of(peer[0]), self._clock()
         waiting = [each.network for each in self._connections.values() if not each.client]
         if self._refused_lately(network, now) >= self.limits.refusals_per_minute:
@@ -107,14 +91,7 @@ class Admission:
         return ""
 
     def answers(self, peer: tuple[Any, ...], status: int, tls: str | None, own: Any = None) -> None:
-        """Note how a handshake was answered.
-
-        Args:
-            peer: as above.
-            status: of HTTP; 101 makes it a client, and 200 is the answer to somebody who watches.
-            tls: version of TLS, None without.
-            own: as above.
-        """
+        """Note how a handshake was answered: 101 makes it a client, and 200 is for somebody who watches."""
         connection = self._connections[peer, own]
         connection.answered, connection.client = True, status == HTTPStatus.SWITCHING_PROTOCOLS
         no_fault_of_theirs = status in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE)
@@ -161,12 +138,7 @@ class Admission:
 
 
 class AdmittingSocket(socket.socket):
-    """A listening socket that asks about every connection, before a byte of it is read.
-
-    Args:
-        admission: is asked.
-        family: of addresses.
-    """
+    """A listening socket that asks about every connection, before a byte of it is read."""
 
     def __init__(self, admission: Admission, family: int) -> None:
         super().__init__(family, socket.SOCK_STREAM)
@@ -191,14 +163,7 @@ class AdmittingSocket(socket.socket):
 
 
 class AdmittedSocket(socket.socket):
-    """The socket of a connection, which tells when it is closed.
-
-    Args:
-        admission: is told.
-        peer: address, as ``accept`` gives it.
-        own: address of the server that it came to.
-        accepted: whose descriptor this one takes over.
-    """
+    """The socket of a connection, which tells when it is closed."""
 
     def __init__(self, admission: Admission, peer: Any, own: Any, accepted: socket.socket) -> None:
         super().__init__(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
@@ -213,9 +178,7 @@ class AdmittedSocket(socket.socket):
 class Pace:
     """How long a client's next request has to wait, so that it has no more than its share of a second.
 
-    Args:
-        per_second: requests; as many may come at once after a quiet second.
-        now: seconds of any clock.
+    After a quiet second as many may come at once.
     """
 
     def __init__(self, per_second: float, now: float) -> None:

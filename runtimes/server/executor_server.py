@@ -27,8 +27,6 @@ class ExecutorServer(Listener):
     """Serves one executor; it is the caller's, and is not closed here.
 
     Args:
-        executor: shared by all clients.
-        limits: what clients may do; None for the defaults.
         lock: who may come in; None lets every program of this machine in, and nobody else.
     """
 

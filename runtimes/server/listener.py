@@ -62,11 +62,7 @@ class Listener(ABC):
 
     @abstractmethod
     async def do(self, request: Request) -> dict[str, Any]:
-        """The result of a request.
-
-        Raises:
-            TtscompileError: told to the client that asked.
-        """
+        """The result of a request. Raises TtscompileError: told to the client that asked."""
 
     @abstractmethod
     async def trouble(self) -> str:

@@ -57,9 +57,6 @@ class Lock:
     def require(self, address: str) -> None:
         """Refuse an address of a machine that others may reach, unless it is locked or that was asked for.
 
-        Args:
-            address: an IP address.
-
         Raises:
             ExecutorError: see above.
         """

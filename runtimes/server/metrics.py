@@ -17,9 +17,7 @@ class Metric:
     Attributes:
         name: after ``ttscompile_``; of a counter it ends with ``_total``.
         kind: ``counter``, ``gauge`` or ``histogram``.
-        help: what it is.
         samples: labels and value; of a histogram those of its buckets, the last of which has all.
-        sum: of a histogram.
     """
 
     name: str

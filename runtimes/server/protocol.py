@@ -90,11 +90,7 @@ def _checked(document: dict[str, Any], methods: Methods) -> tuple[str, dict[str,
 
 
 def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
-    """The arrays of a frame; shapes are left to ``observe``.
-
-    Raises:
-        ProtocolError: something is no array.
-    """
+    """The arrays of a frame; shapes are left to ``observe``. Raises ProtocolError: something is no array."""
     return read_arrays(obs, {key: spec.dtype for key, spec in frames.specs.items()})
 
 

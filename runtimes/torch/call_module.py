@@ -24,14 +24,7 @@ CPU = torch.device("cpu")
 
 
 class CallModule(nn.Module):
-    """A call of a policy. Every constant is a buffer; there are no parameters, and nothing is kept from call to call.
-
-    Args:
-        view: of an artifact, for the plan.
-        weights: constants that a call needs, by name.
-        advance: of the sampler, with the correction.
-        correction: of the sampler's steps, which belongs to the plan; None for none.
-    """
+    """A call of a policy. Every constant is a buffer; nothing is a parameter, or kept from call to call."""
 
     def __init__(
         self,
@@ -67,11 +60,7 @@ class CallModule(nn.Module):
         return self._spec
 
     def _network(self, obs: Mapping[str, Tensor], initial: Tensor) -> PlainNetwork:
-        """The network of a call.
-
-        Raises:
-            ObservationError: an observation or the initial noise of another shape or dtype, or missing.
-        """
+        """The network of a call."""
         spec = self._spec
         horizon, dimensions = spec.sample
         if initial.ndim != 3 or tuple(initial.shape[1:]) != spec.sample or initial.dtype != torch.float32:

@@ -24,11 +24,7 @@ WARM_UP = 2
 
 
 class Lines:
-    """Runs lines, captured or not.
-
-    Args:
-        capture: how; None to run them as they are.
-    """
+    """Runs lines, captured or not."""
 
     def __init__(self, capture: Capture | None) -> None:
         self._capture = capture
@@ -44,7 +40,6 @@ class Lines:
 
         Args:
             key: of all that the line depends on beside the values of its tensors; None not to capture it.
-            line: what to run.
         """
         if self._capture is None or key is None:
             line()

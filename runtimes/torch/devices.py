@@ -49,9 +49,6 @@ def exact_arithmetic(device: torch.device | None) -> Iterator[None]:
 
     The settings of torch, of which autocast is the thread's and the others are the process's, are as they were after
     it. They have older and newer names; the older ones cannot be read where a caller has used the newer.
-
-    Args:
-        device: where the block computes, beside the CPU; None for the CPU alone.
     """
     cudnn, kinds = torch.backends.cudnn, {"cpu"} if device is None else {"cpu", device.type}
     matmul, convolution = _older(torch.get_float32_matmul_precision), _older(lambda: bool(cudnn.allow_tf32))

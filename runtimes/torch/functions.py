@@ -64,10 +64,7 @@ def write_function(
     """A graph as a function.
 
     Args:
-        graph: what it computes.
-        weights: value of each of its constants, by name, all on one device.
         examples: its inputs in order. Those of every call must have the same shapes, strides and device.
-        streams: B.
         narrow: type to keep the constants of products in; the caller then runs the function under autocast.
 
     Raises:

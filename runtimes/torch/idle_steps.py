@@ -30,12 +30,7 @@ class Prepared(NamedTuple):
 
 
 class IdleSteps:
-    """What steps that add one sum of residuals predict, from numbers of the size of the sample.
-
-    Args:
-        form: of the network.
-        device: where to compute.
-    """
+    """What steps that add one sum of residuals predict, from numbers of the size of the sample."""
 
     def __init__(self, form: IdleForm, device: torch.device) -> None:
         def there(array: object) -> Tensor:

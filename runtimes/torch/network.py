@@ -26,11 +26,7 @@ Array: TypeAlias = npt.NDArray[np.generic]
 
 
 class Placed:
-    """Arrays of an artifact on a device, each once.
-
-    Args:
-        device: where they go.
-    """
+    """Arrays of an artifact on a device, each once."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -45,13 +41,7 @@ class Placed:
 
 
 class Parts:
-    """What all numbers of streams share.
-
-    Args:
-        view: of an artifact.
-        placed: its constants, where to compute.
-        narrow: type of the products in residual blocks; None for float32.
-    """
+    """What all numbers of streams share."""
 
     def __init__(self, view: View, placed: Placed, narrow: torch.dtype | None) -> None:
         self.manifest, self.pieces = view.manifest, view.pieces
@@ -70,11 +60,6 @@ class Parts:
 
 class StreamsNetwork:
     """The pieces for B streams, and the contexts that they read, which stay where they are.
-
-    Args:
-        parts: of the artifact.
-        obs: what the prologue reads: observations by key, ``[B, ...]`` each.
-        streams: B.
 
     Attributes:
         idle: see ``loop.Network``.

@@ -20,21 +20,7 @@ Tensors = Mapping[str, Tensor]
 
 
 class PlainNetwork:
-    """``loop.Network`` of one call; the prologue is computed when it is made.
-
-    Args:
-        pieces: of the artifact.
-        evaluators: of all pieces, from ``evaluators_of``.
-        weights: value of every constant.
-        first: the same at step 0.
-        tables: ``[K, ...]`` by name.
-        obs: normalised, by key.
-        streams: B.
-        idle: see ``loop.Network``.
-
-    Attributes:
-        stream_type: of the residual stream.
-    """
+    """``loop.Network`` of one call; the prologue is computed when it is made."""
 
     def __init__(
         self,
@@ -100,23 +86,13 @@ class PlainNetwork:
         return self._at(k, TAIL, stream)
 
     def contexts(self, k: Tensor) -> dict[str, Tensor]:
-        """All that the pieces of the loop read at a step that only the program knows, by name.
-
-        Args:
-            k: int64 ``[1]``.
-        """
+        """All that the pieces of the loop read at a step that only the program knows, int64 ``[1]``; by name."""
         rows = {name: self._repeated(name, table.index_select(0, k)[0]) for name, table in self._tables.items()}
         known = {**self._weights, **self._condition, **rows}
         return known if self._pieces.step is None else {**known, **self._step_values(known)}
 
     def run(self, name: str, value: Tensor, contexts: Tensors) -> Tensor:
-        """A piece of the loop on a sample or a stream.
-
-        Args:
-            name: of the piece.
-            value: what flows in.
-            contexts: from ``contexts``.
-        """
+        """A piece of the loop on a sample or a stream."""
         return self._run(name, {**contexts, self._streams_of[name]: value})[0]
 
     def _at(self, k: int, name: str, value: Tensor) -> Tensor:

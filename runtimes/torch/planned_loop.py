@@ -32,13 +32,7 @@ from .sampler import Advance, State, begin
 
 
 class SteppedAdvance(Advance):
-    """The same, also at a step that only the program knows.
-
-    Args:
-        spec: of the policy.
-        correction: of the sampler's steps; None for none.
-        device: where to compute.
-    """
+    """The same, also at a step that only the program knows."""
 
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
         super().__init__(spec, correction, device)
@@ -98,10 +92,8 @@ def denoise_as_planned(
     """All steps of a call, in operations that ``torch.export`` takes.
 
     Args:
-        network: of the call.
         groups: FORWARD group of each block, numbered from zero.
         plan: int8 ``[B, K, blocks]``, legal.
-        advance: the sampler.
         initial: the sample at step 0, ``[B, T, D]``.
         offset: what each step adds to the sample, ``[K, D, B, (1 + S) T]``.
         read: what the correction reads of the condition, ``[B, F]``; None if it reads nothing.

@@ -34,10 +34,6 @@ class PrunedCall(CallModule):
     one loop over the steps (``torch.while_loop``) in which each block is a ``torch.cond``: it is not evaluated at a
     step if no stream of the batch computes it there, and otherwise for all of them. For one stream both are the same.
     Stem, tail and sampler are computed at every step.
-
-    Args:
-        view: of an artifact, in a loop that has a pruner.
-        correction: of the pruner's plans; None for none.
     """
 
     def __init__(self, view: View, correction: Correction | None) -> None:

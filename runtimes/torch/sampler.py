@@ -37,11 +37,6 @@ class State(NamedTuple):
 class Advance:
     """The steps of a policy's sampler with one correction.
 
-    Args:
-        spec: of the policy.
-        correction: of the sampler's steps; None for none.
-        device: where to compute.
-
     Attributes:
         horizon: T.
         memories: S.
@@ -94,24 +89,14 @@ class Advance:
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     def of_condition(self, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``.
-
-        Args:
-            condition: ``[B, N]``.
-        """
+        """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``."""
         assert self.reading is not None and self.observed is not None
         read = condition @ self.reading
         added = (read @ self.observed).reshape(len(condition), self.steps, -1, self.horizon)
         return read, added.permute(1, 2, 0, 3)
 
     def jump(self, layers: Sequence[Tensor], read: Tensor | None, history: Tensor) -> Tensor:
-        """What a jump adds, ``[D, B, T]``.
-
-        Args:
-            layers: its own of ``layers``.
-            read: of the condition, ``[B, F]``; None if nothing is.
-            history: after its anchor, ``[D, B, 4 T]``.
-        """
+        """What a jump adds, ``[D, B, T]``, of ``read [B, F]``, if there is any, and ``history [D, B, 4 T]``."""
         dimensions, streams, _ = history.shape
         value = history.permute(1, 0, 2).reshape(streams, -1)
         value = value if read is None else torch.cat([read, value], 1)
@@ -122,14 +107,7 @@ class Advance:
         return added.reshape(streams, dimensions, self.horizon).permute(1, 0, 2)
 
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
-        """What is carried to step k + 1.
-
-        Args:
-            state: at step k.
-            prediction: the network's output, ``[D, B, T]``.
-            k: step.
-            offset: what the step adds beside, ``[D, B, (1 + S) T]``.
-        """
+        """What is carried to step k + 1, of ``prediction [D, B, T]`` and ``offset [D, B, (1 + S) T]``."""
         clean = None
         if self._clip is not None:
             of_sample, of_prediction = self._to_clean[k]

@@ -24,14 +24,8 @@ from .sampler import Advance
 class Inlet:
     """A tensor of the device that the host writes to once a call.
 
-    Args:
-        shape: of it.
-        dtype: of it, by numpy's name.
-        device: of it.
-
     Attributes:
         array: what to write to; on the CPU the memory of the tensor itself.
-        tensor: what the call reads.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: str, device: torch.device) -> None:
@@ -50,13 +44,7 @@ class Inlet:
 class Workspace:
     """Tensors for B streams.
 
-    Args:
-        parts: of the artifact.
-        streams: B.
-
     Attributes:
-        streams: B.
-        network: for B streams.
         result: the denoised sample of the last call, ``[B, T, D]``.
         rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from ttscompile.calibration.step_counts import SpacedSchedules, budget_of_error
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
 from ttscompile.errors import CalibrationError, CalibrationFailedError
-from ttscompile.rivals.oracle import oracle
 
 from .killed import killed
 
@@ -233,9 +231,6 @@ def test_of_one_step_nothing_can_be_reused(artifact: Path, recording: Path, monk
     for asked in ({"max_action_error": 1.0}, {"latency_ms": 1.0}, {"target_sparsity": 0.5}, {}):
         with pytest.raises(CalibrationError, match="one denoising step, which every plan computes"):
             quick(artifact, recording, **asked)
-    monkeypatch.setattr(sys.modules["ttscompile.rivals.oracle"], "load_artifact", lambda _: single)
-    with pytest.raises(CalibrationError, match="1 denoising step; expected three at least"):
-        oracle(artifact, [recording], 2)
 
 
 def test_an_error_needs_the_strategy_that_fits_corrections(artifact: Path, recording: Path) -> None:

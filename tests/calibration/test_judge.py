@@ -16,13 +16,14 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.held import holding
-from ttscompile.calibration.judge import Score, _Answers, further, judge, pairs, rooted, timed
+from ttscompile.calibration.judge import Score, _Answers, further, judge, timed
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import DRAWS, HELD_OUT, LEARNED, STRETCH, Trials
 from ttscompile.core.lattice import dense_plan, uniform_plan, whole_steps_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError
+from ttscompile.measure.energy import pairs, rooted
 from ttscompile.samplers.flow import flow_matching_table
 
 from . import policies

@@ -89,7 +89,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
         inner, middle, outer = (torch.randn(a + 1, b, generator=draw) / a for a, b in sizes)
         return (inner, middle, outer), through((inner, middle, outer), known)
 
-    monkeypatch.setattr(sparse_loop, "fit_jump", drawn_jump)
+    monkeypatch.setattr(sparse_loop, "TERMS", (drawn_jump,))
     some, others = (task.executor.select(task.calls, part) for part in (range(40), range(40, 60)))
     loop = SparseLoop(task.executor, some, others, reads=reads, whole=True)
     plain, place = loop.ends(plan)
@@ -107,7 +107,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
 
 
 def test_without_a_jump_that_holds_there_are_none(make_task: MakeTask, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sparse_loop, "fit_jump", lambda *given: None)
+    monkeypatch.setattr(sparse_loop, "TERMS", (lambda *given: None,))
     task = make_task(calls=60)
     plan: PlanArray = task.whole.plan([0, 5])
     loop = SparseLoop(task.executor, task.calls, None, reads=True, whole=True)
@@ -132,7 +132,7 @@ def test_jumps_stay_if_the_loop_ends_nearer_to_the_dense_policy(
         draw = torch.Generator().manual_seed(seed)
         return (inner, middle, outer), missing if helps else torch.randn(missing.shape, generator=draw)
 
-    monkeypatch.setattr(sparse_loop, "fit_jump", exact_or_worse)
+    monkeypatch.setattr(sparse_loop, "TERMS", (exact_or_worse,))
     correction = fit_correction(task.executor, task.whole.plan([0, 6]), task.calls, True)
     assert correction is not None
     assert bool(correction.landings) == helps

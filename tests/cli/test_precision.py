@@ -105,7 +105,7 @@ def test_bench_times_the_dense_plan_in_fp32_and_names_the_precision(converted: t
     assert labels == ["dense", "full, int8"]
     entered = contestants({"": load_artifact(converted[0])}, ["dense@int8", "full@fp32"], [Way()])
     assert [one.label for one in entered] == ["dense", "dense@int8", "full@fp32"]
-    assert [one.spec.sampler.steps for one in entered] == [100, 100, STEPS]
+    assert all(one.spec is entered[0].spec for one in entered)  # whose noise serves the loops of all
     ((obs, noise),) = random_calls(entered[0].spec, 1, 0)
     answers = [one.call(obs, noise)["action"] for one in entered]  # type: ignore[index]
     policy = ttscompile.load(converted[0], plan="dense")

@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 
 import pytest
+from choosing import SINGLE
 from click.testing import CliRunner
 from oracle import main
 
 from tests.calibration import policies
 from tests.once import Once
 from ttscompile.errors import CalibrationError
-from ttscompile.rivals.choosing import SINGLE
 
 
 @pytest.mark.slow

@@ -196,13 +196,13 @@ def test_blocks_of_another_precision(tmp_path: Path) -> None:
     lowered |= lower_all_blocks(program.pieces.blocks, {**models, **lowered})
     write_artifact(program, models, tmp_path / "artifact", LoweredPieces("int8", lowered, weights))
     model = lower_single_file(program, {**models, **lowered}, {**program.weights, **weights})
-    policy = ttscompile.load(tmp_path / "artifact", precision="int8")
+    policy = ttscompile.load(tmp_path / "artifact")
     obs, noise = inputs(policy, np.random.default_rng(0), 2)
     dense = np.zeros((5, 6), np.int8)
     out = Episode(model.SerializeToString(), 2).call(obs, noise, dense)
-    expected = policy.predict_action(obs, noise=noise, plan="dense")
+    expected = policy.predict_action(obs, noise=noise, plan="full")
     np.testing.assert_allclose(out["action"], expected["action"], rtol=1e-4, atol=1e-4)
-    fp32 = ttscompile.load(tmp_path / "artifact", precision="fp32").predict_action(obs, noise=noise, plan="dense")
+    fp32 = policy.predict_action(obs, noise=noise, plan="dense")
     assert np.abs(fp32["action"] - expected["action"]).max() > 1e-3
 
 

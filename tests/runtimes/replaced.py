@@ -25,6 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 import ttscompile
 from tests.plans import store_schedules
 from ttscompile.artifact.files import beside, exchange, replace_folder
@@ -214,5 +217,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
     raise SystemExit(main())

@@ -58,9 +58,6 @@ def unpack(path: Path) -> Unpacked:
 
     The files may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
 
-    Args:
-        path: the zip file.
-
     Returns:
         The folder, with the files that the manifest declares and no others.
 

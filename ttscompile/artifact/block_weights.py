@@ -42,16 +42,7 @@ def without_weights(manifest: Manifest, kept: Collection[str]) -> Manifest:
 
 
 def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockWeights) -> Manifest:
-    """Write weights into the artifact's directory, in files that nothing has yet.
-
-    Args:
-        artifact: as it is.
-        manifest: as it will be, but for these weights.
-        name: of the weights.
-        own: the weights.
-
-    Returns:
-        The manifest with their record.
+    """Write weights into the artifact's directory, in files that nothing has yet; the manifest with their record.
 
     Raises:
         ArtifactError: a weight that is no constant of the artifact, or is one of another type.

@@ -27,16 +27,7 @@ def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArra
 
 
 def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:
-    """The corrections among some arrays, by the name of the plan.
-
-    Args:
-        stored: arrays; those of other names are left alone.
-        manifest: of the artifact.
-        where: for messages.
-
-    Raises:
-        ArtifactError: a correction of no plan, with too few or too many fields, or that does not fit the policy.
-    """
+    """The corrections among some arrays, by the name of the plan; arrays of other names are left alone."""
     parts = {name.removeprefix(PREFIX): array for name, array in stored.items() if name.startswith(PREFIX)}
     wanted = dict[str, tuple[str, ...]]()
     for name in sorted({name.rpartition("/")[0] for name in parts}):
@@ -58,11 +49,7 @@ def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest,
 
 
 def require_fit(correction: Correction, manifest: Manifest, loop: str) -> None:
-    """Raise unless it is a correction for this loop of a policy.
-
-    Raises:
-        IllegalPlanError: it is not.
-    """
+    """Raise IllegalPlanError unless it is a correction for this loop of a policy."""
     start, sample = manifest.starts.get(loop), manifest.spec.sample
     whole = manifest.steps_of(loop if start is None else start.loop)
     correction.require_fit(manifest.steps_of(loop), sample, manifest.condition_numbers, groups_of(whole, sample))

@@ -24,11 +24,7 @@ PARTIAL = ".partial"
 
 
 def describe(path: Path) -> FileRecord:
-    """Size and hash of a file.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Size and hash of a file. Raises OSError: it cannot be read."""
     with path.open("rb") as file:
         return FileRecord(sha256=hashlib.file_digest(file, "sha256").hexdigest(), bytes=path.stat().st_size)
 
@@ -43,11 +39,7 @@ _AGAIN = "Copy the artifact again, or convert the checkpoint again."
 
 @contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """A file to read from. Anything else is refused unread: a pipe or a device may never end.
-
-    Raises:
-        ArtifactError: missing, something else than a file, or it cannot be read, now or within the block.
-    """
+    """A file to read from. Anything else is refused unread: a pipe or a device may never end."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else a pipe waits for somebody who writes into it
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -62,21 +54,13 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """The content of a file of at most so many bytes; of a larger one no more is read, and the last byte is too many.
-
-    Raises:
-        ArtifactError: see ``opened``.
-    """
+    """The content of a file of at most so many bytes; of a larger one these, and one that is too many."""
     with opened(path) as file:
         return file.read(limit + 1)
 
 
 def check_file(path: Path, record: FileRecord) -> None:
-    """Raise unless the file is what its record says.
-
-    Raises:
-        ArtifactError: missing, unreadable, of another size, or of other content.
-    """
+    """Raise unless the file is what its record says."""
     with opened(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size != record.bytes:

@@ -143,11 +143,7 @@ def plan_arrays(plans: Mapping[str, GoldenPlan]) -> dict[str, Array]:
 
 
 def load_golden(artifact: Artifact) -> Golden:
-    """The record of an artifact.
-
-    Raises:
-        ArtifactError: it has none, or one that does not fit.
-    """
+    """The record of an artifact. Raises ArtifactError: it has none, or one that does not fit."""
     manifest, spec = artifact.manifest, artifact.manifest.spec
     if manifest.stores.golden is None:
         raise ArtifactError(
@@ -221,11 +217,7 @@ def _wanted_of(
 
 
 def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:
-    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none.
-
-    Raises:
-        ArtifactError: records that do not fit.
-    """
+    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none."""
     manifest = artifact.manifest
     if manifest.stores.golden_plans is None:
         return {}

@@ -94,9 +94,6 @@ class Artifact:
     def reading(self, *names: str) -> Iterator[None]:
         """Within the block these files, in ``files``, are those that were checked.
 
-        Args:
-            names: none means all.
-
         Raises:
             ArtifactChangedError: a file was changed or replaced since it was checked.
         """
@@ -161,11 +158,7 @@ class Artifact:
 
     @cached_property
     def graphs(self) -> Mapping[str, Graph]:
-        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``.
-
-        Raises:
-            ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
-        """
+        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``."""
         graphs, own = {}, {of_loop(PRUNER, loop): one for loop, one in self.loop_pruners.items()}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)
@@ -175,22 +168,14 @@ class Artifact:
         return MappingProxyType(graphs)
 
     def graph(self, name: str) -> Graph:
-        """The graph of one piece.
-
-        Raises:
-            ArtifactError: ``program.json`` is not valid or has no such graph.
-        """
+        """The graph of one piece. Raises ArtifactError: ``program.json`` is not valid or has no such graph."""
         if name not in self.graphs:
             raise ArtifactError(f"{self.path}: has no graph {name!r}; it has {list(self.graphs)}. {REMEDY}")
         return self.graphs[name]
 
     @cached_property
     def pieces(self) -> Pieces:
-        """The pieces as the reference runtime executes them.
-
-        Raises:
-            ArtifactError: see ``graphs``.
-        """
+        """The pieces as the reference runtime executes them. Raises ArtifactError: see ``graphs``."""
         streams = self._document.keys("graphs", "streams")["streams"].members()
 
         def inside(name: str) -> LoopPiece:
@@ -217,9 +202,6 @@ class Artifact:
 def load_artifact(path: str | Path) -> Artifact:
     """Open an artifact and check all of it: schema, sizes and hashes of all files, identity, plans, onnxruntime.
 
-    Args:
-        path: the directory that ``convert`` wrote, or the same zipped.
-
     Returns:
         The artifact; arrays are mapped, not read.
 
@@ -241,20 +223,12 @@ def load_artifact(path: str | Path) -> Artifact:
 
 
 def require_artifact_path(path: Path) -> None:
-    """Raise unless there is something that may be an artifact.
-
-    Raises:
-        ArtifactError: there is nothing, or something that is never read.
-    """
+    """Raise unless there is something that may be an artifact."""
     require_path(path, ArtifactError, "Give the directory that 'ttscompile convert' wrote.")
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Read ``manifest.json`` of a directory, and nothing else.
-
-    Raises:
-        ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
-    """
+    """Read ``manifest.json`` of a directory, and nothing else."""
     path = directory / MANIFEST
     require_artifact_path(directory)
     if not os.path.lexists(path):

@@ -119,11 +119,7 @@ class FlopsRecord:
         return fixed + plan_flops(plan, self.blocks)
 
     def ceiling(self, steps: int) -> float:
-        """How many times the FLOPs of a call are that computes step 0 alone, in a dense call: no plan saves more.
-
-        Args:
-            steps: K. The ceiling is below K: prologue, stems and tails are always computed.
-        """
+        """How many times the FLOPs of a call are that computes step 0 alone, in a dense call: no plan saves more."""
         fixed, blocks = self.prologue + steps * (self.stem + self.tail), sum(self.blocks)
         return (fixed + steps * blocks) / (fixed + blocks)
 
@@ -148,10 +144,6 @@ class PlanRecord:
     Attributes:
         kind: where its cells are: ``schedule``, in the file of plans; ``pruner``, made for each observation; ``all``,
             every cell is computed.
-        loop: see ``Plan``.
-        weights: see ``Plan``.
-        precision: see ``Plan``.
-        tokens: see ``Plan``.
         otherwise: name of the plan of a call that has no chunk to begin with; None for loops that begin with noise.
         sparsity: share of reused cells; of a pruner the measured mean, None if it was not measured.
         flops_sparsity: the same with each cell weighed by its FLOPs.

@@ -44,11 +44,7 @@ _PLAN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.%-]{0,63}")
 
 
 def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.NDArray[Any]]:
-    """Values of the constants of these graphs, by name.
-
-    Raises:
-        ArtifactError: a constant without a value, or with a value of another type.
-    """
+    """Values of the constants of these graphs, by name."""
     found: dict[str, npt.NDArray[Any]] = {}
     for piece, graph in graphs.items():
         for name, kind in graph.constants.items():
@@ -61,11 +57,7 @@ def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.ND
 
 
 def block_records(program: Program) -> tuple[BlockRecord, ...]:
-    """The block table; FLOPs are those of the pieces, which is what is left after hoisting.
-
-    Raises:
-        ArtifactError: table and pieces differ in number.
-    """
+    """The block table; FLOPs are those of the pieces, which is what is left after hoisting."""
     graphs = [piece.graph for piece in program.pieces.blocks]
     if len(graphs) != len(program.blocks):
         raise ArtifactError(f"the program has {len(program.blocks)} blocks and {len(graphs)} block graphs. {REPORT}")
@@ -108,11 +100,7 @@ def tokens_records(program: Program) -> dict[str, TokensRecord]:
 
 
 def context_records(program: Program) -> dict[str, ContextRecord]:
-    """Binding and type of every context, in order of first use.
-
-    Raises:
-        ArtifactError: a context without binding, value or table, or of two types.
-    """
+    """Binding and type of every context, in order of first use."""
     pieces = program.pieces
     readers = {name: piece.contexts for name, piece in pieces.loop.items()}
     computed = {Binding.TABLE: set(pieces.tables), Binding.CONDITION: set(pieces.condition.outputs)}
@@ -147,13 +135,8 @@ def piece_records(
     """One record an ONNX model.
 
     Args:
-        program: in its pieces.
         models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
             ``dense_step``, and perhaps ``idle`` and ``layers``.
-        files: file name of each model.
-
-    Raises:
-        ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
     optional = {names.IDLE, *(names.of_loop(names.ADVANCE, loop) for loop in program.spec.loops)}
     expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}
@@ -172,11 +155,7 @@ def piece_records(
 
 
 def requirements(models: Mapping[str, ModelProto]) -> Requires:
-    """What these models need.
-
-    Raises:
-        ArtifactError: more than the onnxruntime that the package asks for.
-    """
+    """What these models need. Raises ArtifactError: more than the onnxruntime that the package asks for."""
     opset = max(entry.version for model in models.values() for entry in model.opset_import if not entry.domain)
     ir = max(model.ir_version for model in models.values())
     if opset > MAX_OPSET or ir > MAX_IR:
@@ -189,11 +168,6 @@ def requirements(models: Mapping[str, ModelProto]) -> Requires:
 
 def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[str, Any]) -> dict[str, PlanRecord]:
     """Records of plans by name, ``dense`` left out; see ``write.update_plans``.
-
-    Args:
-        manifest: with the loops and weights that the plans name.
-        plans: by name.
-        record: of the calibration: what the plans of the pruner come to on average is in it.
 
     Raises:
         ArtifactError: names that cannot be, fields that name what the artifact lacks, or sparsities that are no shares.

@@ -12,11 +12,7 @@ from .manifest import Requires
 
 
 def check_runtime(requires: Requires, directory: Path) -> None:
-    """Raise if onnxruntime is there, and too old for the graphs of an artifact.
-
-    Raises:
-        ArtifactError: says which version they need.
-    """
+    """Raise ArtifactError if onnxruntime is there, and too old for the graphs of an artifact."""
     if importlib.util.find_spec("onnxruntime") is None:
         return  # the reference runtime does without; the onnxruntime runtime says that it is missing
     # From 1.31 on it reports its use to its makers, on threads of its own, for which the end of a forked child waits.

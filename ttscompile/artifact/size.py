@@ -23,11 +23,7 @@ _HISTORY = 16
 
 
 def check_size(manifest: Manifest, directory: Path) -> None:
-    """Raise if the values that a manifest declares are out of proportion to its files: it may declare what it likes.
-
-    Raises:
-        ArtifactError: they are.
-    """
+    """Raise if the values that a manifest declares are out of proportion to its files: it may declare what it likes."""
     allowed = max(FREE_BYTES, MAX_RATIO * sum(record.bytes for record in manifest.files.values()))
     total = sum(_bytes(manifest))
     if total > allowed:

@@ -105,11 +105,7 @@ def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
 
 
 def offsets(path: Path) -> dict[str, tuple[int, int]]:
-    """Byte offset in the file, and length in bytes, of each tensor.
-
-    Raises:
-        ArtifactError: see ``read_header``.
-    """
+    """Byte offset in the file, and length in bytes, of each tensor. Raises ArtifactError: see ``read_header``."""
     return {name: (entry.offset, entry.length) for name, entry in read_header(path).items()}
 
 
@@ -118,9 +114,6 @@ def read(path: Path) -> Mapping[str, Array]:
 
     Returns:
         Read-only arrays, views of the file: nothing is read before it is used.
-
-    Raises:
-        ArtifactError: see ``read_header``.
     """
     with opened(path) as file:
         entries = _header(file, path)
@@ -140,18 +133,7 @@ def check_arrays(
     where: object,
     remedy: str = REMEDY,
 ) -> None:
-    """Raise unless these are exactly the arrays that are wanted.
-
-    Args:
-        kind: what each of them is, for messages.
-        arrays: by name.
-        wanted: dtype and shape by name.
-        where: they come from, for messages.
-        remedy: what to do.
-
-    Raises:
-        ArtifactError: names the first that is missing, too many, or of another dtype or shape.
-    """
+    """Raise ArtifactError unless these are exactly the arrays that are wanted, of the wanted dtypes and shapes."""
     found = {name: (str(array.dtype), array.shape) for name, array in arrays.items()}
     wrong = sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
     if wrong:
@@ -162,20 +144,12 @@ def check_arrays(
 
 
 def serialize(arrays: Mapping[str, Array]) -> bytes:
-    """The bytes of a safetensors file, the same whatever the order of the arrays.
-
-    Raises:
-        ArtifactError: an array of a dtype that the format or the reader lacks.
-    """
+    """The bytes of a safetensors file, the same whatever the order of the arrays."""
     return b"".join(_chunks(arrays))
 
 
 def write(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write a new safetensors file, one array after the other: all of them together may be half of the memory.
-
-    Raises:
-        ArtifactError: see ``serialize``.
-    """
+    """Write a new safetensors file, one array after the other: all of them together may be half of the memory."""
     write_synced(path, _chunks(arrays))
 
 

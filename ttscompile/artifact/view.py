@@ -37,8 +37,6 @@ class View:
     """See the module. ``view_of`` makes it.
 
     Attributes:
-        artifact: loaded and checked.
-        variant: what it is a view for.
         manifest: the artifact's, with the sampler, FLOPs and pieces of this loop, and the plans of this variant.
         tables: TABLE contexts ``[K, ...]`` of this loop.
         start: how a loop begins that goes on with the chunk of the call before; None where it begins with noise.
@@ -150,7 +148,6 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
     """The view for a plan.
 
     Args:
-        artifact: loaded and checked.
         plan: a plan, or the name of one; None for the artifact's default.
 
     Raises:
@@ -190,11 +187,7 @@ def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:
 
 
 def _require(manifest: Manifest, variant: Variant) -> None:
-    """Raise unless the artifact has what a plan names; what a runtime can do is another question.
-
-    Raises:
-        IllegalPlanError: says what is missing.
-    """
+    """Raise IllegalPlanError unless the artifact has what a plan names; what a runtime can do is another question."""
     if variant.loop not in manifest.loops:
         raise IllegalPlanError(f"the artifact has no loop {variant.loop!r}; it has {list(manifest.loops)}.")
     if variant.weights not in (known := [ORIGINAL, *manifest.weights]):
@@ -205,11 +198,7 @@ def _require(manifest: Manifest, variant: Variant) -> None:
 
 
 def require_held(artifact: Artifact, plan: Plan) -> None:
-    """Raise unless the artifact holds models for every precision of a plan.
-
-    Raises:
-        ArtifactError: it does not; says what it has.
-    """
+    """Raise ArtifactError unless the artifact holds models for every precision of a plan."""
     record = artifact.manifest.precision
     held = {} if record is None else dict.fromkeys(record.kept, record.name)
     for part, precision in plan.precision.items():

@@ -84,9 +84,6 @@ def write_artifact(
         beside: files for other programs, by name, one of ``BESIDE``.
         loop: of plan ``full``.
 
-    Returns:
-        The manifest.
-
     Raises:
         ArtifactError: ``directory`` is something else than an artifact, or cannot be written; or program and models do
             not fit each other. Nothing is changed then.
@@ -143,9 +140,6 @@ def update_plans(
         golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
         held: whether the caller has the artifact ``locked``.
-
-    Returns:
-        The new manifest.
 
     Raises:
         ArtifactError: no artifact, a zipped one, one that is being updated, or arguments that do not fit it.
@@ -298,11 +292,7 @@ def _fill(
 
 
 def require_unzipped(path: str | os.PathLike[str]) -> Path:
-    """The directory of an artifact that is about to be changed.
-
-    Raises:
-        ArtifactError: no artifact, or a zipped one.
-    """
+    """The directory of an artifact that is about to be changed. Raises ArtifactError: no artifact, or a zipped one."""
     directory = Path(path)
     require_artifact_path(directory)
     if not directory.is_dir():
@@ -317,11 +307,7 @@ def identified(manifest: Manifest) -> Manifest:
 
 
 def require_replaceable(directory: str | os.PathLike[str]) -> None:
-    """Raise unless a directory is free, empty, or an artifact and nothing else: users' files are never removed.
-
-    Raises:
-        ArtifactError: it is something else.
-    """
+    """Raise unless a directory is free, empty, or an artifact and nothing else: users' files are never removed."""
     require_free_or_path(directory, ArtifactError, "Give another output directory.")
     target = Path(os.path.realpath(directory))
     if not target.exists():
@@ -343,11 +329,7 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
-
-    Raises:
-        ArtifactError: somebody else is at it; or it cannot be locked.
-    """
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too."""
     with ExitStack() as held:
         try:
             held.enter_context(lock_folder(directory))

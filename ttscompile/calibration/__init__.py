@@ -1,6 +1,7 @@
 """Calibration: an artifact learns from a few recorded episodes which residuals it can reuse.
 
-The main path is ``pipeline``: calls and their ``targets``, then the ``tts`` strategy, which places ``whole_steps`` and
-gives them a ``correction``, then the ``judge``. The other strategies are in ``published``; ``strategies`` lists all of
-them. ``pruner`` learns where a plan may depend on the observation. This package and ``strategies`` import no torch.
+The main path is ``pipeline``: ``trials`` of what the original answers; then each ``proposer`` proposes plans, and the
+``judge`` judges them. Schedules are found by ``strategies``, of which ``tts`` is the default. What was asked for and
+cannot be is a ``CalibrationError`` of any function of this room. This package, ``proposer`` and ``strategies`` import
+no torch.
 """

@@ -36,11 +36,7 @@ fitted on 30 calls does harm, on 64 it lowers the held-out error from 19 to 6 px
 
 
 def require_limits(validation_fraction: float, max_minutes: float) -> None:
-    """Raise unless some episodes are held out, others are not, and there is time.
-
-    Raises:
-        CalibrationError: says what was found.
-    """
+    """Raise CalibrationError unless some episodes are held out, others are not, and there is time."""
     if not 0 < validation_fraction < 1 or not max_minutes > 0:
         raise CalibrationError(
             f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {validation_fraction} and"
@@ -82,14 +78,7 @@ def require_directory(path: Path) -> None:
 def calls_to_learn_from(
     manifest: Manifest, max_minutes: float, corrects: bool, distils: bool = False
 ) -> tuple[int, int]:
-    """How many calls there have to be, and how many there are if the time is enough to answer them.
-
-    Args:
-        manifest: of the policy.
-        max_minutes: the time limit.
-        corrects: whether a correction is fitted on them, which reads more the longer the horizon is.
-        distils: whether weights are trained on them.
-    """
+    """How many calls there have to be, and how many there are if the time is enough to answer them."""
     spec, most = manifest.spec, MOST_CALLS
     if distils or (corrects and may_jump(spec.sample)):
         most = int(np.clip(ROOM // _context_bytes(manifest), MOST_CALLS, MOST_LEARNED))

@@ -44,13 +44,7 @@ class Split:
 
 
 def split_episodes(count: int, fraction: float, seed: int) -> Split:
-    """Divide episodes at random.
-
-    Args:
-        count: the number of episodes, at least two.
-        fraction: of them for validation; at least one, and at least one is left to learn from.
-        seed: the seed of the division.
-    """
+    """Divide episodes at random; at least one for validation, and at least one is left to learn from."""
     order = np.random.default_rng((seed, 0)).permutation(count)
     held_out = min(max(round(count * fraction), 1), count - 1)
     return Split(
@@ -130,10 +124,6 @@ def sample_calls(
     """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
 
     Args:
-        episodes: all recorded episodes.
-        numbers: which to draw from.
-        limit: number of calls.
-        seed: the seed of the draw.
         repeats: how often a call may be drawn (it will have another noise each time), after all the others were.
     """
     draw = np.random.default_rng((seed, 1, *numbers))
@@ -179,12 +169,8 @@ def prepare_calls(
     """Calls without targets: draw their noise and run the prologue.
 
     Args:
-        model: of the policy.
         spec: of the policy, with the loop of the model.
-        episodes: all recorded episodes.
         chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
-        seed: the seed of the noise.
-        window: see ``Calls``.
         pinned: whether all calls of a window have the noise of its first; else each has noise of its own.
     """
     initial, noise = draw_noise(spec, len(chosen), seed)
@@ -232,9 +218,6 @@ def draw_noise(spec: PolicySpec, count: int, seed: tuple[int, ...]) -> tuple[Ten
 class Actions:
     """Finds what is executed of denoised samples, and how far two of them are apart.
 
-    Args:
-        spec: the specification of the policy.
-
     Attributes:
         size: number of executed action numbers of a call.
     """
@@ -253,16 +236,7 @@ class Actions:
         return part.reshape(*part.shape[:-2], self.size)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:
-        """Mean absolute difference of the executed actions of each call; at most ``LARGEST``, also where they are NaN.
-
-        Args:
-            samples: ``[..., N, T, D]``.
-            targets: ``[N, T, D]``.
-            units: in the units of the actions, rather than normalised.
-
-        Returns:
-            ``[..., N]``.
-        """
+        """Mean absolute difference of the executed actions of each call, ``[..., N]``; at most ``LARGEST``."""
         difference = (self.executed(samples) - self.executed(targets)).abs()
         if units:
             difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)

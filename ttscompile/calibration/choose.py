@@ -12,11 +12,10 @@ from ..measure.points import Point, efficient
 from ..measure.timer import Times
 from .judge import Score, judge, timed
 from .kept import Kept
-from .proposer import Request
+from .proposer import Request, near
 from .proposers.loops import too_far
 from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
-
 
 SAFER = 0.7
 """Of the default's distance: at most so much has the plan ``safe``."""
@@ -33,7 +32,7 @@ class Tried:
         interval: 95 % interval of that.
         milliseconds: median of a call on this machine.
         worst: longest of the calls that were timed, in milliseconds.
-        near: whether it may be the default: the upper end of the interval is within the bound.
+        near: whether it may be the default (``proposer.near``).
         on_frontier: whether no other plan is faster and nearer.
         kept: whether the artifact has it.
     """
@@ -75,7 +74,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
 
     Without a deadline the fastest plan that is near enough is the default. With one it is the nearest of those whose
     longest call keeps it. ``schedule`` is the name of the default, ``safe`` that of the fastest plan that is a good
-    deal nearer, and ``fast`` that of the next faster one, whose distance is within the bound and its upper limit is not.
+    deal nearer, and ``fast`` that of the next faster one, whose distance is within the bound and its limit is not.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -98,8 +97,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
     times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))
     points = {name: Point("", name, scores[name].distance, times[name].median) for name in entered}
     best = {point.name for point in efficient(list(points.values()))}
-    near = [name for name in entered if name != DENSE and scores[name].interval[1] <= request.bound]
-    chosen = _chosen(near, scores, times, request)
+    close = [name for name in entered if name != DENSE and near(scores[name], request.bound)]
+    chosen = _chosen(close, scores, times, request)
     named = {chosen: SCHEDULE}
     others = [name for name in best if name not in (DENSE, chosen)]
     if nearer := [name for name in others if scores[name].distance <= SAFER * scores[chosen].distance]:
@@ -117,7 +116,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
             interval=scores[name].interval,
             milliseconds=times[name].median,
             worst=max(times[name].ms),
-            near=name == DENSE or name in near,
+            near=name == DENSE or name in close,
             on_frontier=name in best,
             kept=name == DENSE or name in named,
         )
@@ -126,15 +125,15 @@ def choose(kept: Kept, request: Request) -> Frontier:
     return Frontier(tried, plans, {named[name]: scores[name] for name in named}, SCHEDULE)
 
 
-def _chosen(near: Sequence[str], scores: Mapping[str, Score], times: Mapping[str, Times], request: Request) -> str:
-    if not near:
+def _chosen(close: Sequence[str], scores: Mapping[str, Score], times: Mapping[str, Times], request: Request) -> str:
+    if not close:
         name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
         raise CalibrationFailedError(too_far(name, scores[name], request.bound))
     if request.deadline_ms is None:
-        return min(near, key=lambda name: times[name].median)
-    in_time = [name for name in near if max(times[name].ms) <= request.deadline_ms]
+        return min(close, key=lambda name: times[name].median)
+    in_time = [name for name in close if max(times[name].ms) <= request.deadline_ms]
     if not in_time:
-        name = min(near, key=lambda name: max(times[name].ms))
+        name = min(close, key=lambda name: max(times[name].ms))
         raise CalibrationFailedError(
             f"no plan that is near enough keeps {request.deadline_ms:.3g} ms: the fastest, {name!r}, took"
             f" {times[name].median:.3g} ms, and {max(times[name].ms):.3g} at worst, with {request.threads} thread"

@@ -20,7 +20,6 @@ class Clock:
         begun: reading of ``time.monotonic`` when this part began; None for now.
 
     Attributes:
-        limit: the argument of this name.
         cut: whether anything was left out for want of time.
     """
 

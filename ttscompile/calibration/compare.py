@@ -43,14 +43,7 @@ LEARNED = 256
 
 @dataclass(frozen=True, eq=False)
 class Entrant:
-    """A plan that takes part.
-
-    Attributes:
-        series: see ``MeasuredPoint``.
-        name: see ``MeasuredPoint``.
-        trials: of its artifact.
-        plan: what is judged.
-    """
+    """A plan that takes part."""
 
     series: str
     name: str
@@ -84,29 +77,24 @@ def compare(
 
     Args:
         path: the artifact whose dense policy is the truth.
-        trajectories: recorded episodes, see ``ttscompile.trajectories``.
         strategies: names; each finds a plan for each sparsity.
         sparsities: shares of the cells to reuse.
         observation: see ``ttscompile.calibrate``.
         others: artifacts of the same policy, for instance with other samplers; their plans take part.
         calls: held-out calls, at most.
         learned: calls that strategies learn from, at most.
-        threads: how many threads the runtime uses.
         seed: the seed of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.
         max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
             has no plan within the budget by then is left out.
         correct: let the plans of strategies that fit no correction take part a second time, with one that is fitted to
             them, where that is better. Their series are called ``STRATEGY, corrected``.
-        progress: told how far it is.
         ray: address of a Ray cluster that answers the dense calls and does the searches, or ``local``, see
             ``ttscompile.calibrate``; held-out calls are timed in this process. None does everything here.
         resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
             strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
         plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
             all where none is named. ``NAME@PRECISION`` is one in another precision.
-        runtime: that executes the plans.
-        device: see ``load``.
 
     Raises:
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.

@@ -38,10 +38,7 @@ class Executor:
             streams and residuals.
 
     Attributes:
-        view: the same.
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
-        model: of the policy.
-        types: of each block's residual.
         axes: of the streams in each block's residual.
         alike: whether all blocks have residuals of one type.
         pruner_graph: the pruner; None if the artifact has none.
@@ -91,15 +88,11 @@ class Executor:
         )
 
     def run(self, plan: PlanArray, calls: Calls) -> Tensor:
-        """The denoised sample of every call.
+        """The denoised sample of every call, ``[N, T, D]``.
 
         Args:
             plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. A cell that reads of an earlier
                 call what no earlier one of its window computed reads TIMESTEP, as legalised plans do.
-            calls: N of them.
-
-        Returns:
-            ``[N, T, D]``.
 
         Raises:
             IllegalPlanError: a plan reads the rollout cache and calls are independent, or step 0 is not dense.
@@ -139,12 +132,7 @@ class Executor:
             return np.asarray(self.model.logits(calls.contexts, tensors).numpy(), dtype=np.float32)
 
     def samples(self, calls: Calls, blocks: Blocks) -> Iterator[Tensor]:
-        """The sample ``[N, T, D]`` after each step, with the executor's correction.
-
-        Args:
-            calls: N of them.
-            blocks: from a step and the stream after its stem to the stream after its last block.
-        """
+        """The sample ``[N, T, D]`` after each step, with the executor's correction."""
         loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction)
         return (carried.sample for carried in loop)
 
@@ -231,10 +219,6 @@ class State:
 
 def rollout_reads(column: PlanArray, window: int) -> tuple[IntArray, IntArray]:
     """Which calls read ROLLOUT in a cell, and from which call each: from the last before it that computed the cell.
-
-    Args:
-        column: ``[N]``, the cell of each call's plan; or ``[1]`` for all calls, of which none then reads another.
-        window: consecutive calls.
 
     Returns:
         Numbers of calls, twice ``[n]``. A call whose cell no earlier one of its window computed is not among them.

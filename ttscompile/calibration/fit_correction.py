@@ -21,11 +21,8 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
     """The correction of a schedule, or one for all plans of a pruner; None where the sparse loop ends in no numbers.
 
     Args:
-        executor: runs the policy; its own correction is not used.
         plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. It may read the rollout cache where
             the calls are windows.
-        calls: to fit it on, with their dense paths.
-        reads: whether it may read the observation.
     """
     loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
     ends = loop.ends(plan) if may_jump(executor.view.manifest.spec.sample) else (loop.end(plan),)

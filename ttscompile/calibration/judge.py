@@ -20,20 +20,18 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core.lattice import Source, plan_flops, sparsity
 from ..core.plan import Plan
-from ..core.spec import FloatArray, SamplerTable
+from ..core.spec import FloatArray
 from ..errors import CalibrationError
+from ..measure.energy import Numbers, pairs, rooted
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport
 from ..runtimes.runtime import Runtime
 from .calls import LARGEST
 from .trials import DRAWS, HELD_OUT, Sample, Trials
-
-Numbers = npt.NDArray[np.float64]
 
 STREAMS = 32
 """Calls that are computed together, at most."""
@@ -91,9 +89,6 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT, threads: int | None 
     the chunk of another episode, as if the world had changed between two calls; the worse of the two counts.
 
     Args:
-        trials: holding all that the plan names.
-        plan: any that a runtime can execute.
-        part: of the episodes.
         threads: with which its calls are timed; None leaves that out.
 
     Raises:
@@ -310,35 +305,6 @@ def _scored(
     )
 
 
-def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
-    """h, and how far two answers of the original are apart, mean over the pairs of draws of each call.
-
-    Args:
-        x: what a plan answers, ``[N, R, A]``.
-        y: what the original answers.
-
-    Returns:
-        ``[N]`` twice.
-    """
-    found = []
-    for i, j in combinations(range(x.shape[1]), 2):
-        crossed = _far(x[:, i], y[:, j]) + _far(x[:, j], y[:, i])
-        apart = _far(y[:, i], y[:, j])
-        found.append((crossed - _far(x[:, i], x[:, j]) - apart, apart))
-    h, far = np.mean(found, axis=0)
-    return h, far
-
-
-def _far(one: Numbers, other: Numbers) -> Numbers:
-    return np.asarray(np.sqrt(np.square(one - other).mean(-1)))
-
-
-def rooted(gap: float, apart: float) -> float:
-    """The root of a mean h in units of how far answers of the original are apart; of less than 0 that of its size."""
-    share = gap / max(apart, 1e-12)
-    return float(np.sign(share) * np.sqrt(abs(share)))
-
-
 def _resampled(gaps: Numbers, apart: float) -> Numbers:
     """The distance with episodes drawn anew, of the mean h of each; the same draws for equally many episodes."""
     drawn = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLED, len(gaps)))
@@ -348,9 +314,5 @@ def _resampled(gaps: Numbers, apart: float) -> Numbers:
 
 def _paired(trials: Trials, plan: Plan) -> bool:
     """Whether the noise of the plan's calls means the same as in the original."""
-
-    def kind(table: SamplerTable) -> tuple[str, int, bool]:
-        return table.name, table.steps, table.stochastic
-
     original = trials.executor.view.artifact.manifest.spec.sampler
-    return plan.otherwise is None and kind(trials.artifact.manifest.sampler_of(plan.loop)) == kind(original)
+    return plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,16 +27,23 @@ Layers = tuple[Tensor, Tensor, Tensor]
 
 
 def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> tuple[Layers, Tensor] | None:
+    """A jump that is trained; ``seed`` is of the weights that it begins with, and of the order of the calls."""
+    return on_other_episodes(partial(_trained, seed=seed), known, missing, episodes)
+
+
+def on_other_episodes(
+    fit: Callable[[Tensor, Tensor], Layers], known: Tensor, missing: Tensor, episodes: IntArray
+) -> tuple[Layers, Tensor] | None:
     """A jump, fitted on all calls, and what it would have added to each had its episode not been there.
 
     What follows in the loop is to be fitted on the latter: a network is better on the calls that it has seen, and
     corrections that are fitted after it would take it for that good.
 
     Args:
+        fit: makes layers of what some calls read and what they miss.
         known: what it reads, ``[n, I]``.
         missing: what should be added, ``[n, D T]``.
         episodes: of each call, ``[n]``.
-        seed: of the weights that training begins with, and of the order of the calls.
 
     Returns:
         Its layers, each with the row that is added last, and ``[n, D T]``. None where that leaves over more than is
@@ -45,10 +55,10 @@ def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> t
     added = torch.zeros_like(missing)
     for fold in range(FOLDS):
         apart = torch.from_numpy(of_call % FOLDS == fold)
-        added[apart] = through(_trained(known[~apart], missing[~apart], seed), known[apart])
+        added[apart] = through(fit(known[~apart], missing[~apart]), known[apart])
     if not (missing - added).square().mean() < missing.square().mean():
         return None
-    return _trained(known, missing, seed), added
+    return fit(known, missing), added
 
 
 def _trained(known: Tensor, missing: Tensor, seed: int) -> Layers:

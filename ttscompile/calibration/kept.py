@@ -21,16 +21,11 @@ class Kept:
     """See the module.
 
     Args:
-        trials: of the artifact as it is.
         anew: whether to begin with the base of the calibration. Else with the artifact's plans, to which others come.
 
     Attributes:
         trials: of the artifact with all that is kept.
-        default: name of the best plan.
-        plans: by name.
-        scores: of those that were judged, by name.
         judged: the plans that these scores are of, by name.
-        notes: on those that were proposed, by name.
         weights: of blocks, that came with them.
         starts: loops, that came with them.
         pruner: constants, and the loop whose pruner has them; None where they stay.

@@ -14,11 +14,7 @@ Progress = Callable[[str, int, int], None]
 
 
 class Bar:
-    """One line: what is being done, how far it is, error, sparsity and time left. A context manager.
-
-    Args:
-        shown: False for silence.
-    """
+    """One line: what is being done, how far it is, error, sparsity and time left. A context manager."""
 
     def __init__(self, shown: bool) -> None:
         columns = (

@@ -35,13 +35,8 @@ BETTER = 0.9
 class Schedule:
     """Plans of whole steps, corrected; or what another strategy finds. See ``Proposer``.
 
-    Args:
-        request: see ``Request``.
-
     Attributes:
-        told: see ``Proposer``.
         budget: what was asked for, once it is known what it comes to.
-        intervals: how many the search took.
         stopped: why it ended: ``finished`` or ``time limit``.
         skipped: why there is no plan of a name that there might be.
     """

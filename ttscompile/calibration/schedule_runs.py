@@ -20,14 +20,7 @@ BYTES = 2**29
 
 
 class ScheduleRuns:
-    """The way of schedules through a sparse loop.
-
-    Args:
-        loop: for whole steps.
-        steps: K.
-        blocks: of the network.
-        bytes_: see ``BYTES``.
-    """
+    """The way of schedules through a sparse loop."""
 
     def __init__(self, loop: SparseLoop, steps: int, blocks: int, bytes_: int = BYTES) -> None:
         self._loop, self._steps, self._bytes = loop, steps, bytes_

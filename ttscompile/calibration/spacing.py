@@ -20,13 +20,7 @@ FEW = 128
 
 
 def spaced_steps(steps: int, full_steps: int, crowding: float) -> tuple[int, ...]:
-    """Which steps to compute, in order.
-
-    Args:
-        steps: K, the number of denoising steps.
-        full_steps: how many steps are computed; step 0 is one of them.
-        crowding: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``.
-    """
+    """Which steps to compute, in order: the i-th of m is at ``K * (1 - (1 - i/m) ** crowding)``, the first at 0."""
     wished = steps * (1 - (1 - np.arange(full_steps) / full_steps) ** crowding)
     chosen: list[int] = []
     for i, wish in enumerate(wished):  # distinct, in order, and leaving room for those that follow

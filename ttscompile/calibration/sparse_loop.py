@@ -27,6 +27,9 @@ from .regression import Components, Solved, solve
 STREAMS = 64
 """Calls that go through the loop at once."""
 
+TERMS = (fit_jump,)
+"""Ways to fit what is added where a jump ends; of those that hold, the one that leaves least over is taken."""
+
 ANCHOR_SHARE = 0.5
 """Of the blocks that a step computes, from which on it is an anchor."""
 
@@ -48,11 +51,8 @@ class Place:
     """Before a step of a sparse loop.
 
     Attributes:
-        step: the number of the step.
         fitted: calls that corrections are fitted on, at this place.
         judged: others, that only go along.
-        solved: the corrections of the steps before.
-        anchors: whether these steps are anchors.
         jumps: those that hold, by the step after which they were added.
     """
 
@@ -118,13 +118,7 @@ class SparseLoop:
         self.begin = Place(0, batches(fitted), batches(judged))
 
     def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
-        """The place after one step more.
-
-        Args:
-            place: before it.
-            rows: of the plan of all calls, ``[1, blocks]``, or of the plan of each.
-            pool: see ``pool.workers``; the batches go through the network beside each other.
-        """
+        """The place after one step more, of one row of a plan for all calls, ``[1, blocks]``, or one for each."""
         batches, anchor = [batch.fork() for batch in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
         ends = np.cumsum([len(batch.sample) for batch in batches])[:-1]
         own = [rows] * len(batches) if len(rows) == 1 else np.split(rows, ends)
@@ -166,10 +160,11 @@ class SparseLoop:
         known = torch.cat([self._known, torch.cat([batch.history for batch in batches])], 1)
         missing = torch.cat([batch.left for batch in fitted])
         landing = place.step - 1
-        found = fit_jump(known[: len(missing)], missing, self._episodes, landing)
-        if found is None:
+        fitted_terms = (fit(known[: len(missing)], missing, self._episodes, landing) for fit in TERMS)
+        held = [one for one in fitted_terms if one is not None]
+        if not held:
             return None
-        layers, added = found
+        layers, added = min(held, key=lambda one: float((missing - one[1]).square().mean()))
         added = torch.cat([added, through(layers, known[len(missing) :])])
         ends = np.cumsum([len(batch.sample) for batch in batches])[:-1].tolist()
         for batch, part in zip(batches, added.tensor_split(ends), strict=True):
@@ -202,13 +197,7 @@ class SparseLoop:
 
 
 class _Batch:
-    """Some of the calls at a place.
-
-    Args:
-        executor: runs the policy.
-        calls: the calls.
-        sums: keep of residuals what all blocks added together, which is enough for whole steps.
-    """
+    """Some of the calls at a place; with ``sums`` residuals are kept as their sum, which is enough for whole steps."""
 
     def __init__(self, executor: Executor, calls: Calls, sums: bool) -> None:
         self._executor, self._calls, self._sums = executor, calls, sums

@@ -34,12 +34,10 @@ class StateFile:
     """The state of one calibration or comparison.
 
     Args:
-        directory: the directory of the artifact.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
         work: ``calibration`` or ``comparison``.
 
     Attributes:
-        arrays: the saved arrays by name.
         progress: how far the work is, as JSON.
     """
 
@@ -58,9 +56,6 @@ class StateFile:
 
         Returns:
             Whether there was anything.
-
-        Raises:
-            CalibrationError: it is damaged, or belongs to a run with other settings.
         """
         if self.warning or not self._path.exists():
             return False
@@ -88,11 +83,7 @@ class StateFile:
         return True
 
     def save(self) -> None:
-        """Write everything, at once or not at all.
-
-        Raises:
-            CalibrationError: the directory cannot be written.
-        """
+        """Write everything, at once or not at all. Raises CalibrationError: the directory cannot be written."""
         if self.warning:
             return
         texts = {_SETTINGS: self._settings, _PROGRESS: json.dumps(self.progress, sort_keys=True)}
@@ -108,11 +99,7 @@ class StateFile:
             self.warning = told
 
     def remove(self) -> None:
-        """Forget everything.
-
-        Raises:
-            CalibrationError: the directory cannot be written.
-        """
+        """Forget everything. Raises CalibrationError: the directory cannot be written."""
         if self.warning:
             return
         try:
@@ -125,11 +112,7 @@ class StateFile:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Within the block an error is one of the state: it has everything that was written, and yet does not fit.
-
-        Raises:
-            CalibrationError: it does not.
-        """
+        """Within the block an error is one of the state: it has everything that was written, and yet does not fit."""
         try:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:

@@ -33,7 +33,6 @@ class Best:
     """The best of a family.
 
     Attributes:
-        steps: that are computed.
         error: on calls that its correction was not fitted on, in the units of the actions.
     """
 
@@ -45,10 +44,7 @@ class SpacedSchedules:
     """Compares crowded schedules, and remembers every comparison in the state.
 
     Args:
-        whole: compares schedules of whole steps.
-        state: the state of the calibration.
         clock: nothing is begun that would end, with the correction and the judgement that follow, after its limit.
-        bar: shows the progress.
         key: what the state calls the comparisons.
     """
 
@@ -56,13 +52,7 @@ class SpacedSchedules:
         self._whole, self._state, self._clock, self._bar, self._key = whole, state, clock, bar, key
 
     def best(self, full_steps: int, what: str, crowding: Sequence[float] = CROWDING) -> Best | None:
-        """The best of the family of ``full_steps`` computed steps, of those that there was time for; None if of none.
-
-        Args:
-            full_steps: how many steps are computed, at least one.
-            what: what the schedule is for, as the bar shows it.
-            crowding: the crowdings of the members of the family.
-        """
+        """The best of the family of ``full_steps`` computed steps, of those that there was time for; or None."""
         found: tuple[Errors, tuple[int, ...]] | None = None
         members = spacings(self._whole.steps, full_steps, crowding)
         self._bar.stage(what, len(members))
@@ -136,9 +126,6 @@ def named_plans(
     """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.
 
     ``strategy`` found the target's plan, which computes ``cells``.
-
-    Returns:
-        Plans by name, with the computed steps in their notes; and by name why there is no plan.
     """
     steps, target = task.executor.model.steps, max(1, cells // task.executor.model.blocks)
     plans: dict[str, Found] = {}

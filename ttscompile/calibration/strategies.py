@@ -59,11 +59,7 @@ class Strategy:
         return found
 
     def require_reach(self, steps: int, blocks: int, budget: int) -> None:
-        """Refuse a budget of computed cells, step 0 included, that the strategy cannot keep.
-
-        Raises:
-            CalibrationError: it computes more; says how much sparsity it can reach.
-        """
+        """Refuse a budget of computed cells, step 0 included, that the strategy cannot keep."""
         least, cells = self.least(steps, blocks), steps * blocks
         if budget < least:
             raise CalibrationError(
@@ -146,11 +142,7 @@ DEFAULT = NAMES[0]
 
 
 def strategy_of(name: str) -> Strategy:
-    """The strategy of this name.
-
-    Raises:
-        CalibrationError: there is none; lists those that there are.
-    """
+    """The strategy of this name. Raises CalibrationError: there is none; lists those that there are."""
     for one in STRATEGIES:
         if one.name == name:
             return one

@@ -49,13 +49,9 @@ class Task:
     """What to find a plan for.
 
     Attributes:
-        executor: runs the policy.
-        actions: which part of the sample counts.
         calls: to learn from, with targets; never those that the plan is judged on.
         budget: cells that a plan may compute, step 0 included.
-        seed: the seed of everything random.
         pruner: constants of the pruner by name; empty if the artifact has none.
-        kinds: what each block is.
         whole: compares schedules of whole steps on ``calls``.
         clock: what can be left out is not begun if it would end after its limit.
     """
@@ -104,9 +100,6 @@ class Task:
         """What a strategy found, with corrections where they are better: of the schedule, and of the pruner's plans.
 
         The pruner's plans share one correction, fitted along the plan that each call has.
-
-        Raises:
-            CalibrationError: the schedule reads the rollout cache, and the calls are independent of each other.
         """
         if self.calls.window == 1 and (found.schedule == Source.ROLLOUT.value).any():
             raise CalibrationError(
@@ -165,11 +158,7 @@ class Search(Protocol):
         """Everything that ``restore`` needs."""
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Go back to where ``state`` was taken.
-
-        Raises:
-            KeyError: not the state of this search.
-        """
+        """Go back to where ``state`` was taken. Raises KeyError: not the state of this search."""
 
     def found(self) -> Found:
         """The outcome."""

@@ -79,20 +79,15 @@ class Trials:
 
     Attributes:
         artifact: as it would be with what is judged; ``holding`` adds to it, in memory.
-        episodes: the recorded ones.
         split: numbers of those that are learned from, and of those that are held out.
         seed: of the split, the noise, and everything else that is random.
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
         observations: that the original answers, at most, of either part.
-        name: of the best plan so far.
         until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
-        clock: of all work.
-        bar: told how far it is.
-        pool: where the original answers.
         device: where the network computes; None for the CPU.
         runtime: that executes what is judged, where it can.
     """
@@ -213,7 +208,6 @@ class Trials:
         and any loop begins alike.
 
         Args:
-            spec: of the view of the plan.
             keys: of each call, what tells it from others: part, stretch, row and draw.
         """
         drawn = [_draw(spec, (self.seed, 5, *key)) for key in keys]

@@ -24,9 +24,6 @@ DISTANCES = (8, 4, 2, 1)
 class Tts:
     """The search of this module; see ``Search``.
 
-    Args:
-        task: see ``Task``.
-
     Attributes:
         loss: error of the plan on calls that its correction was not fitted on.
     """

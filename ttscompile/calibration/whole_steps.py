@@ -35,12 +35,7 @@ MakePlans = Callable[[Calls], PlanArray]
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean absolute error of the executed actions of a schedule.
-
-    Attributes:
-        normalised: as the network has them.
-        units: in the units of the actions.
-    """
+    """Mean absolute error of the executed actions of a schedule."""
 
     normalised: float
     units: float
@@ -50,8 +45,6 @@ class WholeSteps:
     """Compares schedules of whole steps.
 
     Args:
-        executor: runs the policy.
-        actions: which part of the sample counts.
         calls: with what the dense policy answers to them.
         seed: decides which of the calls corrections are fitted on, and which, of other episodes, schedules are compared
             on.

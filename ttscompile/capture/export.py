@@ -50,7 +50,6 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
         module: takes ``spec.sample_argument`` float32 ``[B, T, D]``, ``spec.timestep_argument`` ``[B]`` of the dtype of
             ``spec.sampler.timesteps`` and every observation ``[B, ...]`` as the keyword that ``spec.arguments`` says;
             returns one tensor ``[B, T, D]``.
-        spec: the policy beside its network.
 
     Returns:
         The graph, whose inputs are sample, timestep and the observations in this order, and the value of each constant.

@@ -28,7 +28,6 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
 
     Args:
         module: as ``compile_denoiser`` takes it; it has to accept a shorter sample.
-        spec: of the policy with all steps.
         prediction_horizon: T, at least up to the last action that is executed.
 
     Returns:

@@ -194,13 +194,7 @@ def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
 
 
 def _precision_error(artifact: Artifact, plans: Sequence[str], way: Way) -> PrecisionError | None:
-    """What fewer bits that a runtime makes itself do to dense actions: how far they are from those in fp32.
-
-    Args:
-        artifact: with the dense plan.
-        plans: of which the first in such a precision counts; None comes of none.
-        way: that they run; fp32 runs the same.
-    """
+    """What fewer bits that a runtime makes itself do to dense actions: how far they are from those in fp32."""
     asked = [plan.partition("@")[2] for plan in plans]
     if not (found := [one for one in asked if one in kind_of(way.runtime).made]):
         return None

@@ -33,11 +33,7 @@ class PrecisionError:
     """How far executed actions of dense calls are from those in fp32, with equal noise, in their units.
 
     Attributes:
-        precision: of the calls.
-        calls: how many.
-        mean: over the calls.
         p90: 90th percentile over the calls.
-        largest: of all numbers.
     """
 
     precision: str
@@ -52,9 +48,6 @@ class BenchReport:
     """What was found.
 
     Attributes:
-        measured: everybody's times.
-        default: name of the artifact's default plan.
-        calls: of each.
         by_threads: median of one plan in ms by its number of threads.
         error: of dense calls in a precision that a runtime makes; None if no plan asks for one.
         loop: which plans keep up; None if that was not asked.

@@ -16,6 +16,7 @@ from ttscompile.cli.options import (
     count_option,
     json_option,
     names_option,
+    number_option,
     ray_option,
     seed_option,
     threads_option,
@@ -23,7 +24,7 @@ from ttscompile.cli.options import (
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_written
-from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
+from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, NumberOption
 
 
 @click.command(cls=FilesCommand)
@@ -33,34 +34,34 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
     "--learn",
     LEARNED,
     default="schedule",
-    help=f"What is learned, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
+    help=f"Learn these, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
 )
-@click.option(
+@number_option(
     "--target-sparsity",
-    type=SHARE,
-    help="Reuse this share of the cells. Without any budget it is 0.95, or what leaves five steps to compute.",
+    SHARE,
+    "Reuse this share of the cells. Without any budget it is 0.95, or what leaves five steps to compute.",
 )
-@click.option(
+@number_option(
     "--target-flops",
-    type=SHARE,
-    help="Save this share of the FLOPs of a dense call, prologue and pruner counted, in place of --target-sparsity.",
+    SHARE,
+    "Save this share of the FLOPs of a dense call, prologue and pruner counted, in place of --target-sparsity.",
 )
-@click.option(
+@number_option(
     "--latency-ms",
-    type=MILLISECONDS,
-    help="Have a call take no longer than this with onnxruntime on this machine, measured at the start, in place of"
+    MILLISECONDS,
+    "Have a call take no longer than this with onnxruntime on this machine, measured at the start, in place of"
     " --target-sparsity.",
 )
-@click.option(
+@number_option(
     "--max-action-error",
-    type=ERROR,
-    help="Take the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is not"
+    ERROR,
+    "Take the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is not"
     " above this, in place of --target-sparsity.",
 )
-@click.option(
+@number_option(
     "--max-distance",
-    type=ERROR,
-    help="Take a cheaper plan if it is no further than this from the original than a dearer one, in units of what other"
+    ERROR,
+    "Take a cheaper plan if it is no further than this from the original than a dearer one, in units of what other"
     " noise changes; without this option it is what each that learns allows.",
 )
 @threads_option("Threads of the calls that --latency-ms is about.")
@@ -69,7 +70,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
     type=click.Choice(NAMES),
     default=DEFAULT,
     show_default=True,
-    help=f"How the schedule is found. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
+    help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
 @click.option(
     "--correct",
@@ -81,6 +82,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 @seed_option("Seed of the split, the noise and the training.")
 @click.option(
     "--max-minutes",
+    cls=NumberOption,
     type=MINUTES,
     default=15.0,
     show_default=True,

@@ -28,16 +28,7 @@ def compare(
     sparsities: Sequence[float] = (),
     **how: Any,
 ) -> Comparison:
-    """Hold plans against the dense policy on held-out calls; warnings go to standard error.
-
-    Args:
-        directory: the artifact.
-        artifacts: it and the others, as they were opened before.
-        others: where the others are.
-        trajectories: recorded episodes.
-        strategies: that find plans, too.
-        sparsities: for them.
-        how: what else ``ttscompile.calibration.compare`` takes.
+    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
 
     Raises:
         ArtifactChangedError: an artifact was replaced meanwhile.

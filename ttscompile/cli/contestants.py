@@ -30,13 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Way:
-    """How a compiled policy runs.
-
-    Attributes:
-        runtime: ``onnxruntime`` or ``torch``.
-        device: that torch computes on; None for the CPU.
-        threads: that it computes with.
-    """
+    """How a compiled policy runs."""
 
     runtime: str = "onnxruntime"
     device: str | None = None
@@ -59,10 +53,8 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
     more than two copies of the weights. A plan that goes on from an earlier call has a policy of its own.
 
     Args:
-        artifacts: by name.
         plans: of the first artifact, and of the others where they have one of this name; all where none is named.
             ``NAME@PRECISION`` is one in another precision.
-        ways: how they run.
 
     Raises:
         ArtifactError: one cannot be run, or has no models of a plan's precision.
@@ -70,7 +62,6 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
         RuntimeUnavailableError: a runtime or device cannot be had, or cannot do what a plan asks for.
     """
     made: list[Contestant] = []
-    specs: dict[tuple[str, str], PolicySpec] = {}
 
     def enter(series: str, policy: CompiledPolicy, plan: str, way: Way) -> None:
         policy.reset()
@@ -79,12 +70,9 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
             label.append(way.place)
         if len({one.threads for one in ways}) > 1:
             label.append(f"{way.threads} thread{'s' * (way.threads > 1)}")
-        found = artifacts[series].plan(plan)
         if "@" not in plan:
-            label += dict.fromkeys(found.precision.values())
-        found = found.otherwise or found  # whose loop the noise is for
-        spec = specs.setdefault((series, found.loop), view_of(artifacts[series], found).manifest.spec)
-        one = plan_contestant(", ".join(label), policy, plan, spec)
+            label += dict.fromkeys(artifacts[series].plan(plan).precision.values())
+        one = plan_contestant(", ".join(label), policy, plan, artifacts[series].manifest.spec)
         made.append(replace(one, threads=way.threads))
 
     for series, artifact in artifacts.items():
@@ -110,18 +98,7 @@ def _goes_on(artifact: Artifact, plan: Plan) -> bool:
 
 
 def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
-    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
-
-    Args:
-        checkpoint: as ``convert`` took it.
-        encoders: the folder that ``convert`` was given with it, if it was.
-        threads: of PyTorch.
-        artifact: that was made from it.
-
-    Raises:
-        RuntimeUnavailableError: there is no torch.
-        SpecError: the checkpoint is of another policy.
-    """
+    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another."""
     try:
         import torch
 
@@ -150,16 +127,7 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
 
 
 def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = None) -> tuple[nn.Module, PolicySpec]:
-    """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
-
-    Args:
-        checkpoint: as ``convert`` took it.
-        spec: specification of the policy in the artifact.
-        encoders: see ``originals``.
-
-    Raises:
-        SpecError: the checkpoint is of another policy.
-    """
+    """The network of the checkpoint that an artifact was made from, and what that says about it; needs torch."""
     from ttscompile.frontends import load_checkpoint_policy
     from ttscompile.frontends.families import as_converted
 

@@ -90,11 +90,7 @@ class Commands(click.Group):
 
 @contextmanager
 def _told_at_the_end(words: Sequence[str]) -> Iterator[None]:
-    """Say what went wrong in the block, and end the process with its status.
-
-    Args:
-        words: of the command line, the program's name first.
-    """
+    """Say what went wrong in the block, and end the process with its status."""
     try:
         try:
             yield

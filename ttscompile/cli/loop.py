@@ -27,7 +27,6 @@ class LoopReport:
     """Which plans keep up.
 
     Attributes:
-        control_hz: rate of the loop.
         judged: a verdict by label.
         jitter: how late a loop woke, alone and beside a plan; None if that was not measured.
     """
@@ -71,8 +70,6 @@ class Loop:
     """A control loop that plans are judged for.
 
     Attributes:
-        control_hz: its rate.
-        settings: of the executor.
         jitter: seconds for which a loop is run to see how late it wakes; None for not at all.
     """
 
@@ -81,11 +78,7 @@ class Loop:
     jitter_seconds: float | None = None
 
     def require(self, entered: Sequence[Contestant]) -> None:
-        """Raise unless the policies of all of these fit.
-
-        Raises:
-            ExecutorError: one does not.
-        """
+        """Raise ExecutorError unless the policies of all of these fit."""
         for one in entered:
             self._with(one)
 
@@ -95,13 +88,7 @@ class Loop:
         return resolve(replace(self.settings, tiers=(one.plan,)), one.policy.info, self.control_hz)
 
     def judge(self, entered: Sequence[Contestant], measured: Sequence[Measurement], plans: Sequence[str]) -> LoopReport:
-        """The longest call of each has to fit.
-
-        Args:
-            entered: those of networks are left out.
-            measured: what their calls took.
-            plans: that a loop may run beside, of which the fastest is taken.
-        """
+        """The longest call of each has to fit; a loop may run beside the fastest. Networks are left out."""
         driving = [(one, m) for one, m in zip(entered, measured, strict=True) if one.policy is not None]
         judged = {m.label: self._with(one).feasibility(max(m.times_ms) / 1e3) for one, m in driving}
         jitter = None
@@ -112,13 +99,7 @@ class Loop:
         return LoopReport(self.control_hz, judged, jitter)
 
     def _jitter(self, beside: Contestant, latency: float, seconds: float) -> dict[str, Jitter]:
-        """Run a loop of about ``JITTER_HZ``, alone and with the executor at work.
-
-        Args:
-            beside: whose calls the executor makes.
-            latency: of its calls, seconds.
-            seconds: of each run.
-        """
+        """Run a loop of about ``JITTER_HZ``, alone and with the executor at work."""
         policy, policy_hz = beside.policy, self._with(beside).policy_hz
         hz = ceil(JITTER_HZ / policy_hz) * policy_hz
         settings = ExecutorSettings(

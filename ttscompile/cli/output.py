@@ -110,21 +110,13 @@ def counted_parts() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def manifest_of(path: Path) -> Manifest:
-    """Manifest of an artifact; in a directory nothing else is read and checked.
-
-    Raises:
-        ArtifactError: there is no artifact.
-    """
+    """Manifest of an artifact; in a directory nothing else is read and checked."""
     require_artifact_path(path)
     return read_manifest(path) if path.is_dir() else load_artifact(path).manifest
 
 
 def identity_of(path: Path) -> str:
-    """Identity of an artifact, 64 digits.
-
-    Raises:
-        ArtifactError: there is no artifact.
-    """
+    """Identity of an artifact, 64 digits. Raises ArtifactError: there is no artifact."""
     return manifest_of(path).identity
 
 

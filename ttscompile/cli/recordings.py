@@ -49,22 +49,13 @@ def _sources(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> 
 
 
 def require_recordings(paths: Iterable[Path]) -> None:
-    """Raise unless all of these exist: to be told before torch is imported, which takes seconds.
-
-    Raises:
-        TrajectoryError: names the first that does not.
-    """
+    """Raise TrajectoryError unless all of these exist: to be told before torch is imported, which takes seconds."""
     for path in paths:
         require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
 
 
 def trajectories_options(required: bool = True, what: str = "Learn from these recorded episodes.") -> Decorator:
-    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``.
-
-    Args:
-        required: whether the command does nothing without recordings.
-        what: the sentence that says what is done with them.
-    """
+    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
     return together(
         click.option(
             "-t",

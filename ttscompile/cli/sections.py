@@ -17,8 +17,6 @@ class Section:
     """Options that belong together.
 
     Attributes:
-        title: over them in the help.
-        options: names of their parameters.
         needs: parameters of which one must be given where one of the options is; none for no such condition.
     """
 
@@ -28,11 +26,7 @@ class Section:
 
 
 class SectionedCommand(FilesCommand):
-    """Shows the options of each section under its title, and refuses those whose section was not asked for.
-
-    Args:
-        sections: options that are in none stand first, as click puts them.
-    """
+    """Shows the options of each section under its title, and refuses those whose section was not asked for."""
 
     def __init__(self, *args: Any, sections: Sequence[Section] = (), **settings: Any) -> None:
         super().__init__(*args, **settings)

@@ -91,9 +91,7 @@ class ServerOptions:
     """What ``server_options`` were given as, checked.
 
     Attributes:
-        host: to listen on.
         port: 0 for any that is free.
-        lock: who may come in.
         max_clients: that may be connected; None for what is usual.
     """
 
@@ -144,13 +142,7 @@ class ServerOptions:
             AUDIT.propagate = before[1]
 
     async def serve(self, server: Listener, identity: str, output: TextIO | None = None) -> None:
-        """Let a server listen until the process is told to end, and write its address, one line of JSON.
-
-        Args:
-            server: made with this lock and these limits.
-            identity: of the artifact.
-            output: that the line goes to; None for standard output.
-        """
+        """Let a server listen until the process is told to end, and write its address, one line of JSON."""
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
         for each in (signal.SIGINT, signal.SIGTERM):
@@ -165,11 +157,7 @@ class ServerOptions:
 
 
 def _token_hash(file: Path | None) -> bytes | None:
-    """Of the token in the file or in the environment.
-
-    Raises:
-        ExecutorError: both have one, or what is there is none.
-    """
+    """Of the token in the file or in the environment. Raises ExecutorError: both have one, or what is there is none."""
     given = os.environ.get(TOKEN_VARIABLE)
     if file is None:
         return None if given is None else hashed(given, f"the environment's {TOKEN_VARIABLE}")

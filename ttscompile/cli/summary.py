@@ -50,10 +50,7 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
         *((f"piece {one['piece']}", _told_frames(one, captured)) for one in summary["frames"]),
         *facts.tokens(manifest),
-        *(
-            (f"loop {n!r}", f"the last {one.steps} steps of {one.loop!r}, from the chunk of the call before")
-            for n, one in manifest.starts.items()
-        ),
+        *facts.starts(manifest),
     )
     about = table("artifact", summary["path"], rows=rows)
     about.columns[1].justify = "left"

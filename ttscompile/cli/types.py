@@ -30,13 +30,7 @@ class NumberOption(click.Option):
 
 
 class Number(click.FloatRange):
-    """A finite number between two others.
-
-    Args:
-        least: the smallest that is taken.
-        most: the largest.
-        above: whether ``least`` itself is refused.
-    """
+    """A finite number between two others; ``above`` says whether ``least`` itself is refused."""
 
     name = "number"
 

@@ -5,4 +5,6 @@
 - ``correction``: the linear correction of a plan.
 - ``update``: sampler and correction of one step as one matrix product.
 - ``untrusted_json``: the one reader of JSON that somebody else wrote.
+
+Functions that are given a class of errors, ``error``, raise that: what comes from a caller is the caller's.
 """

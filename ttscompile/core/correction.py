@@ -154,13 +154,7 @@ class Correction:
         return int(self.reading.shape[1])
 
     def require_fit(self, steps: int, sample: tuple[int, int], numbers: int, groups: int | None = None) -> None:
-        """Raise unless it is a correction for a policy of K steps, samples ``(T, D)`` and a condition of N numbers.
-
-        Args:
-            steps: K.
-            sample: ``(T, D)``.
-            numbers: N.
-            groups: of action dimensions; None for as many as ``groups_of`` has.
+        """Raise unless it is for a policy of K steps, samples ``(T, D)`` and conditions of N numbers.
 
         Raises:
             IllegalPlanError: it is not.
@@ -195,23 +189,13 @@ class Correction:
         return np.asarray(condition @ self.reading, np.float32)
 
     def from_condition(self, read: FloatArray) -> FloatArray:
-        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``.
-
-        Args:
-            read: of the condition, float32 ``[B, F]``.
-        """
+        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``."""
         count, *shape = self.observed.shape
         added = read @ self.observed.reshape(count, -1)
         return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
 
     def jump(self, j: int, read: FloatArray, history: FloatArray) -> FloatArray:
-        """What jump number j adds to the sample, float32 ``[D, B, T]``.
-
-        Args:
-            j: of the jumps.
-            read: of the condition, float32 ``[B, F]``.
-            history: after the jump's anchor, ``[D, B, 4 T]``.
-        """
+        """What jump number j adds to the sample, float32 ``[D, B, T]``."""
         dimensions, streams, width = history.shape
         value = np.concatenate([read, history.transpose(1, 0, 2).reshape(streams, -1)], 1)
         for layer in (self.inner[j], self.middle[j]):
@@ -252,11 +236,7 @@ def correction_flops(sample: tuple[int, int]) -> int:
 
 
 def numbers_of(features: Iterable[tuple[int, ...]]) -> int:
-    """N: how many numbers of the condition a correction may read; 0 where there are too many.
-
-    Args:
-        features: the shapes of its values for one stream.
-    """
+    """N: how many numbers of the condition a correction may read; 0 where there are too many."""
     numbers = sum(math.prod(shape) for shape in features)
     return numbers if numbers <= MOST_NUMBERS else 0
 
@@ -278,13 +258,7 @@ def groups_of(steps: int, sample: tuple[int, int]) -> int:
 
 
 def no_correction(steps: int, sample: tuple[int, int], groups: int | None = None) -> Correction:
-    """The correction of K steps and samples ``(T, D)`` that changes nothing.
-
-    Args:
-        steps: K.
-        sample: ``(T, D)``.
-        groups: of action dimensions; None for as many as ``groups_of`` has.
-    """
+    """The correction of K steps and samples ``(T, D)`` that changes nothing."""
     groups, (horizon, dimensions) = groups_of(steps, sample) if groups is None else groups, sample
     return Correction(
         anchors=np.zeros(steps, np.bool_),

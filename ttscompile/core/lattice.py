@@ -57,9 +57,6 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
 
     Returns:
         int8 ``[B, K, blocks]``, contiguous.
-
-    Raises:
-        IllegalPlanError: wrong dtype, shape or values.
     """
     array = given = _sources(plan)
     if array.ndim == 2:
@@ -71,11 +68,7 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
 
 
 def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
-    """A copy of a plan of any shape and integer dtype, which holds nothing but sources.
-
-    Raises:
-        IllegalPlanError: it does not.
-    """
+    """A copy of a plan of any shape and integer dtype, which holds nothing but sources."""
     array = listed(plan, "plan", IllegalPlanError, "int8").copy()
     if array.dtype.kind not in "iu":
         raise IllegalPlanError(
@@ -89,10 +82,6 @@ def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
 
 def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
     """Resolve every cell of one stream's plan to the computed residual that it adds.
-
-    Args:
-        plan: int8 ``[K, blocks]``.
-        groups: for each block the number of its FORWARD group (one kind and one shape).
 
     Returns:
         The origins; cells that read nothing have ``UNWRITTEN``. Rollout cells are resolved to their own index
@@ -118,16 +107,7 @@ def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
 
 
 def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> BoolArray:
-    """Cells of one stream's plan that may not be executed.
-
-    Args:
-        plan: int8 ``[K, blocks]``.
-        groups: FORWARD group of each block.
-        written: bool ``[K, blocks]``; rollout entries that an earlier call of the episode computed.
-
-    Returns:
-        bool ``[K, blocks]``: a reuse in step 0, or a read of a residual that was never computed.
-    """
+    """Cells of one stream's plan that may not be executed, bool ``[K, blocks]``."""
     resolved = origins(plan, groups)
     illegal: BoolArray = np.where(resolved.rollout, ~written, resolved.cell == UNWRITTEN)
     illegal[0] |= plan[0] != Source.COMPUTE.value
@@ -135,16 +115,7 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
-    """Raise if any stream's plan is illegal.
-
-    Args:
-        plans: int8 ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
-        written: bool ``[B, K, blocks]``.
-
-    Raises:
-        IllegalPlanError: names the first cell, and how many there are.
-    """
+    """Raise IllegalPlanError if any stream's plan is illegal."""
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
         if len(bad):
@@ -164,8 +135,6 @@ def legalize(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> tupl
     Pure: neither argument is changed. Works on one plan or on one a stream.
 
     Args:
-        plan: int8 ``[K, blocks]`` or ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
         written: bool, of the plan's shape; the rollout entries that exist.
 
     Returns:

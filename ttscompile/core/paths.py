@@ -25,17 +25,7 @@ def on_hub(path: str | os.PathLike[str]) -> bool:
 
 
 def require_path(path: str | os.PathLike[str], error: type[TtscompileError], give: str) -> None:
-    """Raise unless a path leads to a file or a directory, before anything of it is opened.
-
-    Args:
-        path: links are followed.
-        error: of this kind.
-        give: what to give instead, as a sentence; ends the message.
-
-    Raises:
-        TtscompileError: of the kind ``error``: nothing is there, its name cannot be looked up, or it is a pipe, a
-            socket or a device.
-    """
+    """Raise unless a path leads to a file or a directory, before anything of it is opened."""
     require_free_or_path(path, error, give)
     if not Path(path).exists():
         link = " (it is a link to nothing)" if Path(path).is_symlink() else ""
@@ -43,11 +33,7 @@ def require_path(path: str | os.PathLike[str], error: type[TtscompileError], giv
 
 
 def require_free_or_path(path: str | os.PathLike[str], error: type[TtscompileError], give: str) -> None:
-    """The same for a path that is written: there may be nothing.
-
-    Raises:
-        TtscompileError: see ``require_path``.
-    """
+    """The same for a path that is written: there may be nothing. Raises TtscompileError: see ``require_path``."""
     name = os.fspath(path)
     try:
         mode = Path(path).stat().st_mode

@@ -41,14 +41,7 @@ class TokenReuse:
 
 @dataclass(frozen=True)
 class Variant:
-    """What has to be opened for a plan, and is common to all plans that differ in cells and correction alone.
-
-    Attributes:
-        loop: see ``Plan``.
-        weights: see ``Plan``.
-        precision: see ``Plan``; pairs of a part and its precision, in order.
-        tokens: see ``Plan``.
-    """
+    """What has to be opened for a plan, and is common to all plans that differ in cells and correction alone."""
 
     loop: str = ORIGINAL
     weights: str = ORIGINAL

@@ -100,6 +100,10 @@ class SamplerTable:
         pairs = [(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)]
         return all(np.array_equal(one, two) for one, two in pairs)
 
+    def takes_noise_as(self, other: SamplerTable) -> bool:
+        """Whether the same noise means the same in both: a sampler of this name, with as many steps and draws."""
+        return (self.name, self.steps, self.stochastic) == (other.name, other.steps, other.stochastic)
+
     @property
     def memories(self) -> int:
         """S, how many arrays of the sample's shape are carried from step to step beside it."""

@@ -287,11 +287,7 @@ class PolicySpec:
         return {ORIGINAL: self.sampler, **self.loops}
 
     def in_loop(self, name: str) -> PolicySpec:
-        """The policy that has this loop alone, as its own.
-
-        Raises:
-            SpecError: there is no such loop.
-        """
+        """The policy that has this loop alone, as its own. Raises SpecError: there is no such loop."""
         if name not in self.all_loops:
             raise SpecError(f"loop {name!r:.80}: expected one of {', '.join(self.all_loops)}.")
         return replace(self, sampler=self.all_loops[name], loops={})

@@ -38,8 +38,6 @@ class Start:
 
         Args:
             before: the denoised sample of the call before, float32 ``[B, T, D]``.
-            chunk: which steps of it are to be executed.
-            fresh: noise of the whole loop, of as many streams.
             executed: how many steps of it were executed; None for all that are to be.
         """
         executed = chunk.stop - chunk.start if executed is None else executed
@@ -52,10 +50,6 @@ def rest_of(table: SamplerTable, last_steps: int) -> tuple[SamplerTable, Start]:
     """The last steps of a loop, and what they begin with.
 
     A multistep solver has no earlier predictions there: its first step takes its own in their place.
-
-    Args:
-        table: of the whole loop.
-        last_steps: how many of its steps are left, fewer than all.
 
     Returns:
         Their table, and how the sample before them is made of action and noise.

@@ -14,15 +14,7 @@ _MOST_BYTES = 64 * 2**20
 
 
 class Tokenizer:
-    """What ``tokenizer.json`` describes.
-
-    Args:
-        path: of the file, or of the folder that has it.
-        error: class of the errors.
-
-    Raises:
-        TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
-    """
+    """What ``tokenizer.json`` describes."""
 
     def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
         own = Path(path)
@@ -50,11 +42,7 @@ class Tokenizer:
         return made
 
     def __call__(self, text: str) -> list[int]:
-        """The tokens of a text, all of them, with those that the tokenizer adds.
-
-        Raises:
-            TtscompileError: the tokenizer refuses the text.
-        """
+        """The tokens of a text, all of them, with those that the tokenizer adds."""
         try:
             return list(self._tokenizer.encode(text).ids)
         except Exception as refused:

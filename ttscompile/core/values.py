@@ -14,9 +14,6 @@ def check_values(array: Array, spec: ObservationSpec, what: str, error: Errors) 
     They are finite, and normalised not above ``LARGEST``; tokens and images are within their bounds. Images may
     overshoot by a tenth of the range, as resizing with a cubic filter does at edges. One of 0..255 in place of 0..1
     would give actions that look like actions.
-
-    Raises:
-        TtscompileError: of the class ``error``: says how many are not, and where the first is.
     """
     tokens = spec.bounds is not None and array.dtype.kind in "iu"
     if array.dtype.kind == "f" or spec.normalizer is not None:
@@ -47,9 +44,6 @@ def check_numbers(
 
     Returns:
         The least and the largest of them, as they are; zeros if there are none.
-
-    Raises:
-        TtscompileError: of the class ``error``: says how many are not, and where the first is.
     """
     if not array.size:
         return 0.0, 0.0

@@ -20,14 +20,7 @@ _COPIES = 3
 
 
 def artifact_findings(directory: Path) -> list[Finding]:
-    """Does it load here, does it fit, and does a call give finite actions, in which time.
-
-    Args:
-        directory: of the artifact, or the same zipped.
-
-    Returns:
-        Findings up to the first problem.
-    """
+    """Does it load here, does it fit, and does a call give finite actions, in which time; up to the first problem."""
     try:
         from ..artifact.load import load_artifact
     except ModuleNotFoundError as error:

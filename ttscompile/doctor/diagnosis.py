@@ -25,9 +25,6 @@ MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PR
 def examine(directory: Path | None = None) -> list[Finding]:
     """Everything that is found, in the order of the report.
 
-    Args:
-        directory: an artifact, or the same zipped; it is loaded and called. None looks at the machine alone.
-
     Returns:
         Findings; none raises. What stops an artifact from running has the level ``PROBLEM``.
     """

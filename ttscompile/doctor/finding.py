@@ -20,10 +20,7 @@ class Finding:
     """One thing that was looked at.
 
     Attributes:
-        part: heading under which it stands.
-        what: was looked at.
         found: what was found, for people.
-        level: how much it matters.
         remedy: what to do; every warning and problem has one.
     """
 

@@ -37,11 +37,7 @@ _LATE_MS = 1.0
 
 
 def machine_findings(root: Path = Path("/")) -> list[Finding]:
-    """What decides how fast calls are here, and how steady.
-
-    Args:
-        root: of ``/proc`` and ``/sys``.
-    """
+    """What decides how fast calls are here, and how steady."""
     return [*_processor(root), *_cores(root), *_memory(root), *_clock(root)]
 
 

@@ -1,4 +1,8 @@
-"""Readers of the checkpoints that users have: each gives a module and a ``PolicySpec``; nothing after it differs."""
+"""Readers of the checkpoints that users have: each gives a module and a ``PolicySpec``; nothing after it differs.
+
+Whatever a checkpoint lacks, or has that is not rebuilt here, is a ``CheckpointError`` of any function of this room; a
+sampler, spacing or number of steps that was asked for and cannot be is a ``SpecError``.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,6 @@ def load_checkpoint_policy(
     """Load a trained policy without the code that trained it, and without running anything from the file.
 
     Args:
-        path: the checkpoint.
         format: name of a row of ``families.FAMILIES``; ``auto`` tells by what is there.
         options: what is asked for in place of what the checkpoint says.
 
@@ -39,12 +42,7 @@ def load_checkpoint_policy(
 
 
 def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes]:
-    """Files by which the program that trained a policy takes the compiled one in its place; none where it cannot.
-
-    Args:
-        path: of the checkpoint, which was loaded.
-        spec: what was loaded from it.
-    """
+    """Files by which the program that trained a policy takes the compiled one in its place; none where it cannot."""
     if spec.source.get("format") != "lerobot":
         return {}
     from .lerobot_files import lerobot_files

@@ -50,11 +50,7 @@ _BUILTIN_TYPES: Mapping[str, type] = {
 
 
 def _load_type(name: str) -> type:
-    """Stand-in for ``dill._dill._load_type``: the plain built-in types that a configuration can hold.
-
-    Raises:
-        CheckpointError: any other name; dill itself would look it up among all it knows, callables included.
-    """
+    """Stand-in for ``dill._dill._load_type``: the plain built-in types that a configuration can hold."""
     if not isinstance(name, str) or name not in _BUILTIN_TYPES:
         raise CheckpointError(
             f"the checkpoint asks dill for the type {name!r}; expected one of {sorted(_BUILTIN_TYPES)}. Nothing of the"
@@ -77,12 +73,6 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a torch zip checkpoint; tensors on the CPU, configuration objects as inert stand-ins.
 
     Entries that are pickles of their own (``pickles``) stay the bytes they are.
-
-    Args:
-        path: the file.
-
-    Returns:
-        The dictionary that was saved.
 
     Raises:
         CheckpointError: missing, truncated, not a torch zip, or naming a global that is not known to be harmless.
@@ -170,18 +160,8 @@ def _unreadable(path: Path, error: Exception) -> CheckpointError:
 def plain_config(value: Any, where: str = "cfg", depth: int = 0, values: Iterator[int] | None = None) -> Any:
     """Turn inert configuration objects into dictionaries, lists and scalars.
 
-    Args:
-        value: what ``read_checkpoint`` found, or a part of it; plain dictionaries and lists pass as they are.
-        where: dotted name of ``value``, for messages.
-        depth: of ``value`` in the whole.
-        values: counts those of the whole.
-
     Returns:
         dict, list, str, int, float, bool or None, nested.
-
-    Raises:
-        CheckpointError: an object of another type, a malformed one, nesting without end, or more values than any
-            configuration has.
     """
     values = itertools.count() if values is None else values
     if depth > _DEEPEST:

@@ -38,12 +38,8 @@ class TowerConfig:
     """One encoder; the names are those of transformers' configuration.
 
     Attributes:
-        hidden_size: width.
         intermediate_size: width inside the feed-forward layers.
-        num_hidden_layers: layers.
-        num_attention_heads: attention heads.
         hidden_act: ``quick_gelu``, ``gelu``, or ``gelu_pytorch_tanh``, which approximates it.
-        layer_norm_eps: of every layer normalisation.
     """
 
     hidden_size: int
@@ -154,11 +150,7 @@ def find_encoder(name: str, folders: Sequence[Path], kind: str = "clip") -> Path
 
 
 def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Path]) -> Tower:
-    """The configuration of one encoder: its ``part``, ``vision_config`` or ``text_config``, as a ``cls``.
-
-    Raises:
-        CheckpointError: there is none on this machine, or it is not CLIP's.
-    """
+    """The configuration of one encoder: its ``part``, ``vision_config`` or ``text_config``, as a ``cls``."""
     found = find_encoder(name, folders)
     if found is not None:
         where, settings = str(found / "config.json"), read_json(found / "config.json")

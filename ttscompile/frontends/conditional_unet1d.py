@@ -34,12 +34,9 @@ class UNetConfig:
     """Sizes and variant of one network; the names are those of the original configuration.
 
     Attributes:
-        input_dim: channels of sample and prediction.
         local_cond_dim: channels of a condition for each step of the sample; None for none.
         global_cond_dim: channels of the condition vector; None for none.
-        diffusion_step_embed_dim: width of the timestep's embedding.
         down_dims: channels of the levels; every level but the last halves the number of steps.
-        kernel_size: of the convolutions.
         n_groups: of their group norms.
         cond_predict_scale: whether the condition scales the features as well as shifting them.
         condition_layer: whether a layer of the condition's own width comes before scale and shift.
@@ -182,17 +179,7 @@ class ConditionalUnet1D(nn.Module):
         global_cond: torch.Tensor | None = None,
         local_cond: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Evaluate the denoiser once.
-
-        Args:
-            sample: float32 ``[B, T, input_dim]``, T divisible by ``config.divisor``.
-            timestep: int64 ``[B]``.
-            global_cond: float32 ``[B, global_cond_dim]``; None without one.
-            local_cond: float32 ``[B, T, local_cond_dim]``; None without one.
-
-        Returns:
-            float32 ``[B, T, input_dim]``.
-        """
+        """Evaluate the denoiser once, of a sample ``[B, T, input_dim]`` with T divisible by ``config.divisor``."""
         condition = self.diffusion_step_encoder(timestep)
         if global_cond is not None:
             condition = torch.cat((condition, global_cond), dim=-1)

@@ -65,12 +65,6 @@ class InpaintingDenoiser(nn.Module):
     The first To rows of the observation channels are overwritten before every evaluation, here inside the module. What
     the sampler makes of the overwritten entries is never read: every later evaluation overwrites them again, and they
     are not part of the action.
-
-    Args:
-        model: ``model(sample, timestep)``.
-        sample: ``(T, Da + Do)``.
-        action_dim: Da.
-        n_obs_steps: To.
     """
 
     observed: torch.Tensor

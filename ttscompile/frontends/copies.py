@@ -13,9 +13,6 @@ def sharing_copy(module: nn.Module) -> nn.Module:
     """A copy on the CPU, in float32 and eval mode, for reading: parameters that are so already are the same memory.
 
     Modules and buffers are its own. A copy of all weights for each stage would take several times their memory.
-
-    Raises:
-        CaptureError: the module cannot be copied.
     """
     # Of other classes, as those that have no shape yet, a plain copy is made.
     plain = (each for each in module.parameters() if type(each) is nn.Parameter)
@@ -24,11 +21,7 @@ def sharing_copy(module: nn.Module) -> nn.Module:
 
 
 def own_copy(module: nn.Module) -> nn.Module:
-    """A copy that shares nothing with a module whose owner may go on to train it.
-
-    Raises:
-        CaptureError: the module cannot be copied.
-    """
+    """A copy that shares nothing with a module whose owner may go on to train it."""
     return _copied(module, {})
 
 

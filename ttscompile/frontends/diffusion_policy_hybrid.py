@@ -28,16 +28,7 @@ _ROUNDING = 2**-8  # of numbers up to 1 that were saved as bfloat16; the grid it
 
 
 def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> ObservationEncoder:
-    """The observation encoder with its weights; normalisers of images are part of it.
-
-    Args:
-        settings: ``cfg.policy``.
-        observed: of its ``shape_meta``.
-        weights: of the policy.
-
-    Raises:
-        CheckpointError: settings, weights or normalisers that do not fit.
-    """
+    """The observation encoder with its weights; normalisers of images are part of it."""
     group_norm, fixed = (settings.flag(name, False) for name in ("obs_encoder_group_norm", "eval_fixed_crop"))
     crop = settings.size("crop_shape", [76, 76])
     inputs: dict[str, Camera | int] = {}

@@ -26,11 +26,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the colou
 
 
 def encoder_settings(settings: Settings) -> Settings:
-    """``cfg.policy.obs_encoder``.
-
-    Raises:
-        CheckpointError: it is of another class, or has settings that this one does not know.
-    """
+    """``cfg.policy.obs_encoder``."""
     values = settings.values.get("obs_encoder")
     found = str(values.get("_target_")).rpartition(".")[2] if isinstance(values, dict) else f"{values!r:.80}"
     if found != _ENCODER or not isinstance(values, dict):
@@ -48,16 +44,7 @@ def encoder_settings(settings: Settings) -> Settings:
 
 
 def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> MultiImageEncoder:
-    """The observation encoder with its weights; normalisers of images are part of it.
-
-    Args:
-        settings: ``cfg.policy.obs_encoder``.
-        observed: of its ``shape_meta``.
-        weights: of the policy.
-
-    Raises:
-        CheckpointError: settings, weights or normalisers that do not fit.
-    """
+    """The observation encoder with its weights; normalisers of images are part of it."""
     flags = {name: settings.flag(name, False) for name in ("use_group_norm", "share_rgb_model", "imagenet_norm")}
     views: dict[str, View] = {}
     low_dim: dict[str, int] = {}

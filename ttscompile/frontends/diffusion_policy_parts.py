@@ -28,13 +28,7 @@ Observed = Mapping[str, tuple[str, tuple[int, ...]]]
 
 @dataclass(frozen=True)
 class Saved:
-    """What a checkpoint holds of one policy.
-
-    Attributes:
-        config: the whole configuration.
-        settings: ``cfg.policy``.
-        weights: of the policy, normalisers among them.
-    """
+    """What a checkpoint holds of one policy."""
 
     config: Config
     settings: Settings
@@ -59,8 +53,6 @@ class Rebuilt:
         observations: what callers give, by key.
         sample: ``(T, D)``.
         action_dim: Da, the first of D channels.
-        start: first executed step of the chunk.
-        variant: for people.
         known: names of the settings of ``cfg.policy`` that were read, beside those that all have. The others are what
             the policy hands to every step of its scheduler.
     """
@@ -80,9 +72,6 @@ def read_shape_meta(settings: Settings, *types: str) -> tuple[int, Observed]:
     Args:
         settings: ``cfg.policy``.
         types: of observations that the policy's encoder takes; the first is that of an entry without a type.
-
-    Raises:
-        CheckpointError: malformed, or observations that the original's encoder does not take either.
     """
     meta = settings.values.get("shape_meta")
     if not isinstance(meta, dict) or not isinstance(meta.get("obs"), dict) or not isinstance(meta.get("action"), dict):
@@ -117,11 +106,7 @@ def observation_specs(observed: Observed, steps: int, weights: Weights) -> dict[
 
 
 def image_normalizer(weights: Weights, key: str) -> tuple[float, float]:
-    """Scale and offset of an image: the original has one of each for all channels and places.
-
-    Raises:
-        CheckpointError: there are none, or others.
-    """
+    """Scale and offset of an image: the original has one of each for all channels and places."""
     single = affine(weights, key, None)
     if len(single.scale) != 1:
         raise CheckpointError(
@@ -132,16 +117,7 @@ def image_normalizer(weights: Weights, key: str) -> tuple[float, float]:
 
 
 def network_settings(config: Config, network: str, names: Collection[str]) -> dict[str, Any]:
-    """``cfg.policy.model``, the settings of a network that the configuration describes on its own.
-
-    Args:
-        config: the whole configuration.
-        network: class that is expected.
-        names: of the settings that it knows.
-
-    Raises:
-        CheckpointError: it is of another class, or has other settings.
-    """
+    """``cfg.policy.model``, the settings of a network that the configuration describes on its own."""
     found = str(config.require("policy.model._target_")).rpartition(".")[2]
     if found != network:
         raise CheckpointError(

@@ -114,17 +114,7 @@ def behind_encoder(
     network: Mapping[str, Any],
     known: Collection[str],
 ) -> Rebuilt:
-    """A U-Net on what an encoder makes of the observed steps.
-
-    Args:
-        saved: the policy.
-        encoder: observations by key to ``[B, To, width]``.
-        width: of a step's features.
-        observed: what it takes.
-        action_dim: Da.
-        network: settings of the U-Net, but for its channels.
-        known: settings of ``cfg.policy`` that were read for encoder and network.
-    """
+    """A U-Net on what an encoder makes of the observed steps."""
     as_global = saved.settings.flag("obs_as_global_cond", True)
     (n_obs_steps,) = saved.sizes("n_obs_steps")
     config = UNetConfig(
@@ -159,17 +149,8 @@ def denoiser(
     """The network with its weights, as it is given the observation, and the shape ``(T, D)`` of its sample.
 
     Args:
-        saved: the policy.
         weights: of the policy, without those of an encoder.
-        config: of its network.
-        given: how it is given the observation.
-        action_dim: Da.
         steps: name of the setting that says how many steps its sample has.
-        start: the first of them that is executed.
-
-    Raises:
-        CheckpointError: the network cannot halve and double so many steps, or they end before what is asked of them;
-            weights that do not fit.
     """
     horizon, n_obs_steps = saved.settings.number(steps, most=_MOST_STEPS), saved.settings.number("n_obs_steps")
     if horizon % config.divisor:

@@ -50,16 +50,7 @@ def choose_weights(state_dicts: Any, use_ema: Any) -> tuple[Weights, str]:
 
 
 def require_room(needed: Mapping[str, int], weights: Weights, where: str = "cfg.policy.model.") -> None:
-    """Raise unless the checkpoint has weights for a network of the configured sizes, before it is made.
-
-    Args:
-        needed: weights that the network has at least, by the setting that asks for them.
-        weights: all there are.
-        where: the settings stand, for messages.
-
-    Raises:
-        CheckpointError: it has not: whatever the configuration says, no more memory is taken than the file has.
-    """
+    """Raise unless the checkpoint has weights for a network of the configured sizes, before it is made."""
     total = sum(value.numel() for value in weights.values())
     for name, count in needed.items():
         if count > total:

@@ -20,10 +20,6 @@ EagerPolicy = Callable[[Mapping[str, torch.Tensor], Noise], torch.Tensor]
 def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
     """The loop as the original runs it: the whole network once a step, an observation encoder before it once a call.
 
-    Args:
-        module: as ``load_checkpoint_policy`` gives it.
-        spec: of the same policy.
-
     Returns:
         A function of the normalised observations ``{key: [B, ...]}`` and the noise of one call, that gives the
         denoised sample ``[B, T, D]``. Runs on the CPU. Raises ObservationError if a stochastic sampler is given no

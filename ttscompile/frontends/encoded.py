@@ -13,10 +13,6 @@ class EncodedDenoiser(nn.Module):
 
     Captured as one module; the encoder depends on the observation alone, so hoisting takes it out of the loop. What
     runs or measures the original asks ``parts`` for it, and evaluates or counts it once.
-
-    Args:
-        encoder: ``encoder(observations)``, a dictionary by key to what the denoiser takes.
-        denoiser: ``denoiser(sample, timestep, encoded)``.
     """
 
     def __init__(self, encoder: nn.Module, denoiser: nn.Module) -> None:

@@ -54,12 +54,7 @@ AS_SAVED = LoadOptions()
 
 
 def as_converted(source: Mapping[str, str], encoders: str | os.PathLike[str] | None = None) -> LoadOptions:
-    """The options that decide what a policy observes, as a source tells them: its task, and cameras left out.
-
-    Args:
-        source: of the artifact.
-        encoders: the folder that ``convert`` was given, which no artifact tells.
-    """
+    """The options that decide what a policy observes, as a source tells them: its task, and cameras left out."""
     without = source.get(WITHOUT)
     cameras = without.split(", ") if without else None
     return LoadOptions(task=source.get("task"), encoders=encoders, without_cameras=cameras)
@@ -73,7 +68,6 @@ class Family:
         name: of the format, as ``convert`` takes it and ``PolicySpec.source`` keeps it.
         title: of the project, for messages.
         reads: what the user gives, for messages; begins with an article.
-        kind: of thing that a checkpoint is.
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
         module: in this package. Its ``load(path, options)`` gives the network in eval mode and the ``PolicySpec``, and
@@ -90,12 +84,7 @@ class Family:
     options: frozenset[str]
 
     def load(self, path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
-        """Load a checkpoint of this family.
-
-        Raises:
-            CheckpointError: an option that is of other families, or whatever the family's module refuses.
-            SpecError: the sampler asked for is not possible.
-        """
+        """Load a checkpoint of this family."""
         for name in (field.name for field in fields(options) if getattr(options, field.name) is not None):
             if name not in self.options:
                 takers = " and ".join(each.title for each in FAMILIES if name in each.options)
@@ -143,10 +132,6 @@ FORMATS = ("auto", *(each.name for each in FAMILIES))
 
 def find_family(path: Path, format: str) -> Family:
     """The family that reads a checkpoint.
-
-    Args:
-        path: of the checkpoint.
-        format: name of the family; ``auto`` asks every row of ``FAMILIES`` in turn.
 
     Raises:
         CheckpointError: the format is not known, or no family reads what is there; says what it is, if that is known.

@@ -17,15 +17,10 @@ class ResizeCrop(nn.Module):
     keeps is stored.
 
     Args:
-        height: of the image.
-        width: of the image.
         resize: (height, width); None for none.
         crop: (height, width) within the resized image; None for all of it.
         antialias: whether pixels of a smaller image are averages of all that they stand for, as torchvision resizes
             tensors from its version 0.17 on.
-
-    Raises:
-        CheckpointError: the crop is larger than what it crops.
     """
 
     rows: torch.Tensor

@@ -13,12 +13,7 @@ _NO_TASK = "Or leave the task out: the policy then takes tokens as an observatio
 
 
 def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) -> list[Path]:
-    """Where a language model's files are looked for: the folder that the user names, the checkpoint's, the one above.
-
-    Args:
-        encoders: that the user names; None for none.
-        directory: of the checkpoint.
-    """
+    """Where a language model's files are looked for: the folder that the user names, the checkpoint's, its parent."""
     return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
 
 
@@ -26,14 +21,9 @@ def task_tokens(text: str, name: str, folder: Path | None, most: int, vocabulary
     """The tokens of an instruction, without padding: nothing reads that.
 
     Args:
-        text: of the instruction.
-        name: of the tokenizer, for messages.
         folder: that has its ``tokenizer.json``; None if there is none.
         most: tokens that the policy reads; what is longer is cut, as lerobot does.
         vocabulary: tokens that the language model knows.
-
-    Raises:
-        CheckpointError: there is no tokenizer, it cannot be read, or it is of another language model.
     """
     path = None if folder is None else find_tokenizer(folder)
     if path is None:

@@ -86,17 +86,7 @@ def _evaluate(node: ast.AST) -> Any:
 
 
 def evaluate_expression(text: str) -> Any:
-    """Value of a small arithmetic expression, as in ``${eval:'2 if True else 2 + 20'}``.
-
-    Args:
-        text: the expression, without references.
-
-    Returns:
-        int, float, bool, str or None.
-
-    Raises:
-        CheckpointError: anything but the small language; says what of it.
-    """
+    """Value of a small arithmetic expression, as in ``${eval:'2 if True else 2 + 20'}``."""
     if len(text) > _LONGEST:
         raise _refuse(f"the expression has {len(text)} characters, more than {_LONGEST}")
     try:
@@ -116,20 +106,12 @@ class Config:
     tree: Mapping[str, Any]
 
     def get(self, key: str, default: Any = None) -> Any:
-        """The resolved value at a dotted key, ``default`` where there is none.
-
-        Raises:
-            CheckpointError: the value, or one inside it, cannot be resolved; names the key.
-        """
+        """The resolved value at a dotted key, ``default`` where there is none."""
         found, value = self._find(key)
         return self._resolve(value, key, (), itertools.count()) if found else default
 
     def require(self, key: str) -> Any:
-        """The resolved value at a dotted key.
-
-        Raises:
-            CheckpointError: it is absent, or cannot be resolved; names the key.
-        """
+        """The resolved value at a dotted key."""
         if not self._find(key)[0]:
             raise CheckpointError(f"cfg.{key} is missing from the checkpoint's configuration; it is needed.")
         return self.get(key)

@@ -23,12 +23,8 @@ class LanguageConfig:
     """Sizes of one language model, or of an expert that is built like one.
 
     Attributes:
-        width: of the stream.
         hidden: width inside the feed-forward layers.
-        layers: how many.
-        heads: of queries.
         groups: heads of keys and values.
-        channels: of a head.
         epsilon: of the norms.
         gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
     """
@@ -128,14 +124,7 @@ class Layer(nn.Module):
 
 
 def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:
-    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is not part of a graph.
-
-    Args:
-        layers: of the language model.
-        x: the tokens, embedded, ``[B, T, width]``.
-        turns: of their positions.
-        mask: added to the scores, ``[B, 1, T, T]``.
-    """
+    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is in no graph."""
     found = []
     for layer in layers:
         x, keys, values = layer(x, turns, mask)

@@ -23,7 +23,6 @@ class LeRobotConfig:
     """What of a policy's configuration matters at inference, whatever its type; the names are lerobot's.
 
     Attributes:
-        directory: that the policy was saved to.
         settings: the whole file, for what belongs to one type.
         features: type (``STATE``, ``VISUAL``, ``ENV``, ``ACTION``) and shape by name: state, cameras, environment if
             it has one, and then the action.
@@ -67,16 +66,9 @@ def read_lerobot_config(
     """Check what all types have.
 
     Args:
-        directory: that the policy was saved to.
-        entries: of its ``config.json``.
-        horizon: lerobot's default for this type.
-        n_action_steps: the same.
         environment: whether this type reads the state of the environment; if not, it is no observation.
         chunked: whether the horizon is called ``chunk_size``, one frame is observed, and every camera has a shape of
             its own: vision-language-action models, which resize images themselves.
-
-    Raises:
-        CheckpointError: it contradicts itself.
     """
     settings = Settings(
         entries, f"{directory / CONFIG}: ", "The file was changed, or is of another version of lerobot."

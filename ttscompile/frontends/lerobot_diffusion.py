@@ -43,10 +43,7 @@ class DiffusionConfig(LeRobotConfig):
     """What this type has beside what all have.
 
     Attributes:
-        network: of the denoiser.
-        vision_backbone: name of the ResNet.
         use_group_norm: whether it has group norm in the place of batch norm.
-        keypoints: of the spatial softmax.
         separate_encoders: whether each camera has an encoder of its own.
         resize: (height, width) of images, or None.
         crop: (height, width) of the centre that is cut out of them, or None.
@@ -68,11 +65,7 @@ class DiffusionConfig(LeRobotConfig):
 
 
 def read_config(directory: Path, entries: Mapping[str, Any]) -> DiffusionConfig:
-    """Check ``config.json``, of which these are the entries; defaults are lerobot's.
-
-    Raises:
-        CheckpointError: it contradicts itself, or the encoder is not one that is rebuilt here.
-    """
+    """Check ``config.json``, of which these are the entries; defaults are lerobot's."""
     shared = read_lerobot_config(directory, entries, horizon=64, n_action_steps=32, environment=True)
     settings = shared.settings
     backbone = str(settings.values.get("vision_backbone", "resnet18"))
@@ -215,16 +208,7 @@ class Network(nn.Module):
 
 
 class ConditionEncoder(Measured):
-    """Raw observations to the condition vector: each frame is [state, cameras, environment], oldest first.
-
-    Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        rgb_encoder: as ``Network`` has it.
-
-    Raises:
-        CheckpointError: the crop is larger than the images.
-    """
+    """Raw observations to the condition vector: each frame is [state, cameras, environment], oldest first."""
 
     def __init__(self, config: DiffusionConfig, processors: Processors, rgb_encoder: nn.Module | None) -> None:
         geometry = None

@@ -33,10 +33,6 @@ def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
 
     None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
     normalises with, and without that step tokens would be wrong.
-
-    Args:
-        directory: that lerobot saved the original to, which was read.
-        spec: of the compiled policy.
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]

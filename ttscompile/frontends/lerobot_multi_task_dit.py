@@ -49,7 +49,6 @@ class MultiTaskDiTConfig(LeRobotConfig):
     """What this type has beside what all have.
 
     Attributes:
-        network: of the denoiser.
         flow: whether the objective is flow matching; diffusion otherwise.
         vision_encoder_name: CLIP, by name or path.
         text_encoder_name: the same, of the text.
@@ -70,11 +69,7 @@ class MultiTaskDiTConfig(LeRobotConfig):
 
 
 def read_config(directory: Path, entries: Mapping[str, Any]) -> MultiTaskDiTConfig:
-    """Check ``config.json``, of which these are the entries; defaults are lerobot's.
-
-    Raises:
-        CheckpointError: it contradicts itself.
-    """
+    """Check ``config.json``, of which these are the entries; defaults are lerobot's."""
     shared = read_lerobot_config(directory, entries, horizon=32, n_action_steps=24, environment=False)
     settings = shared.settings
     old = settings.flag("use_separate_encoder_per_camera", False)  # the name of lerobot 0.5
@@ -201,7 +196,7 @@ def _flow(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
     settings = config.settings
     if options.spacing is not None:
         raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
-    method: Any = options.sampler or settings.choice("integration_method", *METHODS)
+    method = options.sampler or settings.choice("integration_method", *METHODS)
     count = options.steps if options.steps is not None else settings.values.get("num_integration_steps", 100)
     if type(count) is not int or not 1 <= count <= MOST_STEPS:
         given = f"{config.directory / CONFIG}: {count!r:.80} integration steps"
@@ -290,10 +285,6 @@ class ConditionEncoder(Measured):
     """Raw observations to the condition vector: normalised, cropped and encoded.
 
     Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        geometry: resizes and crops the frames of all cameras; None without cameras.
-        observation_encoder: CLIP and the projection.
         tokens: the names of the instruction's tokens and of their mask.
         task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
             is an input.

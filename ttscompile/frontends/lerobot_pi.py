@@ -85,11 +85,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
 
 
 def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: bool) -> PiConfig:
-    """Sizes and variant.
-
-    Raises:
-        CheckpointError: a weight that tells a size is missing, or sizes contradict each other.
-    """
+    """Sizes and variant."""
     settings = shared.settings
     patch = _shape(weights, f"{_VISION}embeddings.patch_embedding.weight", 4)
     resolution = settings.size("image_resolution", [224, 224], MOST_PIXELS) or (224, 224)

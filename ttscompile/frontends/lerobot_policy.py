@@ -27,13 +27,7 @@ _SCHEDULER_SETTINGS = {
 
 
 class Measured(nn.Module):
-    """Base of the encoders of conditions: what the robot measures to what lerobot hands to a policy's network.
-
-    Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        geometry: resizes and crops the frames of all cameras; None without cameras.
-    """
+    """Base of the encoders of conditions: what the robot measures to what lerobot hands to a policy's network."""
 
     def __init__(self, config: LeRobotConfig, processors: Processors, geometry: ResizeCrop | None) -> None:
         super().__init__()
@@ -62,15 +56,7 @@ def policy_spec(
     source: Mapping[str, str],
     more: Mapping[str, ObservationSpec] | None = None,
 ) -> PolicySpec:
-    """The specification of a policy.
-
-    Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
-        loops: its denoising loops.
-        source: what distinguishes it, beside the format.
-        more: observations beside those that ``Measured`` takes.
-    """
+    """The specification of a policy."""
     start = config.n_obs_steps - 1
     return PolicySpec(
         sample=(config.horizon, config.action_dim),
@@ -102,12 +88,7 @@ def _observations(config: LeRobotConfig, processors: Processors) -> dict[str, Ob
 
 
 def diffusion_loops(config: LeRobotConfig, options: LoadOptions) -> Loops:
-    """The denoising loops of a policy that was trained with diffusion; the defaults are lerobot's.
-
-    Raises:
-        CheckpointError: settings that are not possible.
-        SpecError: the sampler asked for is not possible.
-    """
+    """The denoising loops of a policy that was trained with diffusion; the defaults are lerobot's."""
     settings = config.settings.values
     scheduler = {key: settings.get(key, default) for key, default in _SCHEDULER_SETTINGS.items()}
     scheduler["_target_"] = f"{config.settings.choice('noise_scheduler_type', 'DDPM', 'DDIM')}Scheduler"
@@ -117,15 +98,7 @@ def diffusion_loops(config: LeRobotConfig, options: LoadOptions) -> Loops:
 
 
 def read_weights(config: LeRobotConfig, *without: str) -> dict[str, torch.Tensor]:
-    """The weights of a policy as float32.
-
-    Args:
-        config: of the policy.
-        without: ends of the names of what a network does not need.
-
-    Raises:
-        CheckpointError: missing, damaged, no weights, or more than this machine's memory can compile.
-    """
+    """The weights of a policy as float32."""
     path = config.directory / WEIGHTS
     require_memory(path, without)
     saved = {name: value for name, value in read_tensors(path).items() if not name.endswith(without)}

@@ -57,7 +57,6 @@ class Statistics:
         mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
         first: mean, or the lower end of the range.
         second: standard deviation, or the upper end.
-        eps: of the processor's configuration.
     """
 
     mode: str
@@ -143,11 +142,7 @@ class Processors:
 
 
 def read_processors(directory: Path, features: Features) -> Processors:
-    """The pipelines of a policy that LeRobot saved, with these features.
-
-    Raises:
-        CheckpointError: a file is missing or damaged; a step is not known, there twice, or out of order.
-    """
+    """The pipelines of a policy that LeRobot saved, with these features."""
     before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
     return Processors(
         renamed=_renamed(directory, before, features),

@@ -91,11 +91,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
 
 
 def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
-    """Sizes and variant, of the policy's entries and those of its language model.
-
-    Raises:
-        CheckpointError: they contradict each other, or ask for what is not rebuilt here.
-    """
+    """Sizes and variant, of the policy's entries and those of its language model."""
     settings = shared.settings
     for entry, expected in (("add_image_special_tokens", False), ("use_delta_joint_actions_aloha", False)):
         if settings.flag(entry, expected) != expected:

@@ -34,9 +34,6 @@ def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOp
     """Check what all of them have; cameras that the robot lacks are left out.
 
     LeRobot shows the network a black image for such a camera, and masks it: nothing reads it.
-
-    Raises:
-        CheckpointError: it contradicts itself, or an option does.
     """
     config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True)
     if config.settings.flag("adapt_to_pi_aloha", False) or config.settings.flag("use_relative_actions", False):
@@ -57,11 +54,7 @@ def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOp
 
 
 def read_vla_processors(config: LeRobotConfig) -> Processors:
-    """The processors of a policy, which leave images alone.
-
-    Raises:
-        CheckpointError: as ``read_processors``; or images are normalised.
-    """
+    """The processors of a policy, which leave images alone."""
     processors = read_processors(config.directory, config.features)
     normalised = sorted(key for key in config.cameras if key in processors.normalizers)
     if normalised:
@@ -83,13 +76,10 @@ def vla_spec(
     """The specification of a policy.
 
     Args:
-        config: of the policy.
-        processors: its own.
         image: height and width that images are resized to; None where they stay.
         fit: where the rest of a resized image is.
         sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
             absent where it is compiled in.
-        options: of the caller.
     """
     language = {}
     if "tokens" in sizes:
@@ -126,16 +116,12 @@ def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
         raise SpecError(
             f"{settings.where}{count!r:.80} steps ({name}, or steps= and --steps); expected 1 to {MOST_STEPS}."
         )
-    method: Any = options.sampler or "euler"
+    method = options.sampler or "euler"
     return flow_matching_table(count, method, start=1.0, end=0.0)
 
 
 def padded_size(settings: Settings, name: str, own: int) -> int:
-    """The width that states or actions are padded to, which has to hold the robot's own.
-
-    Raises:
-        CheckpointError: it does not.
-    """
+    """The width that states or actions are padded to, which has to hold the robot's own."""
     size = settings.number(name, 32, MOST)
     if own > size:
         raise settings.refusal(name, f"at least the {own} numbers that the robot has", 32)
@@ -143,11 +129,7 @@ def padded_size(settings: Settings, name: str, own: int) -> int:
 
 
 def positive_number(settings: Settings, name: str, default: float) -> float:
-    """A positive number.
-
-    Raises:
-        CheckpointError: it is not.
-    """
+    """A positive number. Raises CheckpointError: it is not."""
     value = settings.values.get(name, default)
     if type(value) not in (int, float) or not 0 < value < 2**31:
         raise settings.refusal(name, "a positive number", default)
@@ -158,8 +140,6 @@ class Gathered(nn.Module):
     """What the robot measures to what a prefix reads.
 
     Args:
-        config: of the policy.
-        processors: its normalisers, and the robot's names of the observations.
         prefix: takes images, tokens, their mask and the state.
         state: numbers of the state, padded; None where the instruction holds it.
         task: tokens int64 ``[1, L]`` of the one instruction that is compiled in; None where it is an input.

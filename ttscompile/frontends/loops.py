@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from ..core.spec import SamplerTable
 from ..errors import CheckpointError, SpecError
-from ..samplers.flow import EVALUATIONS
+from ..samplers.flow import METHODS
 from .families import AS_SAVED, LoadOptions
 
 Make = Callable[[LoadOptions], SamplerTable]
@@ -16,13 +16,7 @@ Make = Callable[[LoadOptions], SamplerTable]
 
 @dataclass(frozen=True)
 class Loops:
-    """What a ``PolicySpec`` has of its loops.
-
-    Attributes:
-        original: for ``PolicySpec.sampler``.
-        others: for ``PolicySpec.loops``.
-        source: what ``PolicySpec.source`` says of them.
-    """
+    """What a ``PolicySpec`` has of its loops."""
 
     original: SamplerTable
     others: Mapping[str, SamplerTable] = field(default_factory=dict)
@@ -36,13 +30,7 @@ def loops_of(make: Make, options: LoadOptions, own: str) -> Loops:
     original, and the source says in place of what. Of ``options.loops`` those follow that the policy can have.
 
     Args:
-        make: of the checkpoint.
         options: of the caller; without sampler, steps and spacing nothing is asked for.
-        own: class of the checkpoint's scheduler, for the source.
-
-    Raises:
-        CheckpointError: the checkpoint describes no loop that is known, and nothing was asked for; or as ``make``.
-        SpecError: what is asked for is not possible.
     """
     if options.sampler is None and options.steps is None and options.spacing is None:
         original = make(AS_SAVED)
@@ -76,5 +64,6 @@ def loop_name(table: SamplerTable, spacing: str | None = None) -> str:
 
     The number is that of steps, as people count them: one of ``rk4`` has four rows of the table.
     """
-    steps = table.steps // EVALUATIONS.get(table.name, 1)
+    method = METHODS.get(table.name)
+    steps = table.steps // (1 if method is None else method.evaluations)
     return "-".join([table.name, str(steps), *([] if spacing is None else [spacing])])

@@ -23,12 +23,9 @@ class View:
     """How the images of one observation key are taken in.
 
     Attributes:
-        height: of the image as it comes.
-        width: of the same.
         resize: ``(height, width)`` that it is brought to; None for none.
         crop: of the centre that is looked at; None for the whole image.
         scale: of each colour, after that.
-        offset: of each colour.
     """
 
     height: int
@@ -58,15 +55,7 @@ class _Camera(nn.Module):
 
 
 class MultiImageEncoder(nn.Module):
-    """All keys of the observation to one vector for each observed step: the images' features, then the others.
-
-    Args:
-        views: by key of an image, in the order of their features.
-        low_dim: length by key of what is no image, in their order.
-        network: ResNet, a key of ``resnet.DEPTHS``.
-        norm: of the ResNets.
-        shared: whether one ResNet looks at all images.
-    """
+    """All keys of the observation to one vector for each observed step: the images' features, then the others."""
 
     def __init__(
         self, views: Mapping[str, View], low_dim: Mapping[str, int], network: str, norm: Norm, shared: bool

@@ -26,11 +26,8 @@ class DiTConfig:
     """Sizes and variant of the denoiser; the names are those of lerobot's configuration.
 
     Attributes:
-        action_dim: channels of the sample.
         horizon: T.
-        hidden_dim: width.
         num_layers: layers, of an attention and a feed-forward block each.
-        num_heads: attention heads.
         timestep_embed_dim: channels of the timestep's embedding.
         use_positional_encoding: whether learned positions are added to the tokens.
         use_rope: whether queries and keys are rotated by their position.
@@ -108,12 +105,7 @@ class _Layer(nn.Module):
 
 
 class DiffusionTransformer(nn.Module):
-    """The denoiser: noisy actions, timestep and condition vector to a prediction.
-
-    Args:
-        config: sizes and variant.
-        condition_dim: channels of the condition vector.
-    """
+    """The denoiser: noisy actions, timestep and condition vector to a prediction."""
 
     def __init__(self, config: DiTConfig, condition_dim: int) -> None:
         super().__init__()
@@ -154,14 +146,6 @@ class ObservationEncoder(nn.Module):
     """Window of observations and an instruction to the condition vector.
 
     Each frame is [state, class tokens of all cameras, instruction]; the frames are concatenated, oldest first.
-
-    Args:
-        cameras: how many there are.
-        vision: of the image encoder; None without cameras.
-        text: of the text encoder.
-        text_width: channels of the instruction.
-        separate: whether each camera has an encoder of its own.
-        frames: To.
     """
 
     def __init__(

@@ -37,10 +37,6 @@ class PiConfig:
     """Sizes and variant.
 
     Attributes:
-        vision: of the image encoder.
-        text: of the language model.
-        vocabulary: tokens that there are.
-        expert: of the action expert.
         state: numbers of the state, padded; None in pi0.5, whose instruction holds the state.
         actions: numbers of an action, padded.
         periods: shortest and longest of the timestep's waves.
@@ -135,11 +131,7 @@ class Pi(nn.Module):
 
 
 class Prefix(nn.Module):
-    """What the network reads once a call.
-
-    Args:
-        network: whose parts these are.
-    """
+    """What the network reads once a call."""
 
     def __init__(self, network: Pi) -> None:
         super().__init__()
@@ -154,8 +146,6 @@ class Prefix(nn.Module):
 
         Args:
             images: of each camera ``[B, 3, H, W]``, in -1..1.
-            tokens: int64 ``[B, L]``.
-            mask: bool ``[B, L]``.
             state: padded ``[B, Ds]``; None in pi0.5.
         """
         seen = self.projector(self.vision_model(torch.stack(images, 1).flatten(0, 1)))
@@ -170,11 +160,7 @@ class Prefix(nn.Module):
 
 
 class Expert(nn.Module):
-    """The denoiser.
-
-    Args:
-        network: whose parts these are.
-    """
+    """The denoiser."""
 
     def __init__(self, network: Pi) -> None:
         super().__init__()

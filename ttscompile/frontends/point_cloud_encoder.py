@@ -30,7 +30,6 @@ class PointNet(nn.Module):
         coloured: whether points have a colour; the MLP is a layer deeper then, which has no norm.
         features: of the vector; None for those of the MLP, without a layer after it.
         norms: whether the MLP has layer norms.
-        last_norm: whether the vector has.
     """
 
     def __init__(self, coloured: bool, features: int | None, norms: bool, last_norm: bool) -> None:
@@ -54,13 +53,7 @@ class PointNet(nn.Module):
 
 
 class PointCloudEncoder(nn.Module):
-    """Points and the robot's state to one vector for each observed step.
-
-    Args:
-        extractor: of the points.
-        channels: of a point that it takes, the first of those that are there.
-        state: length of the robot's state.
-    """
+    """Points and the robot's state to one vector for each observed step."""
 
     def __init__(self, extractor: PointNet, channels: int, state: int) -> None:
         super().__init__()

@@ -132,27 +132,14 @@ STATES = (
 
 
 def refuse_policy(name: str, rows: Iterable[Refusal] = POLICIES, where: str = "") -> NoReturn:
-    """Refuse a checkpoint whose policy is another one than its project's that are read.
-
-    Args:
-        name: of the policy's class or type.
-        rows: of the project; the last one matches every name.
-        where: begins the message.
-
-    Raises:
-        CheckpointError: always.
-    """
+    """Refuse a checkpoint whose policy is another one than its project's that are read."""
     row = _first(rows, [name.lower()])
     shown = f"{name!a:.80}".strip("'\"")
     raise CheckpointError(f"{where}the policy is {shown}: {row.what}. {row.remedy}")
 
 
 def refuse_payload(payload: Mapping[str, Any]) -> None:
-    """Refuse what a torch file holds unless it is a checkpoint of Diffusion Policy's workspace.
-
-    Raises:
-        CheckpointError: it has no ``cfg`` or no ``state_dicts``.
-    """
+    """Refuse what a torch file holds unless it is a checkpoint of Diffusion Policy's workspace."""
     if "cfg" in payload and "state_dicts" in payload:
         return
     entries, missing = sorted(map(str, payload)), "cfg" if "cfg" not in payload else "state_dicts"
@@ -174,11 +161,7 @@ def refuse_payload(payload: Mapping[str, Any]) -> None:
 
 
 def refuse_file(path: Path) -> None:
-    """Refuse a file whose first bytes or entries say that it is no torch checkpoint; leave all others alone.
-
-    Raises:
-        CheckpointError: safetensors, HDF5, GGUF, a zipped artifact, or a zip archive that torch did not write.
-    """
+    """Refuse a file whose first bytes or entries say that it is no torch checkpoint; leave all others alone."""
     if not path.is_file():
         return
     with path.open("rb") as file:
@@ -205,11 +188,7 @@ def refuse_file(path: Path) -> None:
 
 
 def refuse_directory(path: Path) -> NoReturn:
-    """Refuse a directory that no frontend reads; ``LEROBOT`` has LeRobot's own policies.
-
-    Raises:
-        CheckpointError: always.
-    """
+    """Refuse a directory that no frontend reads; ``LEROBOT`` has LeRobot's own policies."""
     every = chain.from_iterable(path.glob(level) for level in ("*", "*/*", "*/*/*"))
     names = sorted(each.relative_to(path).as_posix() for each in islice(every, _MOST_FILES))
     names += _entries(path / "config.json")

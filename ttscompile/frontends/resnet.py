@@ -55,11 +55,6 @@ def resnet(channels: int, norm: Norm, name: str = "resnet18") -> nn.Sequential:
 
     Its layers have torchvision's names (``conv1``, ``layer1``); ``nn.Sequential(*resnet(...))`` numbers them, as the
     checkpoints of code that took ``list(children())`` of torchvision's network do.
-
-    Args:
-        channels: C.
-        norm: makes the norm of so many channels, ``group_norm`` or ``nn.BatchNorm2d``.
-        name: key of ``DEPTHS``.
     """
     layers: OrderedDict[str, nn.Module] = OrderedDict(
         conv1=nn.Conv2d(channels, 64, 7, stride=2, padding=3, bias=False),

@@ -56,7 +56,6 @@ class Camera:
         shape: ``(C, H, W)`` as they come.
         crop: ``(height, width)`` of the centre that is looked at; None for the whole image.
         scale: of the image's normaliser, one number for all of it.
-        offset: of the same.
     """
 
     shape: tuple[int, int, int]
@@ -88,12 +87,7 @@ class CameraEncoder(nn.Module):
 
 
 class ObservationEncoder(nn.Module):
-    """All keys of the observation to one vector for each observed step.
-
-    Args:
-        inputs: by key, in the order of their features in the vector: a camera, or the length of what is no image.
-        group_norm_in_place_of_batch_norm: which of the two the ResNets hold.
-    """
+    """All keys of the observation to one vector for each observed step."""
 
     def __init__(self, inputs: Mapping[str, Camera | int], group_norm_in_place_of_batch_norm: bool) -> None:
         super().__init__()

@@ -22,11 +22,7 @@ SHOWN = 6
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a safetensors file on the CPU; the format holds nothing that could run.
-
-    Raises:
-        CheckpointError: missing or damaged.
-    """
+    """The tensors of a safetensors file on the CPU; the format holds nothing that could run."""
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file. Copy the policy's directory whole.")
     try:
@@ -38,15 +34,7 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
 
 
 def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
-    """Raise unless the machine has the memory that compiling these weights takes; before anything is read.
-
-    Args:
-        path: of a safetensors file.
-        without: ends of the names of weights that are not compiled.
-
-    Raises:
-        CheckpointError: says how much it takes, and how much there is.
-    """
+    """Raise unless the machine has the memory that compiling these weights takes; before anything is read."""
     if not path.is_file():
         return
     try:
@@ -71,15 +59,7 @@ def names_of(keys: Sequence[str]) -> str:
 
 
 def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.Tensor]:
-    """Weights of any floating-point type, under the names that a network without wrappers gives them.
-
-    Args:
-        weights: by name, as they were saved.
-        where: begins the message.
-
-    Raises:
-        CheckpointError: one is no dense tensor of floating-point numbers.
-    """
+    """Weights of any floating-point type, under the names that a network without wrappers gives them."""
     for name, value in weights.items():
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided or not value.is_floating_point():
             what = f"{value.dtype} tensor" if isinstance(value, torch.Tensor) else type(value).__name__
@@ -100,13 +80,9 @@ def require_weights(
 
     Args:
         expected: by name, on any device: only shapes are looked at.
-        found: what the file has, under the same names.
         source: of the expected shapes, for messages; the configuration or a part of it.
         masks: names of what may hold infinity.
         what: is wrong where names are missing or unknown; begins the message.
-
-    Raises:
-        CheckpointError: names what does not fit.
     """
     missing, extra = [name for name in expected if name not in found], [name for name in found if name not in expected]
     if missing or extra:

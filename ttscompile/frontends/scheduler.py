@@ -65,16 +65,8 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     Args:
         settings: of the scheduler, with its class in ``_target_``.
         own_steps: K of the policy; None for the number of training timesteps.
-        options: sampler, steps and spacing in place of the configured ones.
         step_arguments: what the policy hands to every ``step`` of its own scheduler (``eta``).
         where: the settings stand, for messages.
-
-    Returns:
-        The table.
-
-    Raises:
-        CheckpointError: the configured scheduler is of another class, or has settings that diffusers does not know.
-        SpecError: the sampler, spacing or number of steps asked for is not possible.
     """
     sampler, spacing = options.sampler, options.spacing
     steps = own_steps if options.steps is None else options.steps

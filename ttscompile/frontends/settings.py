@@ -15,11 +15,7 @@ MAX_BYTES = 4 * 2**20
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object that a file holds.
-
-    Raises:
-        CheckpointError: missing, unreadable, too large or deep, not strictly JSON, or something else than an object.
-    """
+    """The object that a file holds."""
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file.")
     try:
@@ -37,7 +33,6 @@ class Settings:
     """Entries by name; every method raises CheckpointError, which says what was found and what was expected.
 
     Attributes:
-        values: the entries.
         where: they stand; begins every message, ``cfg.policy.`` or ``config.json: ``.
         remedy: a sentence that ends every message.
     """

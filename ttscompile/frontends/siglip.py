@@ -50,12 +50,7 @@ class _Embeddings(nn.Module):
 
 
 class Siglip(nn.Module):
-    """Pixels in -1..1 ``[N, 3, H, W]`` to patches ``[N, H/patch * W/patch, width]``, normalised after the last layer.
-
-    Args:
-        config: of the encoder.
-        size: H and W.
-    """
+    """Pixels in -1..1 ``[N, 3, H, W]`` to patches ``[N, H/patch * W/patch, width]``, normalised at the end."""
 
     positions: torch.Tensor
 

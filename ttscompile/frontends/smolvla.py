@@ -40,12 +40,9 @@ class SmolVLAConfig:
     """Sizes and variant.
 
     Attributes:
-        vision: of the image encoder.
         text: of the language model, whose first ``text.layers`` are used.
-        vocabulary: tokens that there are.
         scale: patches along each axis that become one token.
         image: height and width of the images that the encoder sees.
-        expert: of the action expert.
         crosses: whether layer ``i`` of the expert sees the prefix alone; otherwise prefix and actions.
         state: numbers of the state, padded.
         actions: numbers of an action, padded.
@@ -154,11 +151,7 @@ class SmolVLA(nn.Module):
 
 
 class Prefix(nn.Module):
-    """What the network reads once a call.
-
-    Args:
-        network: whose parts these are.
-    """
+    """What the network reads once a call."""
 
     def __init__(self, network: SmolVLA) -> None:
         super().__init__()
@@ -172,8 +165,6 @@ class Prefix(nn.Module):
 
         Args:
             images: of each camera ``[B, 3, H, W]``, in -1..1.
-            tokens: int64 ``[B, L]``.
-            mask: bool ``[B, L]``.
             state: padded ``[B, Ds]``.
         """
         scale = math.sqrt(self.width)
@@ -188,11 +179,7 @@ class Prefix(nn.Module):
 
 
 class Expert(nn.Module):
-    """The denoiser.
-
-    Args:
-        network: whose parts these are.
-    """
+    """The denoiser."""
 
     def __init__(self, network: SmolVLA) -> None:
         super().__init__()

@@ -23,14 +23,9 @@ class TransformerConfig:
     """Sizes and variant of one network; the names are those of the original configuration.
 
     Attributes:
-        input_dim: channels of the sample.
-        output_dim: channels of the prediction.
         horizon: T, the largest number of sample tokens.
         n_obs_steps: To, observation tokens; the horizon where the configuration has none.
         cond_dim: channels of an observation token; 0 for no observation tokens.
-        n_layer: layers of the trunk.
-        n_head: attention heads.
-        n_emb: width.
         causal_attn: whether a token sees only its past, and observations up to its time.
         time_as_cond: whether the timestep is a memory token (decoder) or the first token of the trunk (encoder only).
         n_cond_layers: transformer layers of the condition encoder; 0 for a token-wise MLP.
@@ -151,16 +146,7 @@ class TransformerForDiffusion(nn.Module):
         self.head = nn.Linear(width, config.output_dim)
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, cond: torch.Tensor | None = None) -> torch.Tensor:
-        """Evaluate the denoiser once.
-
-        Args:
-            sample: float32 ``[B, T, input_dim]``, T at most the horizon.
-            timestep: int64 ``[B]``.
-            cond: float32 ``[B, To, cond_dim]``; None without observation tokens.
-
-        Returns:
-            float32 ``[B, T, output_dim]``.
-        """
+        """Evaluate the denoiser once, of a sample ``[B, T, input_dim]`` with T at most the horizon."""
         time = self.time_emb(timestep).unsqueeze(1)
         tokens = self.input_emb(sample)
         if self.decoder is None:

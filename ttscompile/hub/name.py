@@ -58,11 +58,7 @@ def read_name(text: str) -> HubName:
 
 
 def require_repository(repository: str, told: str) -> None:
-    """Raise unless this is ``org/name``.
-
-    Raises:
-        HubError: it is not; the message begins with ``told``.
-    """
+    """Raise HubError unless this is ``org/name``. It is not; the message begins with ``told``."""
     if _REPOSITORY.fullmatch(repository) is None or "--" in repository or ".." in repository:
         raise HubError(f"{told:.200}: this is no name of a repository; {EXPECTED}.")
 

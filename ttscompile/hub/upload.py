@@ -16,10 +16,6 @@ def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, pr
     """Commit these files and the card; the repository is made if it is not there.
 
     Args:
-        folder: that the files are in.
-        names: of the artifact's files.
-        repository: ``org/name``.
-        card: text of its ``README.md``.
         private: whether the repository is nobody else's to see; one that is there already must be private then.
 
     Returns:

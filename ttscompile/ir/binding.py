@@ -29,10 +29,6 @@ def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
     A value without inputs whose shape has the batch in it (``zeros(B, 1, E)``, a class token for every image) is no
     constant; by itself it counts as a table, whose rows are made for a batch of one. It does not make what reads it a
     table: beside an observation it is made once a call, like that.
-
-    Args:
-        graph: any graph.
-        inputs: binding of each of its inputs.
     """
     found = {**dict.fromkeys(graph.constants, Binding.CONSTANT), **inputs}
     shaped: set[str] = set()  # of nothing but constants and the batch size

@@ -31,9 +31,6 @@ _ENUM_TYPES = {"dtype": torch.dtype, "memory_format": torch.memory_format, "layo
 def resolve_op(node: Node) -> Callable[..., Any]:
     """The function of a node: a functional ATen overload, or ``operator.getitem``.
 
-    Args:
-        node: its ``op`` is looked up below ``torch.ops.aten`` and nowhere else.
-
     Raises:
         CaptureError: no such operation; one that changes its arguments, draws random numbers or reads files; or one
             that has no row in the table of operations.
@@ -108,11 +105,6 @@ class Evaluator:
     The weights are held by reference, not copied: an optimiser's in-place update shows in the next call, and gradients
     flow to them and to the inputs.
 
-    Args:
-        graph: what to run.
-        weights: value of each of the graph's constants, by name; others are ignored.
-        device: where device arguments inside the graph point. Weights and inputs must be there.
-
     Raises:
         CaptureError: an operation that ``resolve_op`` refuses, an argument that names no value, a constant that is
             missing or does not have its type, or a symbolic size that no input can give a value.
@@ -150,9 +142,6 @@ class Evaluator:
             inputs: value of each of the graph's inputs, by name, of its type for some number of streams B; entries
                 that are no inputs are ignored, so that one environment can be given to several graphs.
 
-        Returns:
-            The outputs in the order of ``graph.outputs``.
-
         Raises:
             ObservationError: an input is missing, or has a dtype or shape that is not its type's, or sizes
                 contradict each other about B.
@@ -161,11 +150,7 @@ class Evaluator:
         return self.run([inputs[name] for name in self._graph.inputs], bind_batch(self._graph.inputs, inputs))
 
     def run(self, inputs: Sequence[torch.Tensor], streams: int) -> tuple[torch.Tensor, ...]:
-        """The same for inputs in order, which are known to fit, and for so many streams.
-
-        Raises:
-            CaptureError: an operation fails on these values; names the node.
-        """
+        """The same for inputs in order, which are known to fit, and for so many streams."""
         frame: Frame = [*inputs, *self._constants]
         index = 0
         try:
@@ -223,11 +208,7 @@ class Evaluator:
 
 
 def resolve_enum(node: Node, argument: Enum, device: torch.device) -> Any:
-    """The torch object that an enumeration among the arguments of a node names; a device is ``device``.
-
-    Raises:
-        CaptureError: torch has no such object.
-    """
+    """The torch object that an enumeration among the arguments of a node names; a device is ``device``."""
     if argument.kind == "device":
         return device
     value = getattr(torch, argument.name, None)
@@ -237,11 +218,7 @@ def resolve_enum(node: Node, argument: Enum, device: torch.device) -> Any:
 
 
 def bind_batch(types: Mapping[str, TensorType], values: Mapping[str, torch.Tensor]) -> int:
-    """The number of streams B that makes ``values`` fit ``types``; 1 if no type depends on it.
-
-    Raises:
-        ObservationError: a value is missing, or does not fit; names it.
-    """
+    """The number of streams B that makes ``values`` fit ``types``; 1 if no type depends on it."""
     streams: int | None = None
     origin = ""
     for name, type_ in types.items():

@@ -76,11 +76,7 @@ def find_operation(op: str) -> Operation | None:
 
 
 def operation(op: str, where: str = "a graph") -> Operation:
-    """The row of ``aten.NAME.OVERLOAD``.
-
-    Raises:
-        CaptureError: there is none; says ``where``.
-    """
+    """The row of ``aten.NAME.OVERLOAD``. Raises CaptureError: there is none; says ``where``."""
     row = find_operation(op)
     if row is None:
         what = f"operation {op!r} of {where} has no row in the table of operations, so nothing is known of it."

@@ -194,7 +194,6 @@ class LoopPiece:
     """A piece that runs at every step: stem, a block, or tail.
 
     Attributes:
-        graph: of one output.
         stream: the input that carries the sample (of the stem) or the residual stream; the others are contexts.
     """
 

@@ -13,15 +13,7 @@ MASKED = -1e9
 
 
 def first_numbers(inputs: int, width: int, rank: int, steps: int, blocks: int) -> Parameters:
-    """Constants of the head by name: always the same, and with them the plan is dense.
-
-    Args:
-        inputs: numbers of the features that it reads.
-        width: of the hidden layer.
-        rank: number of observation-dependent directions in the space of plans.
-        steps: K.
-        blocks: of the network.
-    """
+    """Constants of the head by name: always the same, and with them the plan is dense."""
     draw = np.random.default_rng(0)
 
     def normal(*shape: int, scale: float) -> npt.NDArray[np.float32]:

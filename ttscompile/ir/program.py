@@ -36,7 +36,6 @@ class Block:
     """One residual block ``x <- x + f(x, context)``.
 
     Attributes:
-        index: position in the order of execution.
         kind: self_attention, cross_attention, feed_forward or a structural signature.
         stream: value that flows in, a_{i-1}.
         result: value that flows out, a_i.
@@ -58,13 +57,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Loop:
-    """The pieces that run at every step. What they read beside the stream are contexts.
-
-    Attributes:
-        stem: sample -> residual stream.
-        blocks: residual stream -> residual.
-        tail: residual stream -> prediction.
-    """
+    """The pieces that run at every step. What they read beside the stream are contexts."""
 
     stem: LoopPiece
     blocks: tuple[LoopPiece, ...]
@@ -168,13 +161,7 @@ class Pieces(Loop):
 def frame_values(
     pieces: Pieces, run: Callable[[str, Mapping[str, Value]], Sequence[Value]], obs: Mapping[str, Value]
 ) -> dict[str, Value]:
-    """What the condition graph reads beside the observations, by name: every tower, run on all of its rows.
-
-    Args:
-        pieces: of the program.
-        run: a piece, by its name, on inputs by theirs; its outputs in order.
-        obs: normalised observations by key.
-    """
+    """What the condition graph reads beside the observations, by name: every tower, run on all of its rows."""
     if pieces.frames is None:
         return {}
     rows = dict(zip(pieces.frames.outputs, run(FRAMES, obs), strict=True))
@@ -190,7 +177,6 @@ class Phase:
     """What every phase has.
 
     Attributes:
-        spec: the policy beside its network.
         denoiser: graph of one evaluation: inputs sample, timestep, observations; output the prediction.
         weights: value of every constant of every graph.
         dense_flops: of one call in the original loop as the module makes it: K evaluations, one stream.
@@ -230,9 +216,7 @@ class Cut(Phase):
     """The denoiser cut along its residual stream (``Partition``).
 
     Attributes:
-        blocks: block table.
         prologue: observations and timestep -> contexts: what the loop reads and does not compute.
-        loop: the pieces that read the sample.
     """
 
     blocks: tuple[Block, ...]
@@ -253,8 +237,6 @@ class Program(Phase):
     """The denoiser in pieces that each run when what they read is known (``Hoist``): what is lowered and executed.
 
     Attributes:
-        blocks: block table.
-        pieces: the denoiser cut up.
         loop_weights: by further loop, values of the constants of its pruner, where it has one of its own.
     """
 
@@ -271,11 +253,7 @@ class Program(Phase):
         return replace(super().mapped(function), pieces=self.pieces.mapped(function))
 
     def in_loop(self, name: str) -> Program:
-        """The program of one loop alone, as if it were the original.
-
-        Raises:
-            SpecError: there is no such loop.
-        """
+        """The program of one loop alone, as if it were the original. Raises SpecError: there is no such loop."""
         return replace(
             self,
             spec=self.spec.in_loop(name),

@@ -52,11 +52,7 @@ class Rows:
 
 
 def unfold(graph: Graph, names: Iterable[str]) -> dict[str, Rows]:
-    """How those of ``names`` cross that have an axis ``m * B`` and none of size B; by name.
-
-    Raises:
-        PassError: it cannot be seen from the operations which rows belong to which stream.
-    """
+    """How those of ``names`` cross that have an axis ``m * B`` and none of size B; by name."""
     types = graph.types()
     wanted = [n for n in names if types[n].batch_axis is None and _axis(types[n]) is not None]
     if not wanted:

@@ -160,14 +160,7 @@ def _axes(tower: Graph, entry: str, tokens: int) -> dict[str, int]:
 
 
 def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Mapping[str, TensorType]) -> int | None:
-    """The axis of tokens in what a node gives; None if it brings tokens together, or nobody knows.
-
-    Args:
-        node: of one result, or of several with the same axes.
-        read: the values that it reads and that depend on tokens; each has an axis of them.
-        axes: of these.
-        types: of all values.
-    """
+    """The axis of tokens in what a node gives; None if it brings tokens together, or nobody knows."""
     row, rank = operation(node.op), len(types[read[0]].shape)
     axis, result = axes[read[0]], node.type.shape
     if node.op == ATTENTION:

@@ -13,11 +13,7 @@ from .program import Binding, Block, Cut, Loop, Phase, Pieces, Program
 
 
 def verify_graph(graph: Graph, what: str) -> None:
-    """Check one graph: names unique, values defined before use, outputs defined, results typed.
-
-    Raises:
-        PassError: names the graph, the node with its source line, and its neighbours.
-    """
+    """Check one graph: names unique, values defined before use, outputs defined, results typed."""
     if both := sorted(graph.inputs.keys() & graph.constants.keys()):
         raise PassError(f"{what}: %{both[0]} is both an input and a constant.")
     defined = {*graph.inputs, *graph.constants}
@@ -37,11 +33,7 @@ def verify_graph(graph: Graph, what: str) -> None:
 
 
 def verify(program: Phase) -> None:
-    """Check a whole program: every graph, every weight, and how the pieces fit together.
-
-    Raises:
-        PassError: what does not hold, where.
-    """
+    """Check a whole program: every graph, every weight, and how the pieces fit together."""
     spec, denoiser = program.spec, program.denoiser
     expected = [spec.sample_argument, spec.timestep_argument, *spec.observations]
     if list(denoiser.inputs) != expected:

@@ -34,16 +34,7 @@ Values = list[ValueInfoProto]
 
 
 def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tuple[Values, Values]:
-    """All inputs, those that may be left out with what they are then; and all outputs.
-
-    Args:
-        main: writer of the main graph.
-        program: after all passes.
-        weights: values of the pruner's constants.
-
-    Raises:
-        LoweringError: an observation has the name of another input or output.
-    """
+    """All inputs, those that may be left out with what they are then; and all outputs."""
     spec, pieces = program.spec, program.pieces
     observations = [tensor(key, each.dtype, ["B", *each.shape]) for key, each in spec.observations.items()]
     inputs, outputs = _of_every_policy(program)

@@ -18,19 +18,11 @@ class Contexts:
     """Writes the prologue of all streams into the main graph.
 
     Args:
-        main: writer of the main graph.
-        pieces: of the program.
         models: of ``condition`` and, if the program has them, ``frames``, frame pieces, ``step`` and ``pruner``.
-        weights: values of their constants.
         observations: normalised, by name.
         streams: value of B, int64 ``[1]``.
         steps: K.
 
-    Attributes:
-        pieces: of the program.
-        streams: value of B, int64 ``[1]``.
-        steps: K.
-        conditions: condition values by name.
         rows: tables ``[K, ...]`` by name.
         by_step: step values ``[K * B, ...]`` by name, step-major, whatever their axis of streams is.
     """
@@ -101,13 +93,7 @@ class Contexts:
 
 
 class StreamContexts:
-    """Hands out the value of a context at a step, of some of the streams.
-
-    Args:
-        w: of a graph inside of the main one; what does not change from step to step is written there.
-        contexts: of all streams.
-        members: numbers of the streams, int64 ``[S]``.
-    """
+    """Hands out the value of a context at a step, of some of the streams."""
 
     def __init__(self, w: GraphWriter, contexts: Contexts, members: str) -> None:
         self._w, self._contexts, self._members = w, contexts, members

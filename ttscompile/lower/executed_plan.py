@@ -48,7 +48,6 @@ def write_executed_plans(
     """Write the nodes.
 
     Args:
-        w: of the main graph.
         plan: int8 [1, K, N] or [B, K, N].
         index: int64 [B, K, N]; negative where the rollout cache has no residual of the cell.
         streams: B, int64 [1].

@@ -20,9 +20,6 @@ class GraphWriter:
     """Nodes and constants of one graph; ``inner`` opens a graph for the body of an If or a Loop.
 
     Names are unique over all graphs of a model, since a body sees the values of the graphs around it.
-
-    Args:
-        names: numbers that no other graph of the model uses.
     """
 
     def __init__(self, names: Iterator[int] | None = None) -> None:
@@ -74,13 +71,7 @@ class GraphWriter:
     def inline(self, model: ModelProto, inputs: Mapping[str, str], weights: Weights) -> list[str]:
         """Lay a model inside this graph, its weights too: onnxruntime packs only weights of the graph that reads them.
 
-        Args:
-            model: from ``lower_program``; initializers without data are constants of the program.
-            inputs: a value for each of its inputs, and for constants that are no weights here.
-            weights: values of the constants.
-
-        Returns:
-            The names of its outputs.
+        ``inputs`` has a value for each of its inputs, and for constants that are no weights here. The outputs' names.
         """
         graph = model.graph
         names = dict(inputs)

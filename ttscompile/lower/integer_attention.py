@@ -47,11 +47,9 @@ class Attention:
     Attributes:
         inputs: names of query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` in float32.
         flat: they are as above, as is the result; else ``[B, heads, tokens, C]``.
-        heads: how many.
         queries: T; zero if only a run says it, and then B is one.
         keys: S.
         channels: C of query and key, and of value.
-        scale: of the scores.
     """
 
     inputs: tuple[str, str, str]
@@ -69,8 +67,6 @@ def attention_of(
     """What a node attends to, if integers can do that, and are faster.
 
     Args:
-        node: of the model.
-        attributes: of the node.
         shapes: of values, zero for a size that is not known.
         any_queries: the shapes are of one case of many: a run has one row, and any number of queries.
     """

@@ -42,7 +42,6 @@ class Convolution:
         pads: before each axis of ``sizes``, and then after each.
         places: which pixels each place of the result sees, of the padded ones, int32 ``[places * kernel]``; None where
             they are all of them in order.
-        sizes: of the result.
     """
 
     x: str
@@ -99,15 +98,7 @@ def convolution_of(
 def integer_convolution(
     node: NodeProto, of: Convolution, integers: str, scales: str, keep: Callable[[str, Array], str]
 ) -> list[NodeProto]:
-    """The nodes that take the place of ``node``.
-
-    Args:
-        node: the convolution.
-        of: what it convolves.
-        integers: name of the constant int8 ``[kernel * C, O]``.
-        scales: name of the constant float32 ``[O]``.
-        keep: stores a small constant under a name, and gives the name.
-    """
+    """The nodes that take the place of ``node``."""
     axes, own = len(of.sizes), f"{node.name}."
     kernel = len(of.matrix)
     u8, scale, zero = (own + name for name in ("u8", "scale", "zero"))

@@ -120,15 +120,7 @@ class _Step:
 
 
 class DenoisingLoop:
-    """Writes the loop of streams that follow one plan.
-
-    Args:
-        main: writer of the graph that the loop is in.
-        program: after all passes.
-        models: from ``lower_program``.
-        weights: values of their constants.
-        contexts: values that the pieces read beside the stream.
-    """
+    """Writes the loop of streams that follow one plan."""
 
     def __init__(
         self,

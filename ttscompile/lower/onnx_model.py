@@ -31,14 +31,9 @@ def name_model(exported: ModelProto, name: str, inputs: Values, constants: Value
 
     Args:
         exported: its inputs are the inputs and then the constants, by position.
-        name: of the ONNX graph.
-        inputs: name and type of each input of the model.
         constants: name and type of each weight. Each becomes an initializer of this name with dtype and dims and *no
             data*; the writer of the artifact gives it a place in a weights file (``artifact.bind``).
         outputs: name and type of each output; an output may be an input or a constant.
-
-    Raises:
-        LoweringError: the exporter left local functions or control flow.
     """
     graph = exported.graph
     if exported.functions:
@@ -93,11 +88,7 @@ def own_model(graph: GraphProto, opset_import: Iterable[onnx.OperatorSetIdProto]
 
 
 def only(model: ModelProto, inputs: Sequence[ValueInfoProto], outputs: Sequence[ValueInfoProto]) -> ModelProto:
-    """The part of a model that computes ``outputs`` from ``inputs``; both are the model's own.
-
-    Raises:
-        LoweringError: the outputs depend on another input.
-    """
+    """The part of a model that computes ``outputs`` from ``inputs``; both are the model's own."""
     part = ModelProto()
     part.CopyFrom(model)
     nodes = live_nodes(list(model.graph.node), {value.name for value in outputs})

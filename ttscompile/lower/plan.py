@@ -59,15 +59,7 @@ class LoweredPlan:
 
 # PLR0915: a node a line
 def lower_plan(w: GraphWriter, plan: str, groups: Sequence[int], steps: int, together: int) -> LoweredPlan:  # noqa: PLR0915
-    """Write the nodes that lower a plan.
-
-    Args:
-        w: of the graph that the loop is in.
-        plan: int8 [K, N], legal.
-        groups: FORWARD group of each block.
-        steps: K.
-        together: how many neighbouring blocks make a group of ``any_of_group``.
-    """
+    """Write the nodes that lower a plan."""
     count = len(groups)
     # Which cells are what. Booleans and int64 throughout: onnxruntime has kernels for all of these.
     source = w.op("Cast", plan, to=INT64)

@@ -76,14 +76,10 @@ def parts_to_lower(
     """The parts of a program (``ir.pieces.part_of``) for which another precision is worth while.
 
     Args:
-        program: after all passes.
         keep_fp32: parts that stay as they are; ``prologue`` for all of them but ``blocks``.
 
     Returns:
         Names of parts in order; those that stay fp32 because it was asked; and notes on what stays.
-
-    Raises:
-        LoweringError: ``keep_fp32`` has a name that is no part of the policy, or leaves nothing.
     """
     flops: dict[str, int] = {}
     rows = {frame_name(i): count for i, count in enumerate(program.pieces.rows)}
@@ -111,16 +107,12 @@ def lower_precision(
 
     Args:
         models: from ``lower_program``; those of the parts are taken, but for the models that hold all blocks.
-        weights: constants of the program, by name.
         precision: ``int8``; the models have ``fp32`` already.
         parts: from ``parts_to_lower``.
 
     Returns:
         By name, the models in which a product was replaced; the new constants of these models, by name; and notes on
         what was replaced and what was not.
-
-    Raises:
-        LoweringError: ``precision`` is none of onnxruntime's CPU provider, or no part has a product to replace.
     """
     require_precision(precision)
     made: dict[str, ModelProto] = {}
@@ -176,11 +168,7 @@ def _notes(
 
 
 def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
-    """Raise unless weights can be lowered to this precision, and it may have parts that stay fp32.
-
-    Raises:
-        LoweringError: says why not.
-    """
+    """Raise LoweringError unless weights can be lowered to this precision, and it may have parts that stay fp32."""
     if precision not in PRECISIONS:
         raise LoweringError(f"precision {precision!r}: expected one of {', '.join(map(repr, PRECISIONS))}.")
     if isinstance(keep_fp32, str) or not all(isinstance(part, str) for part in keep_fp32):
@@ -246,9 +234,6 @@ def quantize_model(
 
 def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
     """A matrix as integers times a scale for each column.
-
-    Args:
-        matrix: float32 ``[rows, columns]``.
 
     Returns:
         int8 ``[rows, columns]`` in -127..127, and float32 ``[columns]``; their product is within half a scale of the

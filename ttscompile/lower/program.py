@@ -48,9 +48,6 @@ def lower_graph(graph: Graph, name: str) -> onnx.ModelProto:
     Inputs and outputs are called as in the graph; sizes ``Batch(c)`` are the dynamic dimension ``c*B``. Each constant
     that is read is an initializer of the constant's name with dtype and dims and no data: ``artifact.bind`` points it
     into a weights file. The bytes depend on the graph and the versions of torch and onnxscript alone.
-
-    Raises:
-        LoweringError: an operation has no translation, or the batch size cannot vary.
     """
     return _lower({name: graph})[name]
 
@@ -64,9 +61,6 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
         blocks in one; see ``ir.joint``), if stem and tail allow it ``idle`` (see ``lower.idle``), and of one block
         alone ``layers`` (see ``ir.layers``). ``advance@NAME`` and ``pruner@NAME`` are those of a further loop, where
         they differ from the original's. Graphs of one structure are exported once.
-
-    Raises:
-        LoweringError: as ``lower_graph``.
     """
     pieces = program.pieces
     graphs = {name: graph for name, graph in pieces.graphs().items() if name != TAIL}

@@ -84,13 +84,7 @@ LARGEST = 2**31 - 1
 def lower_single_file(
     program: Program, models: Mapping[str, ModelProto], weights: Weights, loop: str = ORIGINAL
 ) -> ModelProto:
-    """The model of the whole call in one of the program's loops, with its weights inside.
-
-    Args:
-        program: after all passes.
-        models: from ``lower_program``; blocks may be of another precision.
-        weights: values of the constants of these models.
-        loop: name of the loop.
+    """The model of the whole call in one of the program's loops, with its weights inside; blocks may be in int8.
 
     Raises:
         SpecError: there is no such loop.

@@ -52,15 +52,7 @@ def write_streams(
 ) -> Denoised:
     """Write the loop over plans, with all that is in it.
 
-    Args:
-        main: writer of the main graph.
-        program: after all passes.
-        models: from ``lower_program``.
-        weights: values of their constants.
-        contexts: of all streams.
-        plans: of all streams.
-        inputs: of all streams.
-        keep: bool [K, N]; computed residuals that later calls may read.
+    ``keep`` is bool [K, N]: computed residuals that later calls may read.
     """
     count = main.op("Shape", plans.different, start=0, end=1)
     carried = [inputs.initial, main.op("SequenceEmpty"), main.op("SequenceEmpty", dtype=INT64)]

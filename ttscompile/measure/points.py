@@ -29,8 +29,6 @@ class MeasuredPoint:
     """One plan on the held-out calls of a comparison.
 
     Attributes:
-        series: see ``Point``.
-        name: see ``Point``.
         distance: of its actions from the original's (``calibration.judge``).
         interval: 95 % interval of that, over episodes.
         error: mean absolute difference of the executed actions from the original's with the same noise, in their units;
@@ -76,13 +74,10 @@ class Comparison:
     """The outcome of a comparison.
 
     Attributes:
-        points: in the order of the series.
         calls: held-out calls that each point was measured on.
-        episodes: numbers of the held-out episodes.
         threads: threads that onnxruntime computed with.
         other_noise: mean absolute difference of two dense calls of one observation, in the units of the actions.
         skipped: why a strategy has no plan at a sparsity.
-        warnings: what a reader has to know.
     """
 
     points: tuple[MeasuredPoint, ...]

@@ -47,7 +47,6 @@ class Timer:
         medians = [one.median for one in timer.times]
 
     Args:
-        candidates: how many there are.
         warm_up: rounds at the start whose times do not count.
         clock: seconds since some fixed moment; tests move it.
     """

@@ -26,16 +26,7 @@ _CHARACTER = 0.012
 
 
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
-    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
-
-    Args:
-        width: in inches.
-        height: in inches.
-        told: what it will show, and ``--json`` says too; for the error.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib is not installed.
-    """
+    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -66,26 +57,13 @@ def plain_powers(axis: Axis) -> None:
 
 
 def beside(place: float, name: str, shift: float = 0.0) -> dict[str, Any]:
-    """How to write a name beside its point: to its right, or where that would leave the frame, to its left.
-
-    Args:
-        place: of the point between the first and the last, 0..1.
-        name: to write.
-        shift: upwards, in points.
-
-    Returns:
-        Arguments for ``Axes.annotate``.
-    """
+    """How to write a name beside its point: to its right, or where that would leave the frame, to its left."""
     left = place + _CHARACTER * len(name) > 1
     return {"xytext": (-5 if left else 5, shift), "textcoords": "offset points", "ha": "right" if left else "left"}
 
 
 def require_picture_name(path: Path) -> None:
-    """Raise unless a picture may have this name: to be told before there is something to draw.
-
-    Raises:
-        OutputError: no suffix that says the format, or no such folder.
-    """
+    """Raise unless a picture may have this name: to be told before there is something to draw."""
     if path.suffix.lower() not in FORMATS:
         raise _refused(path, f"its name ends in {path.suffix!r}, which is no format of pictures here")
     if not path.parent.is_dir():
@@ -95,15 +73,7 @@ def require_picture_name(path: Path) -> None:
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:
-    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them.
-
-    Args:
-        figure: drawn.
-        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
-
-    Raises:
-        OutputError: it cannot be written; a file that was there is as it was.
-    """
+    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them."""
     place, content = Path(path), BytesIO()
     require_picture_name(place)
     suffix = place.suffix.lower()

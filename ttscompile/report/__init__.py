@@ -1,4 +1,7 @@
-"""``ttscompile inspect -o``: everything about an artifact on one page that needs nothing else to be read."""
+"""``ttscompile inspect -o``: everything about an artifact on one page that needs nothing else to be read.
+
+A document that is not what it should be is a ``ReportError``; without matplotlib and Jinja2 there is no page.
+"""
 
 from .build import Given, build
 from .page import Page, Picture, Section, Table, render

@@ -33,8 +33,6 @@ class Given:
         episode: recorded observations; None for none.
         comparison: points of one; None for none.
         verification: what was found; see ``verified``.
-        threads: of the calls that are timed.
-        calls: counted ones of each plan.
     """
 
     episode: Episode | None = None
@@ -47,17 +45,7 @@ class Given:
 def build(
     artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None] = lambda what: None
 ) -> Page:
-    """Measure what has to be measured, draw, and put the page together.
-
-    Args:
-        artifact: loaded.
-        policy: the same, with its default runtime and a seed.
-        given: what the report shows beside the artifact.
-        progress: told what is under way.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
-    """
+    """Measure what has to be measured, draw, and put the page together."""
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")

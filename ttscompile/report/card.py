@@ -36,9 +36,7 @@ class Success:
     """How one plan of the artifact did on a task.
 
     Attributes:
-        environment: the task.
         variant: artifact and plan, as the evaluation calls them.
-        episodes: their number.
         figures: mean and 95 % interval by name: ``success`` and ``score``.
         machine: that ran the episodes.
     """
@@ -51,15 +49,7 @@ class Success:
 
 
 def read_success(path: Path, identity: str) -> list[Success]:
-    """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact.
-
-    Args:
-        path: of the document.
-        identity: of the artifact.
-
-    Raises:
-        ReportError: it is no such document, or not of this artifact.
-    """
+    """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact."""
     expected = "expected what examples/evaluation/evaluate.py --json printed"
     try:
         document = parse_json(path.read_bytes(), _MOST_BYTES)
@@ -87,11 +77,7 @@ def _interval(value: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def licence_of(manifest: Manifest, given: str | None) -> str | None:
-    """The licence of the base, which the artifact is under too; of a base that says none the one that was given.
-
-    Raises:
-        ReportError: both say one, and not the same.
-    """
+    """The licence of the base, which the artifact is under too; of a base that says none the one that was given."""
     own = manifest.spec.source.get(BASE_LICENCE)
     if own is not None and given is not None and own.lower() != given.lower():
         raise ReportError(f"the base is under the licence {own}, which was passed on; found {given}. Leave it out.")
@@ -105,15 +91,7 @@ def card(
     success: Sequence[Success],
     licence: str | None,
 ) -> str:
-    """The text of ``README.md``.
-
-    Args:
-        artifact: loaded.
-        repository: ``org/name``.
-        measured: calls with its default plan and with the dense one, measured now.
-        success: what was evaluated; may be empty.
-        licence: from ``licence_of``.
-    """
+    """The text of ``README.md``."""
     manifest = artifact.manifest
     base = _base(manifest)
     head = {

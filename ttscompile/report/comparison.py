@@ -16,11 +16,7 @@ _REMEDY = "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed."
 
 
 def read_comparison(path: Path) -> tuple[Point, ...]:
-    """Points of a comparison.
-
-    Raises:
-        ReportError: the file is not what ``ttscompile bench -t --json`` prints.
-    """
+    """Points of a comparison. Raises ReportError: the file is not what ``ttscompile bench -t --json`` prints."""
     require_path(path, ReportError, _REMEDY)
     try:
         with path.open("rb") as file:

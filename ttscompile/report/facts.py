@@ -57,15 +57,18 @@ def policy(manifest: Manifest) -> Section:
         ("action", f"{chunk.action_dim} numbers, {horizon} steps predicted, {chunk.start}..{chunk.stop - 1} executed"),
         ("sample", f"[{horizon}, {channels}]"),
         *((f"loop {name!r}", told_sampler(table)) for name, table in spec.all_loops.items()),
-        *(
-            (f"loop {name!r}", f"the last {one.steps} steps of {one.loop!r}, from the chunk of the call before")
-            for name, one in manifest.starts.items()
-        ),
+        *starts(manifest),
         ("precision", precision(manifest)),
         *tokens(manifest),
         ("default plan", manifest.default_plan),
     ]
     return Section("Policy", (), (Table(("", ""), tuple(rows), prose=True),))
+
+
+def starts(manifest: Manifest) -> list[tuple[str, str]]:
+    """The loops that begin with the chunk of the call before."""
+    told = "the last {} steps of {!r}, from the chunk of the call before"
+    return [(f"loop {name!r}", told.format(one.steps, one.loop)) for name, one in manifest.starts.items()]
 
 
 def told_sampler(table: SamplerTable) -> str:

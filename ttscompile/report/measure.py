@@ -20,7 +20,6 @@ class Course:
     """One episode with one plan.
 
     Attributes:
-        name: file and number of the episode.
         plans: int8 ``[R, K, blocks]``, as executed.
         legalised: cells of each call that were replaced because they were never computed.
     """
@@ -40,13 +39,7 @@ class Course:
 
 
 def run_episode(policy: CompiledPolicy, episode: Episode, plan: str | None = None) -> Course:
-    """A plan on consecutive calls, from a reset.
-
-    Args:
-        policy: loaded with a seed; it is reset before and after.
-        episode: its first ``EPISODE_CALLS`` calls are run.
-        plan: its name; None for the policy's default.
-    """
+    """A plan, or the policy's default, on the first ``EPISODE_CALLS`` calls of an episode; reset before and after."""
     policy.reset()
     made = []
     for row in range(min(episode.calls, EPISODE_CALLS)):

@@ -30,8 +30,6 @@ class Picture:
     """A PNG.
 
     Attributes:
-        png: the file.
-        caption: under it.
         alt: what it shows, for who cannot see it; empty where the caption says it.
     """
 
@@ -66,11 +64,7 @@ class Page:
     """A report.
 
     Attributes:
-        title: heading of the page.
-        lead: under the title.
         figures: label and value of what matters most.
-        sections: what the page has below the figures, in order.
-        foot: at its end.
     """
 
     title: str
@@ -81,11 +75,7 @@ class Page:
 
 
 def require_packages() -> None:
-    """Raise before anything is measured for a page that could not be made.
-
-    Raises:
-        RuntimeUnavailableError: Jinja2 or matplotlib is not installed.
-    """
+    """Raise before anything is measured for a page that could not be made."""
     for name in ("jinja2", "matplotlib"):
         try:
             importlib.import_module(name)
@@ -97,11 +87,7 @@ def require_packages() -> None:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document without scripts, which refers to nothing outside of itself.
-
-    Raises:
-        RuntimeUnavailableError: Jinja2 is not installed.
-    """
+    """The page as one HTML document without scripts, which refers to nothing outside of itself."""
     require_packages()
     from jinja2 import Environment, StrictUndefined
 

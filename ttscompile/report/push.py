@@ -42,8 +42,6 @@ def push(
         licence: of a base that did not say one, as the hub writes it (``apache-2.0``).
         private: whether a repository that is made now is nobody else's to see.
         runs: counted calls of each plan for the times.
-        dry_run: upload nothing.
-        progress: told what is under way.
 
     Returns:
         ``hf://org/name@commit``; with ``dry_run`` the card.

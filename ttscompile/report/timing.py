@@ -36,13 +36,10 @@ class Contestant:
 
     Attributes:
         label: name of the contestant, for people.
-        plan: that it runs.
         call: one call, given an observation of one stream and noise.
         report: the report of the last call; None if there is none, and everything was computed.
-        spec: specification of the policy.
         dense_flops: of a call without a report; None where they are not known.
         policy: that runs the plan; None of a network.
-        threads: that it computes with.
     """
 
     label: str
@@ -60,9 +57,6 @@ class Measurement:
     """What the counted calls of one contestant took.
 
     Attributes:
-        label: name of the contestant, for people.
-        plan: name of the plan that it ran.
-        times_ms: wall time of each call.
         parts_ms: median of each of ``PARTS``; empty without reports.
         flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
@@ -107,14 +101,7 @@ def measure(
 
     Args:
         entered: at least one; those of one specification get the same observations and noise.
-        calls: counted ones of each.
-        seed: of observations and noise.
-        on_round: told how many rounds of how many are done.
-        warm_up: calls of each before these.
         in_a_row: calls that each makes in its turn, of which the last is timed.
-
-    Returns:
-        One measurement a contestant.
     """
     timer = Timer(len(entered), warm_up)
     reports: list[list[Any]] = [[] for _ in entered]

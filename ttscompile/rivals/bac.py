@@ -61,7 +61,6 @@ class Schedule:
 
     Attributes:
         computed: bool ``[K]``.
-        score: of the similarities.
     """
 
     computed: BoolArray
@@ -69,12 +68,7 @@ class Schedule:
 
 
 def best_schedules(similarity: Scores, most: int) -> list[Schedule]:
-    """The schedules with the highest scores with 1, 2, ... ``most`` computations, the first at step 0.
-
-    Args:
-        similarity: ``[K, K]``, ``S[a, t]`` of one block.
-        most: computations at most.
-    """
+    """The schedules with the highest scores with 1, 2, ... ``most`` computations, the first at step 0."""
     steps = len(similarity)
     sums = np.concatenate([np.zeros((steps, 1)), np.cumsum(similarity, 1)], 1)
     segment = sums - np.diagonal(sums)[:, None]  # [a, e]: a's residual is added at a..e-1
@@ -105,10 +99,6 @@ def bubbling(change: Scores, kinds: Sequence[str]) -> dict[int, list[int]]:
     """The blocks that change most -> the feed-forward blocks at or after each, whose updates it takes over.
 
     In a policy of unknown structure no block is called feed-forward; then any block counts as one.
-
-    Args:
-        change: ``[blocks]``, mean absolute difference of a block's residual between two steps.
-        kinds: the kind of each block.
     """
     followed = [b for b, kind in enumerate(kinds) if kind == FEED_FORWARD] or list(range(len(kinds)))
     sources = np.argsort(-change, kind="stable")[:BUBBLING]
@@ -125,13 +115,7 @@ def union(computed: Sequence[BoolArray], followed: Mapping[int, Sequence[int]]) 
 
 
 def spend(schedules: Sequence[Sequence[Schedule]], followed: Mapping[int, Sequence[int]], budget: int) -> list[int]:
-    """Number of computations of each block before the union, such that there are at most ``budget`` after it.
-
-    Args:
-        schedules: of each block, with 1, 2, ... computations.
-        followed: what ``bubbling`` returns.
-        budget: cells; at least one for each block.
-    """
+    """Number of computations of each block before the union, such that there are at most ``budget`` after it."""
 
     def fits(counts: Sequence[int]) -> bool:
         cells = union([one[n - 1].computed for one, n in zip(schedules, counts, strict=True)], followed)

@@ -31,11 +31,7 @@ def dbcache(task: Task) -> Found:
 
 
 def proposals(task: Task) -> Sequence[tuple[Criterion, float]]:
-    """For each number of first blocks and of warm-up steps that the budget has room for, a criterion.
-
-    Raises:
-        CalibrationError: the policy has one block only.
-    """
+    """For each number of first blocks and of warm-up steps that the budget has room for, a criterion."""
     steps, blocks = task.executor.model.steps, task.executor.model.blocks
     if blocks < 2:
         raise CalibrationError(

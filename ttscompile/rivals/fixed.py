@@ -17,12 +17,7 @@ COMPARED = 16
 
 
 class Fixed(NothingAfter):
-    """A strategy of one interval.
-
-    Args:
-        task: see ``Task``.
-        choose: the function that makes the plan.
-    """
+    """A strategy of one interval."""
 
     def __init__(self, task: Task, choose: Callable[[Task], Found]) -> None:
         self._task, self._choose = task, choose
@@ -65,12 +60,7 @@ def fixed(choose: Callable[[Task], Found]) -> Callable[[Task], Fixed]:
 
 
 def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]]) -> Found:
-    """The candidate with the lowest error of some of the calls to learn from; the first of equals.
-
-    Args:
-        task: see ``Task``.
-        candidates: plans within the budget, each with its parameters; as many are compared as there is time for.
-    """
+    """The candidate with the lowest error of some of the calls to learn from; the first of equals."""
     calls = task.some_calls(COMPARED)
     errors = [task.error(plan, calls) for plan, _ in task.clock.in_time(candidates)]
     best = int(np.argmin(errors))

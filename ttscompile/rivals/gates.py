@@ -49,13 +49,11 @@ class Gates(NothingAfter):
     """Gradient steps on the scores of the cells; see ``Search``.
 
     Args:
-        task: see ``Task``.
         reuse: what cells that are not computed read.
         whole: every how many steps all cells are computed; 0 for step 0 only.
 
     Attributes:
         plan: the best schedule within the budget so far.
-        loss: its error on some of the calls.
     """
 
     intervals = INTERVALS

@@ -89,11 +89,7 @@ class Criterion:
 
 
 class Decisions:
-    """What a criterion decides during one call of B streams. Streams do not influence each other.
-
-    Raises:
-        IllegalPlanError: the policy has no block after the first ``always`` ones.
-    """
+    """What a criterion decides during one call of B streams. Streams do not influence each other."""
 
     def __init__(self, criterion: Criterion, steps: int, blocks: int, streams: int) -> None:
         if criterion.always >= blocks:
@@ -107,10 +103,6 @@ class Decisions:
 
     def decide(self, k: int, feature: FloatArray) -> PlanArray:
         """The row of the plan at step k; to be asked for every step, in order.
-
-        Args:
-            k: the number of the step.
-            feature: ``[B, ...]``, see ``Criterion.always``.
 
         Returns:
             int8 ``[B, blocks]`` of COMPUTE and TIMESTEP; the first ``always`` blocks are COMPUTE.
@@ -194,9 +186,7 @@ def fit_threshold(
     """The criterion with the lowest threshold that keeps the budget, as far as bisection finds it.
 
     Args:
-        task: see ``Task``.
         criterion: with any threshold.
-        calls: whose computed cells are counted.
         low: a threshold that is probably too low.
         high: one that probably is not; doubled until it is not.
         probes: as many as there is time for.
@@ -225,15 +215,7 @@ def fit_threshold(
 
 
 def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
-    """Fit every criterion that is proposed, take the best, and fit it again on more calls.
-
-    Args:
-        task: see ``Task``.
-        proposed: criteria, each with a threshold to begin with.
-
-    Raises:
-        CalibrationFailedError: the time was up before one kept the budget.
-    """
+    """Fit every criterion that is proposed, take the best, and fit it again on more calls."""
     probes, some, more = task.clock.in_time(repeat(None)), task.some_calls(COMPARED), task.some_calls(COUNTED)
     fitted = [fit_threshold(task, criterion, some, 0.0, start, probes) for criterion, start in proposed]
     kept = [one for one in fitted if one is not None]

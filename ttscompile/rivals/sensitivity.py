@@ -33,10 +33,7 @@ def sensitivity(
     """Run the plan, and go back from a figure.
 
     Args:
-        executor: runs the policy.
         plan: ``[K, blocks]`` of COMPUTE and ``reuse``, step 0 dense.
-        reuse: FORWARD or TIMESTEP.
-        calls: the N calls to run.
         copies: how many streams there are of each call, one after the other: ``[copies * N]``.
         figure: a number, of the denoised samples ``[copies * N, T, D]``.
 

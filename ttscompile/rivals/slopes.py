@@ -29,13 +29,6 @@ Matrix = npt.NDArray[np.float32]
 def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls) -> Matrix:
     """The slope of the mean error in every COMPUTE gate.
 
-    Args:
-        executor: runs the policy.
-        actions: which part of the sample counts.
-        plan: ``[K, blocks]`` of COMPUTE and ``reuse``, step 0 dense.
-        reuse: FORWARD or TIMESTEP.
-        calls: calls whose targets are known.
-
     Returns:
         ``[K, blocks]``: by how much computing the cell, rather than reusing, changes the mean absolute error of the
         executed actions, normalised. 0 in step 0, which is always computed.

@@ -15,11 +15,7 @@ from .adaptation import Adaptation
 
 
 class Switched(Tts):
-    """The search of ``Tts``, and after it the switches, where the artifact has a pruner; see ``Search``.
-
-    Args:
-        task: see ``Task``.
-    """
+    """The search of ``Tts``, and after it the switches, where the artifact has a pruner; see ``Search``."""
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)

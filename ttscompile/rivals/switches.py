@@ -53,7 +53,6 @@ class Switch:
         out: ``(k, b)`` of a computed cell of the schedule.
         into: ``(k, b)`` of a reused one.
         weight: ``[F]``.
-        bias: the bias of the same function.
     """
 
     out: tuple[int, int]
@@ -69,12 +68,7 @@ class Switch:
 
 
 class _Components:
-    """Principal components of features, and ridge regression on them.
-
-    Args:
-        features: ``[N, F]``.
-        episodes: ``[N]``; the folds keep the calls of an episode together.
-    """
+    """Principal components of features, and ridge regression on them."""
 
     def __init__(self, features: Matrix, episodes: IntArray) -> None:
         self._mean = features.mean(0, dtype=np.float64)
@@ -122,7 +116,6 @@ def fit_switches(
         computed: ``[K, blocks]``, of the schedule.
         features: ``[N, F]``.
         episodes: ``[N]``, which episode each call is from.
-        count: how many switches at most.
 
     Returns:
         Switches that do not get into each other's way; none if the observation tells nothing.
@@ -190,12 +183,6 @@ def head_weights(
     A linear function ``a`` passes the hidden layer exactly as ``gelu(a) - gelu(-a)``. The code of switch r is +1 or -1,
     nearly always; ``step[:, r]`` and ``block[r]`` carry it to the COMPUTE logits of its two cells, whose base is on the
     edge. All other cells have a margin that no sum of switches reaches.
-
-    Args:
-        constants: the pruner's constants as they are.
-        schedule: ``[K, blocks]``.
-        switches: the switches to express, at most ``capacity`` of them.
-        features: ``[N, F]``, for the scale of the switches' functions.
     """
     new = {name: np.array(value) for name, value in constants.items()}
     for name in NAMES:

@@ -28,8 +28,6 @@ class EDMDenoiser(nn.Module):
     Args:
         network: F as k-diffusion's ``Denoiser`` calls it: ``network(scaled, sigma, **observations)`` with ``scaled
             [B, T, D]`` = ``c_in x`` and ``sigma [B]``.
-        sigmas: as ``edm_table`` is given them.
-        sigma_data: likewise.
     """
 
     def __init__(self, network: nn.Module, sigmas: Sequence[float], sigma_data: float) -> None:
@@ -52,9 +50,6 @@ def edm_table(sigmas: Sequence[float], sigma_data: float, *, clip: float | None 
             ``get_sigmas_karras`` give them.
         sigma_data: standard deviation of the actions that the policy was trained with, as in its configuration.
         clip: bound on the denoised sample.
-
-    Returns:
-        The table, of K rows, deterministic.
 
     Raises:
         SpecError: no noise levels, or such that do not fall to 0 or above it; ``sigma_data`` is not positive.

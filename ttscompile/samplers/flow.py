@@ -5,8 +5,8 @@ Nothing is probed here: the methods are written down, and tests hold them agains
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -15,14 +15,25 @@ from ..core.coercion import integer, numbers
 from ..core.spec import SamplerTable
 from ..errors import SpecError
 
-METHODS = ("euler", "rk4")
-EVALUATIONS = {"euler": 1, "rk4": 4}
-"""Of the network in each step, by method; each is a row of the table."""
+Times = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to integrate.
+
+    Attributes:
+        evaluations: of the network in each step; each is a row of the table.
+        table: of N + 1 times, of what timesteps are multiplied with, and of a bound on the sample or None.
+    """
+
+    evaluations: int
+    table: Callable[[Times, float, float | None], SamplerTable]
 
 
 def flow_matching_table(
     steps: int | Sequence[float],
-    method: Literal["euler", "rk4"] = "euler",
+    method: str = "euler",
     *,
     start: float = 0.0,
     end: float = 1.0,
@@ -46,9 +57,7 @@ def flow_matching_table(
     Args:
         steps: N, number of steps of equal length; or the N + 1 times themselves, from ``start`` to ``end``, which then
             are not to be given.
-        method: ``euler`` or ``rk4``.
-        start: time at which the sample is noise.
-        end: time at which it is the action.
+        method: ``euler``, ``rk4``, or another row of ``METHODS``.
         timestep_scale: the network is given ``time * timestep_scale``, as a float32.
         clip: bound on the sample that the velocity leads to from where it is, ``x + (end - t) v``; Euler only.
 
@@ -56,21 +65,23 @@ def flow_matching_table(
         The table, of K = N (Euler) or K = 4 N (rk4) rows, deterministic.
 
     Raises:
-        SpecError: no steps, times that do not go one way, a method that is not known, or a bound with rk4.
+        SpecError: no steps, times that do not go one way, a method that is not known, or a bound that it cannot keep.
     """
     times = _times(steps, start, end)
     if method not in METHODS:
         raise SpecError(f"flow-matching method {method!r} is not known; expected one of {', '.join(METHODS)}.")
     if not np.isfinite(timestep_scale):
         raise SpecError(f"timestep_scale must be a finite number; found {timestep_scale}.")
-    if method == "euler":
-        return _euler(times, timestep_scale, clip)
+    return METHODS[method].table(times, timestep_scale, clip)
+
+
+def refuse_bound(clip: float | None, method: str) -> None:
+    """Raise SpecError for a bound that a method of several evaluations a step cannot keep."""
     if clip is not None:
-        raise SpecError("clip needs method 'euler': between the stages of rk4 there is no sample to bound.")
-    return _rk4(times, timestep_scale)
+        raise SpecError(f"clip needs method 'euler': between the stages of {method} there is no sample to bound.")
 
 
-def _times(steps: int | Sequence[float], start: float, end: float) -> npt.NDArray[np.float64]:
+def _times(steps: int | Sequence[float], start: float, end: float) -> Times:
     """The N + 1 times."""
     if isinstance(steps, Sequence) or np.ndim(steps):
         times = numbers(steps, "steps", SpecError, "float64")
@@ -83,7 +94,7 @@ def _times(steps: int | Sequence[float], start: float, end: float) -> npt.NDArra
     return times
 
 
-def _euler(times: npt.NDArray[np.float64], scale: float, clip: float | None) -> SamplerTable:
+def _euler(times: Times, scale: float, clip: float | None) -> SamplerTable:
     lengths = np.diff(times)
     zero, one = np.zeros_like(lengths), np.ones_like(lengths)
     left = times[-1] - times[:-1]
@@ -101,7 +112,8 @@ def _euler(times: npt.NDArray[np.float64], scale: float, clip: float | None) -> 
     )
 
 
-def _rk4(times: npt.NDArray[np.float64], scale: float) -> SamplerTable:
+def _rk4(times: Times, scale: float, clip: float | None) -> SamplerTable:
+    refuse_bound(clip, "rk4")
     count, (h,) = len(times) - 1, (np.diff(times),)
     own = np.arange(count)[:, None] * 4 + np.arange(4)
     at = times[:-1, None] + h[:, None] * np.array([0, 0.5, 0.5, 1])
@@ -128,14 +140,11 @@ def _rk4(times: npt.NDArray[np.float64], scale: float) -> SamplerTable:
 def deterministic_table(
     name: str, timesteps: npt.NDArray[np.float64], clip: float | None, **columns: npt.NDArray[np.float64]
 ) -> SamplerTable:
-    """A table in float32, with zeros ``[K]`` for columns that are not given: no noise, for one.
-
-    Args:
-        name: of the method.
-        timesteps: ``[K]``, as the network is given them.
-        clip: bound on the predicted sample; None for none.
-        columns: of ``SamplerTable``, and its memories.
-    """
+    """A table in float32, with zeros ``[K]`` for columns that are not given: no noise, for one."""
     zeros = {column: np.zeros(len(timesteps)) for column in SamplerTable.COLUMNS}
     narrow = {column: np.asarray(values, np.float32) for column, values in (zeros | columns).items()}
     return SamplerTable(name=name, timesteps=np.asarray(timesteps, np.float32), clip=clip, **narrow)
+
+
+METHODS: Mapping[str, Method] = {"euler": Method(1, _euler), "rk4": Method(4, _rk4)}
+"""What ``convert --sampler`` takes for a policy that was trained with flow matching."""

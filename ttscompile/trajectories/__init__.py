@@ -1,4 +1,7 @@
-"""Recorded episodes as calls of the policy: ``.npz``, zarr replay buffers, robomimic's HDF5, LeRobot data sets."""
+"""Recorded episodes as calls of the policy: ``.npz``, zarr replay buffers, robomimic's HDF5, LeRobot data sets.
+
+Whatever is wrong with a recording is a ``TrajectoryError`` of any function of this room.
+"""
 
 from __future__ import annotations
 

@@ -63,8 +63,6 @@ def load_trajectories(
     """Read episodes from files.
 
     Args:
-        paths: files or directories; never unpickled.
-        observations: what one call of the policy takes.
         action_steps: how many actions of a chunk are executed: the frames between two calls.
         sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
             are called otherwise; ``NAME:N`` are the first N numbers of one.
@@ -150,11 +148,7 @@ _SAVEZ = "Use np.savez with plain arrays"
 
 
 def read_npz(path: Path) -> dict[str, Array]:
-    """All arrays of an ``.npz``, without unpickling anything.
-
-    Raises:
-        TrajectoryError: it is missing, truncated, of another format, or holds Python objects.
-    """
+    """All arrays of an ``.npz``, without unpickling anything."""
     require_path(path, TrajectoryError, "Give the .npz file of a recording.")
     if not path.is_file():
         raise TrajectoryError(

@@ -33,7 +33,6 @@ class Frames:
     """What a file holds; arrays are read when they are asked for.
 
     Attributes:
-        names: names of the arrays.
         read: the array ``[F, ...]`` of a name.
         ends: for each episode the frame after its last, increasing.
     """
@@ -48,7 +47,6 @@ class Recording:
     """A data set that is open, in the process that reads it.
 
     Attributes:
-        names: names of the arrays.
         read: the rows of an array by its name, F, and blocks ``[n, ...]`` of them as they are stored.
         ends: for each episode the frame after its last, increasing.
         order: ``[F]`` which stored row is which frame, if they are not in order.
@@ -66,18 +64,12 @@ def observation_frames(
     """The frames of each key of the observation.
 
     Args:
-        path: of the file, for messages.
-        frames: what the file holds.
-        observations: what the policy observes, by key.
         sources: by key, the arrays that it is made of where they are called otherwise: flattened frame by frame and
             joined; ``NAME:N`` are the first N numbers of one.
 
     Returns:
         By key ``[F, *frame]``. Images ``[F, H, W, C]`` become ``[F, C, H, W]``, divided by 255, where the policy takes
         them so: what the original data sets do.
-
-    Raises:
-        TrajectoryError: an array is missing; names those that there are.
     """
     found = {}
     for key, spec in observations.items():
@@ -125,12 +117,7 @@ def _flat(path: Path, name: str, array: Array) -> Array:
 
 
 def _as_image(array: Array, spec: ObservationSpec) -> Array:
-    """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255.
-
-    Args:
-        array: ``[F, ...]``.
-        spec: of one frame.
-    """
+    """Channels first and in 0..1 where the policy takes images so, and the recording has them last and in 0..255."""
     frame = spec.shape
     if array.ndim != 4 or len(frame) != 3 or array.shape[1:] == frame or array.shape[-1] != frame[0]:
         return array
@@ -142,11 +129,7 @@ def _as_image(array: Array, spec: ObservationSpec) -> Array:
 
 
 def require_proportion(path: Path, total: int, size: int) -> None:
-    """Raise if so many bytes of arrays are out of proportion to the bytes of their file.
-
-    Raises:
-        TrajectoryError: they are.
-    """
+    """Raise TrajectoryError if so many bytes of arrays are out of proportion to the bytes of their file."""
     if total > max(FREE_BYTES, MAX_RATIO * size):
         raise TrajectoryError(
             f"{path}: expected arrays in proportion to a file of {size} bytes, at most {MAX_RATIO} times as much; it"
@@ -177,9 +160,6 @@ def require_files(path: Path) -> None:
     """Raise unless a file, or all in a directory, are files of bytes: reading a pipe or ``/dev/zero`` does not end.
 
     Links to files are followed, which is how caches of downloads keep them; links to directories are not.
-
-    Raises:
-        TrajectoryError: names the first that is none.
     """
     for folder, names, files in os.walk(path) if path.is_dir() else [("", [], [os.fspath(path)])]:
         wrong = [name for name in names if Path(folder, name).is_symlink()]

@@ -18,11 +18,7 @@ FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 
 
 def hdf5_recording(path: Path) -> Recording:
-    """Open a data set.
-
-    Raises:
-        TrajectoryError: not one, damaged, or with data outside of the file.
-    """
+    """Open a data set. Raises TrajectoryError: not one, damaged, or with data outside of the file."""
     try:
         import h5py
     except ModuleNotFoundError as error:

@@ -25,11 +25,7 @@ ROWS, IMAGES = 4096, 8
 
 
 def lerobot_recording(path: Path) -> Recording:
-    """Open a data set.
-
-    Raises:
-        TrajectoryError: not one, or damaged.
-    """
+    """Open a data set. Raises TrajectoryError: not one, or damaged."""
     try:
         import pyarrow.parquet as parquet
     except ModuleNotFoundError as error:

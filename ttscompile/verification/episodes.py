@@ -12,12 +12,13 @@ from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..core.plan import DENSE, FULL
 from ..core.spec import Noise, PolicySpec
+from ..measure.energy import pairs, rooted
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..trajectories.episodes import Episode
 from .rung import SKIPPED, Rung, finite, judged
 
-SPARSITY, UNIT = "sparsity error", "action units"
+SPARSITY, UNIT, OF_NOISE = "sparsity error", "action units", "other noise"
 
 AS_CALIBRATED, FEW_AS_CALIBRATED = 2.0, 3.0
 """How often the mean error that calibration measured on held-out calls a plan's may be; and with ``FEW`` calls or less,
@@ -53,6 +54,10 @@ def check_episodes(
 ) -> Rung:
     """Every plan against the dense policy with the same noise, call by call through whole episodes.
 
+    A plan of another sampler, or one that begins with the chunk before, answers the same noise with other actions; what
+    is judged of it is how far its answers to two draws of noise are from two of the dense policy's, in units of what
+    other noise changes (``measure.energy``). Else:
+
     The mean error of the default plan has to keep within what two dense calls with different noise are apart, or within
     what calibration measured on held-out calls (90th percentile), whichever is more. It also has to keep within
     ``AS_CALIBRATED`` times the mean that calibration measured, where it did: a plan that is much worse than it was may
@@ -63,18 +68,19 @@ def check_episodes(
     if manifest.plans.keys() <= {FULL}:
         return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call computes all cells")
     spec, draw = manifest.spec, np.random.default_rng(0)
-    errors: Errors = {name: [] for name in (*manifest.plans, None)}
+    name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
+    errors: Errors = {each: [] for each in (*manifest.plans, None)}
+    unpaired = None if _shares_noise(artifact, name) else Unpaired(name)
     for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
         rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
         if episodes:
             told(f"episode {i + 1} of {len(episodes)}, {len(rows)} call{'s' * (len(rows) != 1)}")
-        _run(policy, spec, rows, draw, errors)
+        _run(policy, spec, rows, draw, errors, unpaired)
     calls, other_noise = len(errors[None]), float(np.mean(errors.pop(None)))
     figures = {
         name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
         for name, e in errors.items()
     }
-    name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
     error = float(np.mean(errors[name]))
     details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": other_noise}
     others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in errors.items() if n != name)
@@ -86,9 +92,14 @@ def check_episodes(
         remedy = "Give recorded episodes with --trajectories to have this judged."
         return Rung(SPARSITY, SKIPPED, found, finite(error), None, UNIT, remedy, details=details)
     promised, promised_p90 = (_promised(manifest.calibration, name, key) for key in ("error", "error_p90"))
-    beyond = max(other_noise, promised_p90 or 0.0)
+    noise, unit = other_noise, UNIT
+    if unpaired is not None:
+        error, noise, unit = unpaired.distance, 1.0, OF_NOISE
+        promised, promised_p90 = _promised(manifest.calibration, name, "distance"), None
+        found += f". It is of another loop, in which the same noise means something else: by two draws {error:.3g} away"
+    beyond = max(noise, promised_p90 or 0.0)
     factor = FEW_AS_CALIBRATED if calls <= FEW else AS_CALIBRATED
-    worse = float("inf") if promised is None else max(factor * promised, NEGLIGIBLE * other_noise)
+    worse = float("inf") if promised is None else max(factor * promised, NEGLIGIBLE * noise)
     reasons = list[str]()
     if not error <= beyond:
         reasons.append("more than other noise would change")
@@ -101,7 +112,35 @@ def check_episodes(
         made += f". This is {'; and '.join(reasons)}"
     remedy = "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such"
     remedy += " episodes, or with a lower --target-sparsity."
-    return judged(SPARSITY, error, min(beyond, worse), UNIT, made, remedy, details=details)
+    return judged(SPARSITY, error, min(beyond, worse), unit, made, remedy, details=details)
+
+
+class Unpaired:
+    """What a plan and the dense policy answer to the same two draws of noise, over many calls.
+
+    Args:
+        plan: its name.
+    """
+
+    def __init__(self, plan: str) -> None:
+        self.plan = plan
+        self._found: list[tuple[float, float]] = []
+
+    def add(self, own: npt.NDArray[np.float64], dense: npt.NDArray[np.float64]) -> None:
+        """The actions that were executed of one call, ``[2, ...]``: a draw each."""
+        h, apart = pairs(*(one.reshape(1, 2, -1) for one in (own, dense)))
+        self._found.append((float(h[0]), float(apart[0])))
+
+    @property
+    def distance(self) -> float:
+        """Between the two, in units of what other noise changes."""
+        return rooted(*np.mean(self._found, axis=0))
+
+
+def _shares_noise(artifact: Artifact, name: str) -> bool:
+    """Whether the noise of a plan's calls means the same as in the original."""
+    plan, original = artifact.plans[name], artifact.manifest.spec.sampler
+    return plan.otherwise is None and artifact.manifest.sampler_of(plan.loop).takes_noise_as(original)
 
 
 def _run(
@@ -110,6 +149,7 @@ def _run(
     rows: Sequence[Mapping[str, npt.NDArray[Any]]],
     draw: np.random.Generator,
     errors: Errors,
+    unpaired: Unpaired | None,
 ) -> None:
     """One episode with every plan, and twice dense; each begins with a reset."""
     noises, others = ([random_noise(spec, draw) for _ in rows] for _ in range(2))
@@ -119,10 +159,15 @@ def _run(
         made = (policy.predict_action(o, noise=n, plan=plan)["action"] for o, n in zip(rows, with_noise, strict=True))
         return [np.asarray(one, np.float64) for one in made]
 
-    dense = actions(DENSE, noises)
+    dense, other = actions(DENSE, noises), actions(DENSE, others)
     for name, found in errors.items():
-        made = actions(DENSE, others) if name is None else actions(name, noises)
-        found += [float(np.abs(one - other).mean()) for one, other in zip(made, dense, strict=True)]
+        made = other if name is None else actions(name, noises)
+        found += [float(np.abs(one - same).mean()) for one, same in zip(made, dense, strict=True)]
+    if unpaired is not None:
+        own = zip(actions(unpaired.plan, noises), actions(unpaired.plan, others), strict=True)
+        scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+        for pair, both in zip(own, zip(dense, other, strict=True), strict=True):
+            unpaired.add(*(np.stack(each) * scale for each in (pair, both)))
 
 
 def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:

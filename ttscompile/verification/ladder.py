@@ -63,8 +63,6 @@ def verify(
         trajectories: recorded episodes, see ``ttscompile.trajectories``. None: errors of reuse are not judged.
         sources: by key of the observation, the arrays of a recording that it is made of.
         calls: recorded calls to go through at least, in whole episodes.
-        threads: threads that onnxruntime computes with.
-        progress: told what is being done.
 
     Returns:
         What every rung found. Nothing is raised for a rung that fails.
@@ -91,11 +89,7 @@ def verify(
 
 
 def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
-    """Hash every file, and open the artifact: None if that fails.
-
-    Raises:
-        ArtifactError: there is nothing at this path that could be an artifact.
-    """
+    """Hash every file, and open the artifact: None if that fails."""
     require_artifact_path(path)
     if (path.is_dir() and not (path / MANIFEST).is_file()) or is_checkpoint(path):
         load_artifact(path)  # says what is wrong

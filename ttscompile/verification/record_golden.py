@@ -54,7 +54,6 @@ def record_original(module: nn.Module, program: Program) -> Golden:
     On one thread: the record does not depend on how many there are, nor on what else the machine does.
 
     Args:
-        module: as it was given to ``compile_denoiser``; it is copied.
         program: what became of it. Its ``denoiser`` is the graph as captured; its pieces are not used.
 
     Raises:

@@ -17,7 +17,6 @@ class Rung:
     """One check.
 
     Attributes:
-        name: name of the rung.
         status: ``passed``, ``failed`` or ``skipped``.
         told: what was compared, and what was found.
         figure: the error; None where there is no number.
@@ -57,8 +56,6 @@ class ErrorMap:
     Attributes:
         steps: the steps that were looked at, ``[A]``.
         errors: relative error of each block's residual there, ``[A, blocks]``.
-        tolerance: the largest error that passes.
-        kinds: kind of each block.
         plan: name of a plan of which cells differ from what was calibrated; None if none does.
         cells: bool ``[K, blocks]``, true for these cells; None if none differs.
     """

@@ -19,7 +19,7 @@ from ttscompile.calibration.choose import choose
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.proposer import Proposal
+from ttscompile.calibration.proposer import Proposal, near
 from ttscompile.calibration.proposers.loops import Cost, Loops
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import DENSE, ORIGINAL, Plan
@@ -92,14 +92,14 @@ def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
     assert not own["wrong"], "with every step computed it is somewhere else"
     assert "wrong is" in proposer.told and "with every step computed" in proposer.told
     last, score = list(found.values())[-1]
-    assert not last.beside and last.plan.loop == "short" and score.interval[1] <= 0.4
+    assert not last.beside and last.plan.loop == "short" and near(score, 0.4)
     assert len(own["short"]) == 2, "the one that is near enough, and one of more steps for what follows"
     # The cheapest call of the original takes longer than the best plan of the loop of eight steps.
     assert not own[ORIGINAL] and "original takes 10 ms at least, and the best 4" in proposer.told
 
 
 def test_where_no_plan_is_near_enough_the_nearest_is_told(directory: Path, recording: Path, timed: None) -> None:
-    with pytest.raises(CalibrationFailedError, match=r"the nearest, '\w+\.\d', is .* where 0.0001 is allowed"):
+    with pytest.raises(CalibrationFailedError, match=r"the nearest, '\w+\.\d', is .* 0.0001 and 0.0002 are allowed"):
         proposed(Loops(request(bound=1e-4)), trials_of(directory, [recording]))
 
 
@@ -122,7 +122,7 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     assert set(artifact.plans) == {DENSE, *result.plans} and "schedule" in result.plans
     rows = {row["name"]: row for row in artifact.manifest.calibration["frontier"]}  # type: ignore[index]
     assert rows[DENSE]["distance"] < 1e-5 and rows["schedule"]["near"] and rows["schedule"]["kept"]
-    assert rows["schedule"]["interval"][1] <= 0.4
+    assert rows["schedule"]["interval"][1] <= 0.8 and rows["schedule"]["distance"] <= 0.4
     assert all(row["kept"] == (name in artifact.plans) for name, row in rows.items())
     policy = ttscompile.load(directory)
     assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
@@ -172,11 +172,11 @@ def chosen(
 def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, recording: Path) -> None:
     trials = trials_of(directory, [recording])
     figures = {
-        "a": (0.24, 0.40, 1.0),  # within the bound, but for its upper limit
+        "a": (0.24, 0.60, 1.0),  # within the bound, but for its upper limit
         "b": (0.20, 0.25, 2.0),
         "c": (0.15, 0.20, 3.0),  # not much nearer than b
         "d": (0.13, 0.20, 4.0),
-        "e": (0.05, 0.30, 5.0),
+        "e": (0.05, 0.60, 5.0),
         "f": (0.16, 0.20, 3.5),  # slower than c and further
     }
     assert chosen(monkeypatch, trials, figures, bound=0.25) == {"schedule": "b", "fast": "a", "safe": "d"}
@@ -185,5 +185,7 @@ def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, record
     assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=50.0)["schedule"] == "d"
     with pytest.raises(CalibrationFailedError, match="keeps 1.5 ms: the fastest, 'b', took 2 ms"):
         chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=1.5)
-    with pytest.raises(CalibrationFailedError, match="the nearest, 'c', is 0.15 away and 0.2 at worst, where 0.1 is"):
+    with pytest.raises(
+        CalibrationFailedError, match="the nearest, 'c', is 0.15 away, and 0.2 at worst; 0.1 and 0.2 are"
+    ):
         chosen(monkeypatch, trials, figures, bound=0.1)

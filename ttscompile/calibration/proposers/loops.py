@@ -1,9 +1,9 @@
 """Which loop, and how many of its steps: of each loop the fewest computed steps that are near enough to the original.
 
 Loops are tried from the one on whose cheapest call this machine spends least. In each, schedules of more and more whole
-steps are proposed, with corrections, until one is near enough: with 95 % confidence, by ``Request.bound``. One more
-follows, for what is learned after it to trade. A loop is left out that is too far from the original when all is
-computed, and one whose cheapest call takes longer than the best plan so far.
+steps are proposed, with corrections, until one is near enough (``proposer.near``). One more follows, for what is
+learned after it to trade. A loop is left out that is too far from the original when all is computed, and one whose
+cheapest call takes longer than the best plan so far.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..arguments import calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise
-from ..proposer import Proposal, Proposals, Request
+from ..proposer import SURE, Proposal, Proposals, Request, near
 from ..schedule import searched
 from ..search import open_search
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
@@ -99,7 +99,7 @@ class Loops:
                 found: list[Score] = []
                 proposal = Proposal(name, one, notes, beside=True, refusal=self._refusal(name, found))
                 yield proposal
-                self._near = found[0].interval[1] <= self._bound
+                self._near = near(found[0], self._bound)
                 if self._near and cost.of(count) < fastest:
                     best, fastest = replace(proposal, beside=False, margin=float("inf")), cost.of(count)
         if best is None:
@@ -216,9 +216,9 @@ class Loops:
 def too_far(name: str, score: Score, bound: float) -> str:
     """What a user is told where no plan is near enough, given the nearest."""
     return (
-        f"no plan is near enough to the original: the nearest, {name!r}, is {score.distance:.3g} away and"
-        f" {score.interval[1]:.3g} at worst, where {bound:g} is allowed. Record more episodes, or allow more time or a"
-        " larger error."
+        f"no plan is near enough to the original: the nearest, {name!r}, is {score.distance:.3g} away, and"
+        f" {score.interval[1]:.3g} at worst; {bound:g} and {SURE * bound:g} are allowed. Record more episodes, or allow"
+        " more time or a larger error."
     )
 
 

@@ -53,11 +53,7 @@ SMALLEST = 2
 
 
 def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
-    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads.
-
-    Raises:
-        CalibrationError: there are none for so large a rank.
-    """
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
     pieces = artifact.pieces
     others = {
         name for key, graph in artifact.graphs.items() if not key.startswith("block_") for name in graph.constants
@@ -89,7 +85,6 @@ class Lesson:
     """Calls, and what their loop carries to the first step that is trained.
 
     Attributes:
-        calls: with targets.
         carried: to step ``Student.begin``.
     """
 
@@ -103,14 +98,10 @@ class Student:
     Args:
         executor: of a view with weights beside the original's, which this changes in place.
         plan: cells of whole steps, at least two of them computed, and their correction.
-        rank: of the changes.
         seed: of the first changes, and of the order of the calls.
-        updates: how many there are to be.
 
     Attributes:
-        executor: with the plan's correction.
         begin: the first step that is trained: the second that the plan computes.
-        done: number of updates so far.
     """
 
     def __init__(self, executor: Executor, plan: Plan, rank: int, seed: int, updates: int) -> None:
@@ -143,7 +134,6 @@ class Student:
         """Learn from one batch.
 
         Args:
-            lesson: calls to learn from.
             passed: share of the time that there is; the rate falls with it, or with the updates done.
 
         Returns:

@@ -95,11 +95,7 @@ class Weights:
 
 
 def _require_whole_steps(trials: Trials, plan: Plan) -> None:
-    """Raise unless a plan can be distilled.
-
-    Raises:
-        CalibrationFailedError: it cannot.
-    """
+    """Raise CalibrationFailedError unless a plan can be distilled."""
     cells = plan.cells
     if cells is not None and plan.loop == trials.base.loop and plan.weights == ORIGINAL:
         steps = np.flatnonzero((cells == Source.COMPUTE).all(axis=1)).tolist()

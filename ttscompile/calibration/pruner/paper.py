@@ -99,7 +99,6 @@ class Paper(NothingAfter):
         loss: error of the best head so far on calls that it was not trained on, at the budget.
         trained: the same without what it begins with: how far training got, whether or not that is better. Infinite
             before the first comparison.
-        plan: its plans, frozen.
     """
 
     intervals = UPDATES

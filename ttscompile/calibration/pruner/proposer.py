@@ -26,9 +26,6 @@ from .paper import Paper
 class Pruner:
     """Gates for each observation, on average within the cells that the plan so far computes. See ``Proposer``.
 
-    Args:
-        request: see ``Request``.
-
     Attributes:
         told: see ``Proposer``.
     """

@@ -25,15 +25,7 @@ BYTES = 2**28
 
 
 class Practice:
-    """Calls to learn from, in windows of consecutive ones, and what the blocks compute in them when all is computed.
-
-    Args:
-        executor: runs the policy; its correction is used.
-        calls: with targets; as many windows of them are taken as there is memory for.
-
-    Attributes:
-        calls: those that are taken.
-    """
+    """Calls to learn from, in windows of consecutive ones, and what the blocks compute in them when all is computed."""
 
     def __init__(self, executor: Executor, calls: Calls) -> None:
         model = executor.model

@@ -73,15 +73,7 @@ OBSERVATION = "the observation, after the fact"
 
 
 def choices(learned: Errors, judged: Errors, steps: npt.NDArray[np.int64], budget: int, seed: int) -> list[Choice]:
-    """Ways of choosing among the schedules that compute ``budget`` steps; and among all of them, so many on average.
-
-    Args:
-        learned: where the single schedule and the predictors come from.
-        judged: where everything is judged, of other episodes.
-        steps: computed steps of each schedule, ``[S]``.
-        budget: computed steps of a call.
-        seed: of the bootstrap.
-    """
+    """Ways of choosing among the schedules that compute ``budget`` steps; and among all of them, so many on average."""
     same = np.flatnonzero(steps == budget)
     one = same[learned.of[..., same].mean((0, 1)).argmin()]
     single = judged.of[..., one]
@@ -141,8 +133,6 @@ def _predicted(learned: Errors, judged: Errors, name: str, relative: bool) -> tu
     """Errors as a ridge regression on known numbers sees them, ``[O, R, S]``: of the calls learned on, and the others.
 
     Args:
-        learned: the calls that it is fitted to.
-        judged: the others.
         name: what it reads; any name that ``known`` does not have stands for all.
         relative: regress logarithms of errors relative to the call's mean; else errors.
     """

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import choosing
 import numpy as np
 import pytest
-
-from ttscompile.rivals import choosing
-from ttscompile.rivals.choosing import AFTER, OBSERVATION, SINGLE, Choice, Errors, choices
+from choosing import AFTER, OBSERVATION, SINGLE, Choice, Errors, choices
 
 OBSERVATIONS, DRAWS, SCHEDULES, EPISODES = 120, 4, 6, 12
 

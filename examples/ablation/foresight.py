@@ -16,22 +16,30 @@ from typing import Any
 
 import numpy as np
 import torch
+from choosing import Choice, Errors, choices
 
-from ..artifact.load import load_artifact
-from ..artifact.view import view_of
-from ..calibration.calls import FRACTION, Actions, Calls, load_episodes, prepare_calls, sample_calls, split_episodes
-from ..calibration.execute import Executor
-from ..calibration.fit_correction import fit_correction
-from ..calibration.progress import Progress
-from ..calibration.spacing import spacings
-from ..calibration.targets import REPEATS, dense_rounds
-from ..calibration.task import Array
-from ..calibration.trials import base_of
-from ..core.coercion import integer
-from ..core.correction import MOST_NUMBERS, Correction
-from ..core.lattice import PlanArray, whole_steps_plan
-from ..errors import CalibrationError
-from .choosing import Choice, Errors, choices
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.calibration.calls import (
+    FRACTION,
+    Actions,
+    Calls,
+    load_episodes,
+    prepare_calls,
+    sample_calls,
+    split_episodes,
+)
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.fit_correction import fit_correction
+from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.targets import REPEATS, dense_rounds
+from ttscompile.calibration.task import Array
+from ttscompile.calibration.trials import base_of
+from ttscompile.core.coercion import integer
+from ttscompile.core.correction import MOST_NUMBERS, Correction
+from ttscompile.core.lattice import PlanArray, whole_steps_plan
+from ttscompile.errors import CalibrationError
 
 FITTED = 384
 """Calls that corrections are fitted on, at most."""
@@ -76,7 +84,6 @@ def oracle(
     """Measure what choosing a schedule for each call could gain. Nothing is written.
 
     Args:
-        path: the artifact.
         trajectories: recorded episodes, see ``ttscompile.trajectories``; three at least.
         budget: computed steps of a call.
         observation: see ``ttscompile.calibrate``.
@@ -84,7 +91,6 @@ def oracle(
         calls: observations to judge on, and as many to learn from, at most.
         draws: of noise for each observation, two at least.
         seed: the seed of the division of the episodes, the calls, the noise and the schedules.
-        progress: told how far it is.
 
     Raises:
         CalibrationError: arguments out of range, or too few episodes.

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import foresight
 import numpy as np
 import pytest
+from choosing import AFTER, OBSERVATION, SINGLE
+from foresight import Oracle, oracle, placements
 
 from tests.calibration import policies
+from tests.once import Once
+from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import CalibrationError
-from ttscompile.rivals.choosing import AFTER, OBSERVATION, SINGLE
-from ttscompile.rivals.oracle import Oracle, oracle, placements
+
+
+@pytest.fixture(scope="module")
+def compiled(once: Once) -> Path:
+    return policies.compiled(once)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return policies.record(tmp_path_factory.mktemp("calls") / "calls.npz")
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +79,14 @@ def test_two_episodes_are_too_few(compiled: Path, tmp_path: Path) -> None:
     np.savez(few, obs=np.zeros((4, 2, 3), np.float32) + np.arange(4)[:, None, None], episode_ends=np.array([2, 4]))
     with pytest.raises(CalibrationError, match="hold 2 episodes; expected three at least"):
         oracle(compiled, [few], 3)
+
+
+def test_of_one_step_nothing_can_be_chosen(compiled: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_artifact(compiled)
+    sampler = loaded.manifest.spec.sampler
+    rows: Any = {name: np.ascontiguousarray(getattr(sampler, name)[:1]) for name in sampler.COLUMNS}
+    one = replace(sampler, timesteps=sampler.timesteps[:1].copy(), **rows)
+    single = replace(loaded, manifest=replace(loaded.manifest, spec=replace(loaded.manifest.spec, sampler=one)))
+    monkeypatch.setattr(foresight, "load_artifact", lambda _: single)
+    with pytest.raises(CalibrationError, match="1 denoising step; expected three at least"):
+        oracle(compiled, [recording], 2)

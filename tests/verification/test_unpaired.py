@@ -1,0 +1,36 @@
+"""How a plan is judged whose calls answer the same noise with other actions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ttscompile.core.sampler import SamplerTable
+from ttscompile.samplers.flow import flow_matching_table
+from ttscompile.verification.episodes import Unpaired
+
+
+@pytest.mark.parametrize(("moved", "least", "most"), [(0.0, 0.0, 0.25), (0.5, 0.2, 0.6), (3.0, 1.2, 3.0)])
+def test_what_answers_are_tells_them_apart_and_not_their_noise(moved: float, least: float, most: float) -> None:
+    draw, found = np.random.default_rng(0), Unpaired("fast")
+    for _ in range(300):
+        own, dense = draw.standard_normal((2, 2, 8, 3))
+        found.add(own + moved, dense)
+    assert least <= abs(found.distance) <= most
+
+
+def test_the_same_answers_are_at_no_distance() -> None:
+    found, answers = Unpaired("fast"), np.random.default_rng(0).standard_normal((2, 8, 3))
+    found.add(answers, answers)
+    assert found.distance == 0
+
+
+def test_which_samplers_take_noise_alike() -> None:
+    """Same name, same steps, draws in both or in neither."""
+    euler = flow_matching_table(4)
+    assert euler.takes_noise_as(flow_matching_table(4))
+    assert not euler.takes_noise_as(flow_matching_table(5))
+    columns = {name: getattr(euler, name).copy() for name in SamplerTable.COLUMNS}
+    columns["noise_to_next"][0] = 1
+    drawing = SamplerTable(euler.name, euler.timesteps, clip=None, **columns)
+    assert not euler.takes_noise_as(drawing) and drawing.takes_noise_as(drawing)
