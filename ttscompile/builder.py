@@ -8,8 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from .artifact.load import load_artifact
-from .artifact.manifest import read_manifest
+from .artifact.load import load_artifact, read_manifest
 from .calibration.budget import SPARSITY, Goal
 from .calibration.pipeline import calibrate
 from .calibration.proposer import LOOPS, Request, rows_of

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.frontier import print_frontier
@@ -59,7 +60,7 @@ def build(
     error: float | None,
     minutes: float,
     as_json: bool,
-    **how: Any,  # ttscompile.builder.build takes them by the same names
+    **how: Any,  # ttscompile.build takes them by the same names
 ) -> None:
     """Compile CHECKPOINT, and choose the fastest plan that is near enough to the original.
 
@@ -72,26 +73,23 @@ def build(
     require_replaceable(directory)
     require_recordings(trajectories)
     console = progress()
-    with only_results_on_stdout():
-        from ttscompile.builder import build as build_policy
+    with only_results_on_stdout(), console.status("compiling") as status:
 
-        with console.status("compiling") as status:
+        def explain(stage: str, notes: tuple[str, ...]) -> None:
+            status.update(f"compiling: after {stage}")
+            if stage == "write":
+                status.stop()  # the search has a bar of its own
 
-            def explain(stage: str, notes: tuple[str, ...]) -> None:
-                status.update(f"compiling: after {stage}")
-                if stage == "write":
-                    status.stop()  # the search has a bar of its own
-
-            build_policy(
-                checkpoint,
-                directory,
-                trajectories,
-                observation=sources,
-                max_distance=error,
-                max_minutes=minutes,
-                explain=explain,
-                **how,
-            )
+        ttscompile.build(
+            checkpoint,
+            directory,
+            trajectories,
+            observation=sources,
+            max_distance=error,
+            max_minutes=minutes,
+            explain=explain,
+            **how,
+        )
     artifact = load_artifact(directory)
     if as_json:
         print_json(document(artifact))
