@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, Strategy, strategy_of
 from .targets import REPEATS
-from .trials import Trials, base_of
+from .trials import MANY_DRAWS, OBSERVATIONS, Trials, base_of
 
 
 def calibrate(
@@ -181,7 +182,10 @@ def calibrate(
         limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
         clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
         with Bar(progress) as bar:
-            opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": (fewest, limit)}
+            opened: dict[str, Any] = {"clock": clock, "bar": bar, "pool": pool, "device": there}
+            if chooses:
+                opened |= {"observations": OBSERVATIONS // 2, "draws": MANY_DRAWS}
+            opened["limits"] = fewest, limit
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             _warn(trials, rows, chosen, corrects)
             kept, told = Kept(trials, anew), dict[str, str]()

@@ -35,6 +35,10 @@ from .targets import SHARE, dense_rounds, draw_calls, with_targets
 DRAWS = 4
 """Of noise for each observation."""
 
+MANY_DRAWS = 16
+"""The same where plans of other samplers are judged, whose noise cannot be paired. Where two plans answer alike the
+error of an energy distance falls as the number of draws, and only as the root of that of observations."""
+
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
 
@@ -68,6 +72,11 @@ class Sample:
     answers: FloatArray
 
     @property
+    def draws(self) -> int:
+        """R."""
+        return self.answers.shape[1]
+
+    @property
     def episodes(self) -> IntArray:
         """The number of the episode of each answered call, ``[N]``."""
         return np.asarray(self.stretches[self.calls[:, 0], 0])
@@ -85,6 +94,7 @@ class Trials:
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
         observations: that the original answers, at most, of either part.
+        draws: of noise for each of them.
         until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
@@ -108,6 +118,7 @@ class Trials:
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
     observations: int = OBSERVATIONS
     name: str = DENSE
+    draws: int = DRAWS
     until: float = SHARE
     _calls: dict[int, Calls] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
@@ -224,7 +235,7 @@ class Trials:
         """What the original answers; what is in the state already is not asked for again."""
         view = view_of(self.artifact, DENSE)
         spec = view.manifest.spec
-        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(DRAWS)]
+        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(self.draws)]
         noise = self.noise(spec, [self.key(part, *one) for one in asked])
         places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
         key = f"{part} answers"
@@ -245,7 +256,7 @@ class Trials:
                 self.state.progress["seconds"] = self.clock.elapsed()
                 self.state.save()
                 self.bar.update(len(known), "", self.clock.left())
-        return known.reshape(len(calls), DRAWS, *spec.sample)
+        return known.reshape(len(calls), self.draws, *spec.sample)
 
 
 def base_of(artifact: Artifact) -> Plan:
