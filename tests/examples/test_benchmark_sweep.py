@@ -33,7 +33,7 @@ def test_the_table_has_ratios_to_eager_and_to_the_floor() -> None:
     assert "100.0" not in alone
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_quick_run_gives_a_document_and_a_picture(tmp_path: Path) -> None:
     picture = tmp_path / "sweep.png"
     result = CliRunner().invoke(main, ["--quick", "--runs", "1", "--json", "--plot", str(picture)])

@@ -19,7 +19,7 @@ def test_the_world_is_changed_to_an_episode_of_the_same_task() -> None:
     assert warm_start.neighbours(episodes) == [2, 3, 0, 1]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_it_measures_a_policy_of_one_layer(one_layer_checkpoint: Path) -> None:
     arguments = [str(one_layer_checkpoint), "--sampler", "ddim", "--steps", "3", "--evaluations", "1", "--json"]
     sizes = ["--episodes", "2", "--compared", "2", "--threads", "1"]

@@ -25,7 +25,7 @@ WORLD = 512.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["flow", "pixels"])
+@pytest.mark.parametrize("name", ["flow", pytest.param("pixels", marks=pytest.mark.soak)])
 def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     def convert(directory: Path) -> Program:
         return ttscompile.convert(POLICIES / name / "policy", directory, task=TASK)

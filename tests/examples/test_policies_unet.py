@@ -17,7 +17,7 @@ WORLD = 512
 """Pixels, the range of the actions."""
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_checkpoint_compiles_and_dense_is_the_eager_policy(tmp_path: Path) -> None:
     program = ttscompile.convert(CHECKPOINT, tmp_path / "compiled")
     assert [block.kind for block in program.blocks] == ["network"]

@@ -37,7 +37,7 @@ FOUND: dict[str, tuple[dict[str, int], int, float]] = {
     "cross-attention only": ({"cross_attention": 2, "feed_forward": 2}, 0, 0.81),
 }
 
-LOWERED = ("MM-DiT", "guidance")
+LOWERED = ("MM-DiT",)
 """Whose structure asks something of the lowering or of the runtimes; the others go there with ``-m soak``."""
 
 

@@ -14,7 +14,7 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.driver import transform
 from ttscompile.ir.program import Program
 
-LOWERED = ("smolvla", "rdt")
+LOWERED = ("smolvla",)
 """Run through both runtimes every time; the others with ``-m soak``, for the sake of time."""
 
 

@@ -82,6 +82,7 @@ def test_the_artifact_is_the_same_without_them(folder: Path, tmp_path: Path) -> 
     assert read(whole, "config.json")["threads"] == 2
 
 
+@pytest.mark.soak
 def test_they_are_the_same_bytes_again_and_go_with_an_artifact_that_is_replaced(folder: Path, tmp_path: Path) -> None:
     spec, again = load_artifact(folder / "compiled").manifest.spec, tmp_path / "again"
     made = lerobot_files(folder / "policy", spec)

@@ -64,7 +64,7 @@ def test_a_camera_that_the_robot_lacks(directory: Path, kind: str, golden: Mappi
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
-@pytest.mark.parametrize("kind", ["pi05", pytest.param("pi0", marks=pytest.mark.soak)])
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.soak) for kind in ("pi05", "pi0")])
 def test_what_is_compiled_gives_them_too(
     once: Once, tmp_path: Path, kind: str, golden: Mapping[str, Array], runtime: str
 ) -> None:

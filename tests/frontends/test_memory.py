@@ -19,7 +19,7 @@ MOST = 1.2
 """Of the weights, 386 MiB: it was 0.7, and 2.3 with a copy for the capture and one for the exporter's examples."""
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.skipif(not ROLLUP.exists(), reason="needs /proc/self/smaps_rollup")
 def test_weights_are_not_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are mapped, and the module, the graphs and the golden record read them where they are."""

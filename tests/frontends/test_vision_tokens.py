@@ -30,7 +30,7 @@ def test_of_paligemma(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(pis.save("pi05", tmp_path / "policy")) == ["frame_00: 64 tokens"]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_of_a_clip_for_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "image_size": 64}
     monkeypatch.setattr(lerobot_tiny, "VISION", lerobot_tiny.VISION | sizes)

@@ -33,7 +33,7 @@ def test_models_that_differ_between_loops_have_the_loops_name() -> None:
     assert {part_of(name) for name in further} == {None}
 
 
-@pytest.mark.parametrize("loop", ["ddim-3", "ddim-6-trailing"])
+@pytest.mark.parametrize("loop", ["ddim-3", pytest.param("ddim-6-trailing", marks=pytest.mark.soak)])
 def test_a_model_of_a_loop_is_that_of_its_own_program(loop: str) -> None:
     whole, alone = models_of(), models_of(loop)
     for piece in ("advance", "pruner"):

@@ -300,7 +300,7 @@ PLAIN = textwrap.dedent(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("streams", [1, 2])
+@pytest.mark.parametrize("streams", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_the_real_policy_in_a_process_that_never_heard_of_us(
     compiled_pusht: Path, tmp_path: Path, streams: int
 ) -> None:

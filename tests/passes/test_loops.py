@@ -8,14 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.passes.loops import BUILT, LOOPS, program_of, spec
+from tests.passes.loops import LOOPS, program_of, spec
 from ttscompile.errors import PassError
 from ttscompile.ir.verify import verify
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("kind", list(BUILT))
+@pytest.mark.parametrize(
+    "kind", ["tokens", *(pytest.param(kind, marks=pytest.mark.soak) for kind in ("adaLN", "skip", "encoder"))]
+)
 @pytest.mark.parametrize("loop", ["original", "ddim-3"])
 def test_a_loop_is_what_it_is_in_a_program_of_its_own(kind: str, loop: str) -> None:
     """Tables, plan head and FLOPs; the rest is common."""

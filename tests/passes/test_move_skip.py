@@ -73,10 +73,10 @@ def test_a_stream_that_is_the_sample_stays_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("scheduler", "settings"),
     [
-        (DDPMScheduler, {}),
-        (DDIMScheduler, {"clip_sample": False}),
+        pytest.param(DDPMScheduler, {}, marks=pytest.mark.soak),
+        pytest.param(DDIMScheduler, {"clip_sample": False}, marks=pytest.mark.soak),
         (DDIMScheduler, {"prediction_type": "v_prediction"}),
-        (DPMSolverMultistepScheduler, {"prediction_type": "sample"}),
+        pytest.param(DPMSolverMultistepScheduler, {"prediction_type": "sample"}, marks=pytest.mark.soak),
     ],
 )
 def test_actions_are_the_originals(

@@ -27,7 +27,7 @@ def record(kind: str, loop: str | None = None) -> Golden:
     return record_original(module_of(kind), program_of(kind, loop))
 
 
-@pytest.mark.parametrize("kind", ["tokens", "skip"])
+@pytest.mark.parametrize("kind", ["tokens", pytest.param("skip", marks=pytest.mark.soak)])
 def test_the_originals_record_is_that_of_a_policy_without_further_loops(kind: str) -> None:
     """Array by array; and what is of another loop has its name before it."""
     found, expected = record(kind).arrays(), record(kind, "original").arrays()
@@ -38,7 +38,7 @@ def test_the_originals_record_is_that_of_a_policy_without_further_loops(kind: st
         np.testing.assert_array_equal(found[name], array)
 
 
-@pytest.mark.parametrize("kind", ["tokens", "skip"])
+@pytest.mark.parametrize("kind", ["tokens", pytest.param("skip", marks=pytest.mark.soak)])
 def test_a_loops_record_is_of_the_same_call_in_that_loop(kind: str) -> None:
     """As the policy of that loop alone has it; but residuals, which have the original's scales."""
     whole = record(kind)
