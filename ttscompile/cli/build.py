@@ -11,7 +11,7 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.frontier import print_frontier
-from ttscompile.cli.options import json_option, number_option, ray_option, seed_option, threads_option
+from ttscompile.cli.options import json_option, number_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
@@ -48,9 +48,7 @@ from ttscompile.report.summary import document
 )
 @threads_option("Threads that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)
-@seed_option("Seed of the split, the noise and the search.")
 @click.option("--resume", is_flag=True, help="Go on where the same build was interrupted.")
-@ray_option
 @json_option
 def build(
     checkpoint: Path | str,
