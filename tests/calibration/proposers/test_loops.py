@@ -94,7 +94,7 @@ def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
     last, score = list(found.values())[-1]
     assert not last.beside and last.plan.loop == "short" and near(score, 0.4)
     assert len(own["short"]) == 2, "the one that is near enough, and one of more steps for what follows"
-    # The cheapest call of the original takes longer than the best plan of the loop of eight steps.
+    # The cheapest call of the original takes clearly longer than the best plan of the loop of eight steps.
     assert not own[ORIGINAL] and "original takes 10 ms at least, and the best 4" in proposer.told
 
 

@@ -36,6 +36,10 @@ from ..trials import Trials
 HOPELESS = 2.5
 """A number of steps is not searched any further if its crowded schedules are so many times as far off as may be."""
 
+CLEARLY = 1.2
+"""Nothing is left out as slower that takes less than so many times as long: costs are medians of a few calls on a
+machine that does other work too. In the end all plans are timed in turn."""
+
 ANSWERING = 0.4
 """Share of a loop's time for the answers to learn from."""
 
@@ -157,7 +161,8 @@ class Loops:
         if self._deadline is not None:
             most = self._deadline
             return f"takes {cost.one:.3g} ms and {most:.3g} are allowed" if cost.one > most else None
-        return f"takes {cost.one:.3g} ms at least, and the best {fastest:.3g}" if cost.one >= fastest else None
+        slower = cost.one > CLEARLY * fastest
+        return f"takes {cost.one:.3g} ms at least, and the best {fastest:.3g}" if slower else None
 
     def _too_far(self, plan: Plan, own: Trials) -> str | None:
         """Why no plan of a loop can be near enough."""
