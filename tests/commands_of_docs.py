@@ -12,6 +12,7 @@ NOT_RUN = {
     "python examples/evaluation/warm_start.py": "takes minutes; tests/examples has it in short",
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
+    "ttscompile build": "takes a minute; tests/test_builder.py runs it",
     "ttscompile serve": "has no end; tests/server and tests/fleet start it",
     "ttscompile calibrate compiled/ --trajectories calls.npz --learn tokens": "needs tokens: tests/calibration",
     "ttscompile calibrate compiled/ --trajectories calls.npz --learn schedule,start": "a short search ends with 1",

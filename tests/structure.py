@@ -24,7 +24,8 @@ FLOORS = (
     ("capture", "pool", "runtimes"),
     ("doctor", "verification"),
     ("calibration", "driver", "report"),
-    ("rivals", "ttscompile"),
+    ("builder", "rivals"),
+    ("ttscompile",),
     ("cli",),
     ("__main__",),
 )

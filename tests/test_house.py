@@ -43,6 +43,7 @@ MAY_IMPORT = {
     "verification": BELOW_ARTIFACT | {"frontends", "runtimes", "trajectories"},
     "pool": BASE | {"artifact"},
     "calibration": BELOW_ARTIFACT | {"lower", "pool", "runtimes", "trajectories", "verification"},
+    "builder": BELOW_ARTIFACT | {"calibration", "driver", "runtimes"},
     "rivals": BELOW_ARTIFACT | {"calibration", "runtimes"},
     "report": BELOW_ARTIFACT | {"hub", "plots", "runtimes", "trajectories", "verification"},
     "driver": BELOW_ARTIFACT | {"capture", "frontends", "hub", "lower", "passes", "runtimes", "verification"},
@@ -75,6 +76,7 @@ MOST_DOORS = 12
 
 COMPILERS_ONLY = {"diffusers", "matplotlib", "onnx", "onnx_ir", "onnxscript", "pydantic", "safetensors", "torch"}
 COMPILES = (
+    "ttscompile.builder",
     "ttscompile.calibration",
     "ttscompile.capture",
     "ttscompile.driver",

@@ -2,7 +2,7 @@
 
 ``import ttscompile`` loads neither torch nor onnx: the names below are imported when they are first used (PEP 562), so
 that a robot with numpy and onnxruntime alone can ``load`` an artifact, and the compiler's dependencies are only needed
-by ``convert``, ``calibrate`` and ``compile_denoiser``.
+by ``build``, ``convert``, ``calibrate`` and ``compile_denoiser``.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from .measure.versions import VERSION as __version__
 
 if TYPE_CHECKING:
+    from .builder import build as build
     from .calibration.pipeline import calibrate as calibrate
     from .core.lattice import Source as Source
     from .core.lattice import legalize as legalize
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 _HOMES = {
     name: home
     for home, names in {
+        "builder": ("build",),
         "calibration.pipeline": ("calibrate",),
         "core.lattice": ("Source", "legalize"),
         "core.plan": ("Plan", "TokenReuse"),

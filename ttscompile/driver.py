@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from torch import nn
 
@@ -14,7 +14,7 @@ from .artifact.bind import LoweredPieces
 from .artifact.files import replace_file
 from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
-from .capture.narrow import narrow, unneeded
+from .capture.narrow import narrow, needed, unneeded
 from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, INT8, ORIGINAL, PolicySpec
@@ -73,10 +73,11 @@ def convert(
     sampler: str | None = None,
     steps: int | None = None,
     spacing: str | None = None,
+    loops: Sequence[tuple[str, int]] = (),
     task: str | None = None,
     encoders: str | os.PathLike[str] | None = None,
     without_cameras: Sequence[str] | None = None,
-    prediction_horizon: int | None = None,
+    prediction_horizon: int | Literal["needed"] | None = None,
     precision: str = FP32,
     keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
@@ -96,6 +97,8 @@ def convert(
         spacing: ``leading``, ``trailing`` or ``linspace``: the timesteps that fewer steps visit. None: the checkpoint's
             own, or diffusers' default (``leading`` of DDIM); of ``dpmsolver++`` in place of another sampler
             ``trailing``, or ``leading`` for a policy that predicts noise without a bound on the sample.
+        loops: further loops, by sampler and number of steps, for calibration to choose among; plan ``full`` is then of
+            the policy's own. Those that a policy of its kind cannot have are left out.
         task: of a LeRobot policy: the one instruction that is compiled in, so that the robot needs no tokenizer; None
             makes its tokens an observation.
         encoders: of a LeRobot policy: folder with its CLIP encoders' or language model's configuration (and tokenizer,
@@ -103,6 +106,7 @@ def convert(
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
+            ``needed``: as many as a robot needs, where no action depends on those after it; all where some does.
         precision: of the weights: ``fp32`` or ``int8``; see ``compile_denoiser``.
         keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none. It
@@ -121,13 +125,13 @@ def convert(
         checkpoint, base = fetched.path, {"base": fetched.origin}
         if fetched.licence is not None:
             base["base_licence"] = fetched.licence
-    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras)
+    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
     spec = replace(spec, source={**spec.source, **base})
     beside = files_beside(checkpoint, spec)
     if spec.source.get("format") == "lerobot" and not beside:
         explain("files_beside", ("none for LeRobot: the instruction holds the state",))
-    loop = next(iter(spec.loops), ORIGINAL)
+    loop = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL)
     return _compile(
         module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside, loop
     )
@@ -177,7 +181,7 @@ def _compile(
     module: nn.Module,
     spec: PolicySpec,
     directory: str | os.PathLike[str] | None,
-    prediction_horizon: int | None,
+    prediction_horizon: int | Literal["needed"] | None,
     precision: str,
     keep_fp32: Collection[str],
     single_file: str | os.PathLike[str] | None,
@@ -190,7 +194,9 @@ def _compile(
     Nobody else may change the module: the program shares memory with it.
     """
     require_precision(precision, keep_fp32)
-    if prediction_horizon is not None:
+    if prediction_horizon == "needed":
+        prediction_horizon = needed(module, spec)
+    elif prediction_horizon is not None:
         prediction_horizon = integer(prediction_horizon, "prediction_horizon", SpecError, 1)
     if single_file is not None:
         _require_apart(single_file, directory)

@@ -45,6 +45,11 @@ def store_arrays(directory: Path, manifest: Manifest, store: str, arrays: Mappin
     return replace(manifest, files=files, stores=replace(manifest.stores, **stores))
 
 
+def pruner_name(piece: str, content: bytes) -> str:
+    """Of the files of a loop's pruner. Those of two loops are never one: a calibration may change either."""
+    return f"{PRUNER}-{content_hash(content if piece == PRUNER else content + piece.encode())}"
+
+
 def store_pruner(
     artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]], loop: str
 ) -> Manifest:
@@ -59,7 +64,7 @@ def store_pruner(
     expected = {name: (str(value.dtype), value.shape) for name, value in own.items()}
     tensors.check_arrays("pruner's weight", values, expected, artifact.path, "Calibrate this artifact again.")
     content = tensors.serialize(values)
-    path = artifact.path / f"{PRUNER}-{content_hash(content)}.safetensors"
+    path = artifact.path / f"{pruner_name(piece, content)}.safetensors"
     replace_file(path, content)
     model = onnx.load(artifact.path / record.file, load_external_data=False)
     bound = bind(model, places_of(path, values), piece, again=True)

@@ -24,7 +24,6 @@ from .block_weights import BlockWeights, store_weights, without_weights
 from .codec import decode, encode, identities
 from .files import (
     PARTIAL,
-    content_hash,
     describe,
     lock_folder,
     new_folder,
@@ -38,7 +37,7 @@ from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import Artifact, load_artifact, plan_of, read_manifest, require_artifact_path, table_prefix
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
-from .stores import plan_arrays_of, store_arrays, store_pruner
+from .stores import plan_arrays_of, pruner_name, store_arrays, store_pruner
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -241,7 +240,7 @@ def _fill(
     own = {PRUNER: pruner} if PRUNER in graphs else {}
     for piece, constants in {**own, **_loop_pruners(program)}.items():
         content = tensors.serialize(constants)
-        name = f"{PRUNER}-{content_hash(content)}"
+        name = pruner_name(piece, content)
         pruner_files[piece], files[piece] = f"{name}.safetensors", f"{name}.onnx"
         write_synced(folder / pruner_files[piece], content)
         pruner_places[piece] = places_of(folder / pruner_files[piece], constants)

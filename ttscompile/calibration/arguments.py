@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,21 @@ def require_limits(validation_fraction: float, max_minutes: float) -> None:
         raise CalibrationError(
             f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {validation_fraction} and"
             f" {max_minutes}."
+        )
+
+
+def require_alone(learn: Sequence[str], *budgets: float | None) -> None:
+    """Raise where loops are learned, and something that they cannot keep is asked for.
+
+    Raises:
+        CalibrationError: a schedule too, or a budget in cells.
+    """
+    if "schedule" in learn:
+        raise CalibrationError("learn: expected a schedule or loops; found both. Leave one of them out.")
+    if any(one is not None for one in budgets):
+        raise CalibrationError(
+            "learn: loops are chosen by their distance from the original and by their time; found a budget in cells."
+            " Give max_distance or latency_ms, or learn a schedule."
         )
 
 

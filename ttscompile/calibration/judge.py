@@ -31,7 +31,7 @@ from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport
 from ..runtimes.runtime import Runtime
 from .calls import LARGEST
-from .trials import DRAWS, HELD_OUT, Sample, Trials
+from .trials import HELD_OUT, Sample, Trials
 
 STREAMS = 32
 """Calls that are computed together, at most."""
@@ -159,7 +159,7 @@ def other_noise(trials: Trials) -> float:
     spec, answers = trials.artifact.manifest.spec, trials.held_out.answers.astype(np.float64)
     part = answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
     scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
-    apart = [np.abs(part[:, i] - part[:, j]) / scale for i, j in combinations(range(DRAWS), 2)]
+    apart = [np.abs(part[:, i] - part[:, j]) / scale for i, j in combinations(range(answers.shape[1]), 2)]
     return float(np.mean(apart))
 
 
@@ -201,12 +201,12 @@ class _Answers:
             yield self._apart()
 
     def _empty(self) -> FloatArray:
-        return np.empty((len(self._sample.calls), DRAWS, *self._spec.sample), np.float32)
+        return np.empty((len(self._sample.calls), self._sample.draws, *self._spec.sample), np.float32)
 
     def _apart(self) -> FloatArray:
         """Every call the first of an episode."""
         sample, made = self._sample, self._empty()
-        asked = [(n, draw) for n in range(len(sample.calls)) for draw in range(DRAWS)]
+        asked = [(n, draw) for n in range(len(sample.calls)) for draw in range(sample.draws)]
         for some in _batches(asked, self._streams):
             self._runtime.reset()
             found = self._call([(*sample.calls[n].tolist(), draw) for n, draw in some], scored=range(len(some)))
@@ -217,7 +217,7 @@ class _Answers:
         """All calls of each stretch, one after the other; those of several stretches together."""
         sample, made = self._sample, self._empty()
         numbers = {(stretch, row): n for n, (stretch, row) in enumerate(sample.calls.tolist())}
-        asked = [(stretch, draw) for stretch in range(len(sample.stretches)) for draw in range(DRAWS)]
+        asked = [(stretch, draw) for stretch in range(len(sample.stretches)) for draw in range(sample.draws)]
         for some in _batches(asked, self._streams):
             self._runtime.reset()
             ends = sample.stretches[[stretch for stretch, _ in some], 1:].tolist()
@@ -236,7 +236,7 @@ class _Answers:
         """Every call after one of another episode, drawn at random: as if the world had changed between the two."""
         sample, made, trials = self._sample, self._empty(), self._trials
         draw = np.random.default_rng((trials.seed, 6))
-        asked = [(n, r) for n in range(len(sample.calls)) for r in range(DRAWS)]
+        asked = [(n, r) for n in range(len(sample.calls)) for r in range(sample.draws)]
         for some in _batches(asked, self._streams):
             self._runtime.reset()
             others = []

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..artifact.block_weights import BlockWeights
 from ..artifact.manifest import StartRecord
-from ..core.plan import DENSE, FULL, Plan
+from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from .held import holding
 from .judge import Score, further, judge
 from .proposer import Proposal
@@ -25,6 +25,7 @@ class Kept:
 
     Attributes:
         trials: of the artifact with all that is kept.
+        judged: the plans that these scores are of, by name.
         weights: of blocks, that came with them.
         starts: loops, that came with them.
         pruner: constants, and the loop whose pruner has them; None where they stay.
@@ -38,6 +39,7 @@ class Kept:
         first = next(n for n in (FULL, DENSE) if n in self.plans) if anew else artifact.manifest.default_plan
         self.default, self.trials = first, replace(trials, name=first)
         self.scores: dict[str, Score] = {}
+        self.judged: dict[str, Plan] = {}
         self.notes: dict[str, Mapping[str, Any]] = {}
         self.weights: dict[str, BlockWeights] = {}
         self.starts: dict[str, StartRecord] = {}
@@ -62,6 +64,7 @@ class Kept:
             return False
         self.refused.pop(proposal.name, None)
         self.plans[proposal.name], self.scores[proposal.name] = proposal.plan, score
+        self.judged[proposal.name] = proposal.plan
         self.notes[proposal.name] = proposal.notes
         self.weights |= proposal.weights
         self.starts |= proposal.starts
@@ -71,6 +74,8 @@ class Kept:
             self._share(proposal)
         if not proposal.beside:
             self.default, self.learned = proposal.name, True
+        if self.plan.loop in (ORIGINAL, *trials.artifact.manifest.spec.loops):
+            trials = trials.of_loop(self.plan.loop)  # so that who trains weights learns from its calls
         self.trials = replace(trials, name=self.default)
         return True
 

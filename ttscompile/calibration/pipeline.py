@@ -5,33 +5,38 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ..artifact.ceiling import few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import locked, update_plans
 from ..core.coercion import integer
-from ..core.plan import ORIGINAL
+from ..core.plan import DENSE, ORIGINAL
 from ..errors import CalibrationError, CalibrationFailedError
 from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
-from .arguments import calls_to_learn_from, require_directory, require_limits
+from .arguments import calls_to_learn_from, require_alone, require_directory, require_limits
 from .budget import goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
+from .choose import choose
 from .clock import Clock
 from .judge import other_noise
 from .kept import Kept
 from .progress import Bar
-from .proposer import Proposer, Request, Row, rows_of
+from .proposer import LOOPS, NEAR, Proposer, Request, Row, rows_of
 from .result import CalibrationResult
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, Strategy, strategy_of
 from .targets import REPEATS
-from .trials import Trials, base_of
+from .trials import MANY_DRAWS, OBSERVATIONS, Trials, base_of
 
 
 def calibrate(
@@ -82,11 +87,13 @@ def calibrate(
             ``max_minutes`` is now; begins anew if none was.
         learn: what is learned, names of ``ttscompile.calibration.proposer.PROPOSERS``, in their order there.
         target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
-        latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit.
+        latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit. Where
+            loops are learned the nearest plan is taken whose longest call keeps it.
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
             the sparsest that was found below it. Only with a strategy that fits corrections.
         max_distance: by how much further from the original a plan may be that costs less than the one it was made from;
-            None for what its proposer allows.
+            None for what its proposer allows. Where loops are learned: how far from the original the default may be,
+            with 95 % confidence.
         threads: how many threads the calls have that are timed for ``latency_ms``.
         max_minutes: the best plan so far is taken in time to be finished by then, as far as what was done before lets
             it be known; what has to be done at least is done. Also decides how many calls are used.
@@ -132,6 +139,9 @@ def calibrate(
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
     rows, chosen = rows_of(tuple(learn)), strategy_of(strategy)
+    chooses, anew = LOOPS in learn, any(row.anew for row in rows)
+    if chooses:
+        require_alone(learn, target_sparsity, target_flops, max_action_error)
     require_limits(validation_fraction, max_minutes)
     require_directory(Path(path))
     # All the while: a second calibration would undo the first.
@@ -140,6 +150,9 @@ def calibrate(
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
         request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
+        if chooses:  # its bound is of what is chosen in the end, and not of each that learns
+            near = NEAR if max_distance is None else max_distance
+            request = replace(request, margin=None, bound=near, deadline_ms=latency_ms, threads=goal.threads)
         made = [(row, row.make(request)) for row in rows]
         for _, proposer in made:
             if (reason := proposer.applies(artifact)) is not None:
@@ -169,18 +182,26 @@ def calibrate(
         limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
         clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
         with Bar(progress) as bar:
-            opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": (fewest, limit)}
+            opened: dict[str, Any] = {"clock": clock, "bar": bar, "pool": pool, "device": there}
+            if chooses:
+                opened |= {"observations": OBSERVATIONS // 2, "draws": MANY_DRAWS}
+            opened["limits"] = fewest, limit
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             _warn(trials, rows, chosen, corrects)
-            kept, told = Kept(trials, anew=SCHEDULE in learn), dict[str, str]()
-            for number, (row, proposer) in enumerate(made, 1):
-                _propose(row, proposer, kept, clock.until(number / len(made)))
+            kept, told = Kept(trials, anew), dict[str, str]()
+            takes = np.cumsum([row.takes for row in rows])
+            for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
+                _propose(row, proposer, kept, clock.until(float(share)))
                 told[row.name] = proposer.told
             if not kept.learned:
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
                 bar.warn(f"plan {name!r} is left out: {reason}")
+            frontier = choose(kept, request) if chooses else None
+            if frontier is not None:
+                kept.plans = {DENSE: kept.plans[DENSE], **frontier.plans}
+                kept.scores, kept.default = dict(frontier.scores), frontier.default
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),
@@ -198,8 +219,9 @@ def calibrate(
             seconds=clock.elapsed(),
             budget=schedule.budget.record(),
             told=told,
+            frontier=() if frontier is None else tuple(one.record() for one in frontier.tried),
         )
-        _write(Path(path), artifact, result, kept)
+        _write(Path(path), artifact, result, kept, anew)
         state.remove()
         return result
 
@@ -244,9 +266,8 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
         )
 
 
-def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept) -> None:
-    """Put the plans into the artifact."""
-    anew = SCHEDULE in result.learned
+def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept, anew: bool) -> None:
+    """Put the plans into the artifact; ``anew`` in place of those that it has."""
     record = {} if anew else dict(artifact.manifest.calibration or {})
     own = result.record()
     own["plans"] = {**record.get("plans", {}), **own["plans"]}

@@ -26,6 +26,20 @@ if TYPE_CHECKING:
     from .trials import Trials
 
 
+NEAR = 0.25
+"""Distance from the original up to which a plan may become the default: docs/evidence/results.md, 'What a distance
+means', has what plans below and above it lost."""
+
+SURE = 2.0
+"""The upper limit of the distance, with 95 % confidence over episodes, may be so many times as far. Of a plan of
+another sampler four episodes tell no less: the root of an energy distance near 0 has wide limits."""
+
+
+def near(score: Score, bound: float) -> bool:
+    """Whether a plan of this score may become the default."""
+    return score.distance <= bound and score.interval[1] <= SURE * bound
+
+
 @dataclass(frozen=True, eq=False)
 class Proposal:
     """A plan, and what has to be written for it.
@@ -70,6 +84,9 @@ class Request:
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
         margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
+        bound: how far from the original a plan may be, with 95 % confidence; for who chooses among loops.
+        deadline_ms: of a call, for the same; None for the fastest that is near enough.
+        threads: of calls that are timed.
     """
 
     goal: Goal
@@ -79,6 +96,9 @@ class Request:
     rank: int = 16
     updates: int = 600
     margin: float | None = None
+    bound: float = NEAR
+    deadline_ms: float | None = None
+    threads: int = 1
 
 
 Proposals: TypeAlias = Generator[Proposal, bool, None]
@@ -125,6 +145,8 @@ class Row:
         corrects: whether it fits corrections, which need many calls to learn from.
         trains: whether it trains a network on the calls, for which more of them are better.
         consecutive: whether it learns from consecutive calls too (``Trials.windows``).
+        anew: whether the plans of an earlier calibration go: all that follows is made from what it proposes.
+        takes: its share of the time, beside those of the others that take part.
     """
 
     name: str
@@ -133,6 +155,8 @@ class Row:
     corrects: bool = False
     trains: bool = False
     consecutive: bool = False
+    anew: bool = False
+    takes: float = 1.0
 
     def make(self, request: Request) -> Proposer:
         """The proposer. Raises ImportError: there is no such module, or it needs a package that is not installed."""
@@ -141,8 +165,25 @@ class Row:
         return made
 
 
+LOOPS = "loops"
+"""The proposer after which the default is chosen among all plans that were kept (``choose``)."""
+
 PROPOSERS = (
-    Row("schedule", "which steps are computed, with corrections and jumps", "calibration.schedule:Schedule", True),
+    Row(
+        "schedule",
+        "which steps are computed, with corrections and jumps",
+        "calibration.schedule:Schedule",
+        True,
+        anew=True,
+    ),
+    Row(
+        LOOPS,
+        "which loop, and how few of its steps; the default is chosen at the end",
+        "calibration.proposers.loops:Loops",
+        corrects=True,
+        anew=True,
+        takes=6.0,
+    ),
     Row("pruner", "gates for each observation", "calibration.pruner.proposer:Pruner", consecutive=True),
     Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
     Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),

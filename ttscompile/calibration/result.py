@@ -30,6 +30,7 @@ class CalibrationResult:
         budget: what was asked for, the cells that it comes to, and what was measured for it; JSON.
         skipped: why there is no plan of a name that there might be.
         told: by proposer, what became of it.
+        frontier: where the default was chosen among many plans, all of them, fastest first; JSON.
     """
 
     learned: tuple[str, ...]
@@ -47,6 +48,7 @@ class CalibrationResult:
     budget: Mapping[str, Any] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
     told: Mapping[str, str] = field(default_factory=dict)
+    frontier: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def sparsity(self) -> float:
@@ -72,5 +74,8 @@ class CalibrationResult:
             for score in record["plans"].values():
                 if "error" in score:
                     score["of_other_noise"] = score["error"] / self.other_noise
+        record["frontier"] = [dict(one) for one in self.frontier]
+        if not record["frontier"]:
+            del record["frontier"]
         record["episodes"] = {name: list(numbers) for name, numbers in self.episodes.items()}
         return record

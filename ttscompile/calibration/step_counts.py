@@ -45,12 +45,11 @@ class SpacedSchedules:
 
     Args:
         clock: nothing is begun that would end, with the correction and the judgement that follow, after its limit.
+        key: what the state calls the comparisons.
     """
 
-    KEY = "crowded"
-
-    def __init__(self, whole: WholeSteps, state: StateFile, clock: Clock, bar: Bar) -> None:
-        self._whole, self._state, self._clock, self._bar = whole, state, clock, bar
+    def __init__(self, whole: WholeSteps, state: StateFile, clock: Clock, bar: Bar, key: str = "crowded") -> None:
+        self._whole, self._state, self._clock, self._bar, self._key = whole, state, clock, bar, key
 
     def best(self, full_steps: int, what: str, crowding: Sequence[float] = CROWDING) -> Best | None:
         """The best of the family of ``full_steps`` computed steps, of those that there was time for; or None."""
@@ -68,7 +67,7 @@ class SpacedSchedules:
 
     def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]]) -> Errors | None:
         """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
-        known = self._state.progress.setdefault(self.KEY, {})
+        known = self._state.progress.setdefault(self._key, {})
         key = ",".join(map(str, steps))
         if key not in known:
             # All plans together are judged on fewer calls than one is compared on: that takes no longer.

@@ -8,7 +8,7 @@ scores are of the same calls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,8 @@ import torch
 
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
-from ..core.plan import DENSE, FULL, Plan
+from ..core.lattice import dense_plan
+from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..pool import Here, Pool
 from ..runtimes.random_calls import Observation, normalized
@@ -29,10 +30,14 @@ from .clock import Clock
 from .execute import Executor
 from .progress import Bar
 from .state import StateFile
-from .targets import dense_rounds, draw_calls, with_targets
+from .targets import SHARE, dense_rounds, draw_calls, with_targets
 
 DRAWS = 4
 """Of noise for each observation."""
+
+MANY_DRAWS = 16
+"""The same where plans of other samplers are judged, whose noise cannot be paired. Where two plans answer alike the
+error of an energy distance falls as the number of draws, and only as the root of that of observations."""
 
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
@@ -67,6 +72,11 @@ class Sample:
     answers: FloatArray
 
     @property
+    def draws(self) -> int:
+        """R."""
+        return self.answers.shape[1]
+
+    @property
     def episodes(self) -> IntArray:
         """The number of the episode of each answered call, ``[N]``."""
         return np.asarray(self.stretches[self.calls[:, 0], 0])
@@ -84,6 +94,8 @@ class Trials:
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
         observations: that the original answers, at most, of either part.
+        draws: of noise for each of them.
+        until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
         device: where the network computes; None for the CPU.
@@ -106,6 +118,8 @@ class Trials:
     limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
     observations: int = OBSERVATIONS
     name: str = DENSE
+    draws: int = DRAWS
+    until: float = SHARE
     _calls: dict[int, Calls] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
 
@@ -126,6 +140,14 @@ class Trials:
         split = split_episodes(len(episodes), fraction, seed)
         return cls(artifact, episodes, split, seed, base, executor, state, **others)
 
+    def of_loop(self, loop: str) -> Trials:
+        """The same episodes, noise and answers of the original; to learn from are calls of a loop."""
+        if loop == self.base.loop:
+            return self
+        manifest = self.artifact.manifest
+        base = replace(self.base, loop=loop, cells=dense_plan(manifest.steps_of(loop), len(manifest.blocks)))
+        return replace(self, base=base, executor=Executor(view_of(self.artifact, base.exact), self.device), _calls={})
+
     @property
     def calls(self) -> Calls:
         """Calls of the episodes that are learned from, and the base's way to its answer with the same noise."""
@@ -140,9 +162,11 @@ class Trials:
         if window not in self._calls:
             spec, (fewest, most) = self.executor.view.manifest.spec, self.limits
             calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
-            name = "calibration" if window == 1 else "windows"
+            loop = self.base.loop
+            name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
+            clock = self.clock.until(self.until / SHARE)
             self._calls[window] = with_targets(
-                self.executor, name, calls, fewest, self.state, self.clock, self.bar, self.pool
+                self.executor, name, calls, fewest, self.state, clock, self.bar, self.pool
             )
             if self.clock.left() < 0:
                 self.bar.warn(
@@ -211,7 +235,7 @@ class Trials:
         """What the original answers; what is in the state already is not asked for again."""
         view = view_of(self.artifact, DENSE)
         spec = view.manifest.spec
-        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(DRAWS)]
+        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(self.draws)]
         noise = self.noise(spec, [self.key(part, *one) for one in asked])
         places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
         key = f"{part} answers"
@@ -232,7 +256,7 @@ class Trials:
                 self.state.progress["seconds"] = self.clock.elapsed()
                 self.state.save()
                 self.bar.update(len(known), "", self.clock.left())
-        return known.reshape(len(calls), DRAWS, *spec.sample)
+        return known.reshape(len(calls), self.draws, *spec.sample)
 
 
 def base_of(artifact: Artifact) -> Plan:

@@ -57,15 +57,25 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
 def unneeded(module: nn.Module, spec: PolicySpec) -> str | None:
     """A hint where ``narrow``, of the same arguments, could leave out steps; None where it could not."""
     (horizon, _), chunk = spec.sample, spec.chunk
-    try:
-        if chunk.stop == horizon or not _difference(module, spec, chunk.stop) <= TOLERANCE:
-            return None
-    except SpecError:
+    if needed(module, spec) is None:
         return None
     return (
         f"of {horizon} predicted steps {chunk.start} to {chunk.stop - 1} are executed, and none depends on a later one."
         f" A prediction horizon of {chunk.stop} or a few more gives the same actions for less (docs/howto/convert.md)."
     )
+
+
+def needed(module: nn.Module, spec: PolicySpec) -> int | None:
+    """How many steps a robot needs: those it executes, and half as many for a call that is late.
+
+    None where all are needed, for the module takes no fewer or its first steps depend on the last.
+    """
+    (horizon, _), chunk = spec.sample, spec.chunk
+    kept = min(chunk.stop + (chunk.stop - chunk.start + 1) // 2, horizon)
+    try:
+        return kept if chunk.stop < horizon and _difference(module, spec, chunk.stop) <= TOLERANCE else None
+    except SpecError:
+        return None
 
 
 def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:

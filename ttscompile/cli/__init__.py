@@ -10,6 +10,7 @@ import click
 
 from ttscompile import __version__
 from ttscompile.cli.bench import bench
+from ttscompile.cli.build import build
 from ttscompile.cli.calibrate import calibrate
 from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
@@ -35,6 +36,7 @@ def main() -> None:
 # In the order in which they are used; a line each, short enough for a terminal of 80 columns.
 for _command, _what in (
     (doctor, "What stands in the way on this machine."),
+    (build, "Checkpoint to fastest safe policy: convert, learn, choose."),
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (inspect, "What is in an artifact: tables, a picture, a page."),

@@ -34,7 +34,7 @@ import ttscompile
 from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 TRACEBACK = "--traceback"
-_RESUMED = ("calibrate",)
+_RESUMED = ("build", "calibrate")
 _WORDS = "ttscompile.words"
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _HOME = Path(ttscompile.__file__).parent

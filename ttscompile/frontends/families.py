@@ -43,6 +43,7 @@ class LoadOptions:
     task: str | None = None
     encoders: str | os.PathLike[str] | None = None
     without_cameras: Sequence[str] | None = None
+    loops: Sequence[tuple[str, int]] | None = None
 
     def __post_init__(self) -> None:
         if self.steps is not None:
@@ -112,7 +113,7 @@ FAMILIES = (
         kind="directory",
         detect=_is_lerobot,
         module="lerobot",
-        options=frozenset({"sampler", "steps", "spacing", "task", "encoders", "without_cameras"}),
+        options=frozenset({"sampler", "steps", "spacing", "loops", "task", "encoders", "without_cameras"}),
     ),
     Family(
         name="diffusion_policy",
@@ -122,7 +123,7 @@ FAMILIES = (
         # Every file that no other family takes: its module names what a file is that is none of its own.
         detect=lambda path: not path.is_dir(),
         module="diffusion_policy",
-        options=frozenset({"sampler", "steps", "spacing"}),
+        options=frozenset({"sampler", "steps", "spacing", "loops"}),
     ),
 )
 

@@ -20,7 +20,7 @@ from ..measure.units import flops, plain, share
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
-_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", "told")
+_NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", "told", "frontier")
 _ERRORS = ("error", "error_p90")
 
 

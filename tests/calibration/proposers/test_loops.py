@@ -1,0 +1,189 @@
+"""Which loop, and how few of its steps."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from tests.calibration import policies
+from tests.once import Once
+from ttscompile import SamplerTable
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.choose import choose
+from ttscompile.calibration.judge import Score, judge
+from ttscompile.calibration.kept import Kept
+from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.proposer import Proposal, near
+from ttscompile.calibration.proposers.loops import Cost, Loops
+from ttscompile.calibration.trials import Trials
+from ttscompile.core.plan import DENSE, ORIGINAL, Plan
+from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.measure.timer import Times
+
+from .trying import request, trials_of
+
+COSTS = {ORIGINAL: (10.0, 1.0), "short": (4.0, 1.0), "wrong": (3.0, 1.0)}
+"""Milliseconds of a call with one computed step, and more for each further one."""
+
+
+def table(steps: int, towards: float) -> SamplerTable:
+    """Fewer steps of the policy's own form, each of which goes further to the prediction times ``towards``."""
+    columns = {name: np.zeros(steps, np.float32) for name in SamplerTable.COLUMNS}
+    share = 1 - 0.75 ** (policies.STEPS / steps)
+    columns["x0_to_next"] += towards * share
+    columns["sample_to_next"] += 1 - share
+    columns["out_to_x0"] += 1
+    columns["noise_to_next"][:-1] += 0.05
+    return SamplerTable("toy", np.linspace(9, 0, steps).round().astype(np.int64), clip=1.0, **columns)
+
+
+@pytest.fixture(scope="module")
+def compiled(once: Once) -> Path:
+    """A policy of ten steps with a loop of eight that does nearly the same, and one that does something else."""
+    spec = replace(policies.spec(), loops={"short": table(8, 1.0), "wrong": table(8, -1.0)})
+    module = policies.Mixer(0).eval()
+    return once.compiled("mixer of three loops", lambda path: ttscompile.compile_denoiser(module, spec, path))[0]
+
+
+@pytest.fixture
+def directory(compiled: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(compiled, tmp_path / "compiled")
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return policies.record(tmp_path / "calls.npz", 8)
+
+
+@pytest.fixture
+def timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loops cost what ``COSTS`` says."""
+    monkeypatch.setattr(Loops, "_measured", lambda self, trials, loop: COSTS[loop])
+
+
+def proposed(proposer: Loops, trials: Trials) -> dict[str, tuple[Proposal, Score]]:
+    """All that is proposed, judged as a calibration judges it; those that are refused are left out."""
+    found: dict[str, tuple[Proposal, Score]] = {}
+    for one in proposer.propose(trials, trials.base, trials.clock):
+        score = judge(trials, one.plan)
+        if one.refusal(score, {}) is None:
+            found.pop(one.name, None)
+            found[one.name] = one, score
+    return found
+
+
+def test_a_cost_is_that_of_a_step_and_of_each_further_one() -> None:
+    assert [Cost(3.0, 0.5).of(steps) for steps in (1, 2, 5)] == [3.0, 3.5, 5.0]
+
+
+def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
+    directory: Path, recording: Path, timed: None
+) -> None:
+    trials = trials_of(directory, [recording])
+    proposer = Loops(request(bound=0.4))
+    found = proposed(proposer, trials)
+    own = {loop: [name for name, (one, _) in found.items() if one.plan.loop == loop] for loop in COSTS}
+    assert not own["wrong"], "with every step computed it is somewhere else"
+    assert "wrong is" in proposer.told and "with every step computed" in proposer.told
+    last, score = list(found.values())[-1]
+    assert not last.beside and last.plan.loop == "short" and near(score, 0.4)
+    assert len(own["short"]) == 2, "the one that is near enough, and one of more steps for what follows"
+    # The cheapest call of the original takes clearly longer than the best plan of the loop of eight steps.
+    assert not own[ORIGINAL] and "original takes 10 ms at least, and the best 4" in proposer.told
+
+
+def test_where_no_plan_is_near_enough_the_nearest_is_told(directory: Path, recording: Path, timed: None) -> None:
+    with pytest.raises(CalibrationFailedError, match=r"the nearest, '\w+\.\d', is .* 0.0001 and 0.0002 are allowed"):
+        proposed(Loops(request(bound=1e-4)), trials_of(directory, [recording]))
+
+
+def test_with_a_deadline_more_steps_are_tried_than_have_to_be(directory: Path, recording: Path, timed: None) -> None:
+    trials = trials_of(directory, [recording])
+    steps = {}
+    for deadline in (4.5, 7.5):
+        found = proposed(Loops(request(bound=0.4, deadline_ms=deadline)), trials)
+        steps[deadline] = sorted({int(name.partition(".")[2]) for name in found})
+        assert {one.plan.loop for one, _ in found.values()} == {"short"}, "the original takes 10 ms"
+    assert max(steps[4.5]) == 1 and max(steps[7.5]) == 4
+
+
+def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording: Path, timed: None) -> None:
+    before = load_artifact(directory).manifest.model_identity
+    result = calibrate(directory, [recording], learn=("loops",), max_distance=0.4, progress=False, max_minutes=2)
+    artifact = load_artifact(directory)
+    assert artifact.manifest.model_identity == before
+    assert artifact.manifest.default_plan == result.default_plan == "schedule"
+    assert set(artifact.plans) == {DENSE, *result.plans} and "schedule" in result.plans
+    rows = {row["name"]: row for row in artifact.manifest.calibration["frontier"]}  # type: ignore[index]
+    assert rows[DENSE]["distance"] < 1e-5 and rows["schedule"]["near"] and rows["schedule"]["kept"]
+    assert rows["schedule"]["interval"][1] <= 0.8 and rows["schedule"]["distance"] <= 0.4
+    assert all(row["kept"] == (name in artifact.plans) for name, row in rows.items())
+    policy = ttscompile.load(directory)
+    assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
+
+
+def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> None:
+    with pytest.raises(CalibrationError, match="a schedule or loops; found both"):
+        calibrate(directory, [recording], learn=("schedule", "loops"), progress=False)
+    with pytest.raises(CalibrationError, match="found a budget in cells"):
+        calibrate(directory, [recording], 0.8, learn=("loops",), progress=False)
+
+
+def chosen(
+    monkeypatch: pytest.MonkeyPatch,
+    trials: Trials,
+    figures: Mapping[str, tuple[float, float, float]],
+    **asked: float,
+) -> Mapping[str, str]:
+    """What the names of the artifact's plans were called while they were tried.
+
+    Args:
+        monkeypatch: fixture.
+        trials: of any policy.
+        figures: distance, upper end of its interval, and milliseconds of plans by name.
+        asked: of ``Request``.
+    """
+    kept = Kept(trials, anew=True)
+    plans = {name: replace(trials.base) for name in figures}
+    kept.plans |= plans
+    names = {id(plan): name for name, plan in kept.plans.items()}
+    figures = {DENSE: (0.0, 0.0, 100.0), **figures}
+
+    def scored(_: Trials, plan: Plan) -> Score:
+        distance, limit, _ms = figures[names[id(plan)]]
+        return Score(distance, (0.0, limit), None, None, 0.0, 0.0, 0.0, 1)
+
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", scored)
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.timed",
+        lambda entrants, threads: [Times((figures[names[id(plan)]][2],) * 3) for _, plan in entrants],
+    )
+    frontier = choose(kept, request(**asked))
+    assert frontier.default == "schedule"
+    return {name: names[id(plan)] for name, plan in frontier.plans.items()}
+
+
+def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, recording: Path) -> None:
+    trials = trials_of(directory, [recording])
+    figures = {
+        "a": (0.24, 0.60, 1.0),  # within the bound, but for its upper limit
+        "b": (0.20, 0.25, 2.0),
+        "c": (0.15, 0.20, 3.0),  # not much nearer than b
+        "d": (0.13, 0.20, 4.0),
+        "e": (0.05, 0.60, 5.0),
+        "f": (0.16, 0.20, 3.5),  # slower than c and further
+    }
+    assert chosen(monkeypatch, trials, figures, bound=0.25) == {"schedule": "b", "fast": "a", "safe": "d"}
+    # By a deadline the nearest that keeps it; the nearest of all, e, is not surely near enough.
+    assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=3.2)["schedule"] == "c"
+    assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=50.0)["schedule"] == "d"
+    with pytest.raises(CalibrationFailedError, match="keeps 1.5 ms: the fastest, 'b', took 2 ms"):
+        chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=1.5)
+    with pytest.raises(CalibrationFailedError, match="'c', is 0.15 away, and 0.2 at worst; 0.1 and 0.2 are"):
+        chosen(monkeypatch, trials, figures, bound=0.1)

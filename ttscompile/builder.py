@@ -1,0 +1,138 @@
+"""From a checkpoint to the fastest policy that is safe, as one call: convert, learn, choose."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from .artifact.load import load_artifact, read_manifest
+from .calibration.budget import SPARSITY, Goal
+from .calibration.pipeline import calibrate
+from .calibration.proposer import LOOPS, Request, rows_of
+from .calibration.result import CalibrationResult
+from .calibration.state import FILE as STATE
+from .core.spec import INT8
+from .driver import Explain, convert
+from .errors import CalibrationError, CalibrationFailedError
+from .runtimes.executor import ExecutorSettings
+from .runtimes.executor.settings import resolve
+from .runtimes.load import open_policy
+
+FURTHER_LOOPS = (("dpmsolver++", 16), ("ddim", 16))
+"""Beside the policy's own. Of a flow-matching policy its own is all: of its ten Euler steps two or three are computed,
+which is nearer to the original than a loop of as many."""
+
+LEARNED = (LOOPS, "precision", "tokens")
+"""What is learned, where it applies. A start from the chunk before and trained weights are left to ``calibrate``: the
+first is further from the original than a default may be on every policy that it was tried on, and the second takes
+most of an hour."""
+
+
+def build(
+    checkpoint: str | os.PathLike[str],
+    directory: str | os.PathLike[str],
+    trajectories: Sequence[str | os.PathLike[str]],
+    *,
+    control_hz: float | None = None,
+    policy_hz: float | None = None,
+    latency_ms: float | None = None,
+    max_distance: float | None = None,
+    threads: int = 1,
+    max_minutes: float = 30.0,
+    seed: int = 0,
+    resume: bool = False,
+    observation: Mapping[str, Sequence[str]] | None = None,
+    progress: bool = True,
+    ray: str | None = None,
+    explain: Explain = lambda stage, notes: None,
+    **of_checkpoint: Any,
+) -> CalibrationResult:
+    """Convert a checkpoint, try what a plan can be, and make the fastest one the default that is near to the original.
+
+    Tried are loops, numbers and places of computed steps with their corrections, eight bits by part, and the tokens of
+    image encoders. All are judged on held-out episodes against the original, and timed on this machine.
+
+    Args:
+        checkpoint: see ``convert``.
+        directory: where the artifact goes; see ``convert``.
+        trajectories: recorded episodes; see ``calibrate``.
+        control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
+            plan is then the nearest of those whose longest call keeps up.
+        policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
+        latency_ms: that the longest call may take, in place of ``control_hz``.
+        max_distance: how far from the original the default may be, with 95 % confidence, in units of what other noise
+            changes; None for ``calibration.proposer.NEAR``.
+        threads: that calls have.
+        max_minutes: for all but the conversion.
+        seed: of everything random.
+        resume: go on where the same build was interrupted.
+        observation: see ``calibrate``.
+        progress: see ``calibrate``.
+        ray: see ``calibrate``.
+        explain: see ``convert``.
+        of_checkpoint: ``format``, ``task``, ``encoders`` and ``without_cameras`` of ``convert``.
+
+    Returns:
+        What was tried and chosen.
+
+    Raises:
+        CalibrationFailedError: no plan is near enough, or none of these keeps up; says how far the nearest is. The
+            artifact computes everything.
+        TtscompileError: as ``convert`` and ``calibrate``.
+    """
+    if latency_ms is not None and control_hz is not None:
+        raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
+    how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, **of_checkpoint}
+    _converted(checkpoint, Path(directory), resume, explain, how)
+    if control_hz is not None:
+        latency_ms = _deadline(Path(directory), control_hz, policy_hz)
+    artifact = load_artifact(Path(directory))
+    request = Request(Goal(SPARSITY, 0.5))
+    learn = [row.name for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]
+    return calibrate(
+        directory,
+        trajectories,
+        learn=learn,
+        latency_ms=latency_ms,
+        max_distance=max_distance,
+        threads=threads,
+        max_minutes=max_minutes,
+        seed=seed,
+        resume=resume,
+        observation=observation,
+        progress=progress,
+        ray=ray,
+    )
+
+
+def _converted(
+    checkpoint: str | os.PathLike[str], directory: Path, resume: bool, explain: Explain, how: Mapping[str, Any]
+) -> None:
+    """Convert; where an interrupted build has done that, see that it was of this checkpoint, and leave it."""
+    if not (resume and (directory / STATE).is_file()):
+        convert(checkpoint, directory, explain=explain, **how)
+        return
+    with TemporaryDirectory(dir=directory.parent, prefix=f".{directory.name}.") as folder:
+        again = Path(folder) / "again"
+        convert(checkpoint, again, explain=explain, **how)
+        found, expected = (read_manifest(each).model_identity for each in (directory, again))
+    if found != expected:
+        raise CalibrationError(
+            f"{directory}: expected the interrupted build of {os.fspath(checkpoint)}; found another model. Leave"
+            " --resume out to begin anew."
+        )
+
+
+def _deadline(directory: Path, control_hz: float, policy_hz: float | None) -> float:
+    """Milliseconds that the longest call may take for the policy to keep up with a control loop."""
+    info = open_policy(load_artifact(directory), plan="dense").info
+    longest = resolve(ExecutorSettings(policy_hz=policy_hz), info, control_hz).feasibility(1e-3).max_latency
+    if longest <= 0:
+        raise CalibrationFailedError(
+            f"no call is short enough for a control loop of {control_hz:g} Hz: a chunk is over before the next frame."
+            " Give the rate that the policy was trained with, --policy-hz."
+        )
+    return 1e3 * longest

@@ -1,0 +1,159 @@
+"""Which of the plans that were kept is the default: all of them judged and timed, in one run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from ..core.plan import DENSE, FULL, Plan
+from ..errors import CalibrationFailedError
+from ..measure.points import Point, efficient
+from ..measure.timer import Times
+from .judge import Score, judge, timed
+from .kept import Kept
+from .proposer import Request, near
+from .proposers.loops import too_far
+from .schedule import SCHEDULE
+from .step_counts import FAST, SAFE
+
+SAFER = 0.7
+"""Of the default's distance: at most so much has the plan ``safe``."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A plan of the frontier, or one that is off it.
+
+    Attributes:
+        name: in the artifact, or what it was called while it was tried.
+        told: what it does, in words.
+        distance: from the original on held-out episodes; see ``judge``.
+        interval: 95 % interval of that.
+        milliseconds: median of a call on this machine.
+        worst: longest of the calls that were timed, in milliseconds.
+        near: whether it may be the default (``proposer.near``).
+        on_frontier: whether no other plan is faster and nearer.
+        kept: whether the artifact has it.
+    """
+
+    name: str
+    told: str
+    distance: float
+    interval: tuple[float, float]
+    milliseconds: float
+    worst: float
+    near: bool
+    on_frontier: bool
+    kept: bool
+
+    def record(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self) | {"interval": list(self.interval)}
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """What was tried, and what was chosen.
+
+    Attributes:
+        tried: fastest first; the original is among them.
+        plans: that the artifact gets, by name.
+        scores: of these, by name.
+        default: name of the one that was chosen.
+    """
+
+    tried: tuple[Tried, ...]
+    plans: Mapping[str, Plan]
+    scores: Mapping[str, Score]
+    default: str
+
+
+def choose(kept: Kept, request: Request) -> Frontier:
+    """Judge and time every plan, in each precision that it can have, and choose.
+
+    Without a deadline the fastest plan that is near enough is the default. With one it is the nearest of those whose
+    longest call keeps it. ``schedule`` is the name of the default, ``safe`` that of the fastest plan that is a good
+    deal nearer, and ``fast`` that of the next faster one, whose distance is within the bound and its limit is not.
+
+    Raises:
+        CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
+    """
+    entered, scores = {DENSE: kept.plans[DENSE]}, dict[str, Score]()
+    for name, plan in kept.plans.items():
+        if name in (DENSE, FULL):
+            continue
+        entered[name] = plan
+        if plan.precision:
+            entered[f"{name}@fp32"] = replace(plan, precision={})
+    kept.trials.bar.stage("held-out calls", len(entered))
+    for number, (name, plan) in enumerate(entered.items(), 1):
+        if kept.judged.get(name) is plan:
+            scores[name] = kept.scores[name]
+        else:
+            scores[name] = judge(kept.trials, plan)
+        kept.trials.bar.update(number, f"{name}: {scores[name].distance:.3g}", kept.trials.clock.left())
+    kept.trials.bar.stage("timing", 1)
+    times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))
+    points = {name: Point("", name, scores[name].distance, times[name].median) for name in entered}
+    best = {point.name for point in efficient(list(points.values()))}
+    close = [name for name in entered if name != DENSE and near(scores[name], request.bound)]
+    chosen = _chosen(close, scores, times, request)
+    named = {chosen: SCHEDULE}
+    others = [name for name in best if name not in (DENSE, chosen)]
+    if nearer := [name for name in others if scores[name].distance <= SAFER * scores[chosen].distance]:
+        named[min(nearer, key=lambda name: times[name].median)] = SAFE
+    faster = [name for name in others if times[name].median < times[chosen].median]
+    if within := [name for name in faster if scores[name].distance <= request.bound]:
+        named[max(within, key=lambda name: times[name].median)] = FAST
+    plans = {named[name]: entered[name] for name in named}
+    plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
+    tried = tuple(
+        Tried(
+            name=named.get(name, name),
+            told=told_plan(entered[name]),
+            distance=scores[name].distance,
+            interval=scores[name].interval,
+            milliseconds=times[name].median,
+            worst=max(times[name].ms),
+            near=name == DENSE or name in close,
+            on_frontier=name in best,
+            kept=name == DENSE or name in named,
+        )
+        for name in sorted(entered, key=lambda one: times[one].median)
+    )
+    return Frontier(tried, plans, {named[name]: scores[name] for name in named}, SCHEDULE)
+
+
+def _chosen(close: Sequence[str], scores: Mapping[str, Score], times: Mapping[str, Times], request: Request) -> str:
+    if not close:
+        name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
+        raise CalibrationFailedError(too_far(name, scores[name], request.bound))
+    if request.deadline_ms is None:
+        return min(close, key=lambda name: times[name].median)
+    in_time = [name for name in close if max(times[name].ms) <= request.deadline_ms]
+    if not in_time:
+        name = min(close, key=lambda name: max(times[name].ms))
+        raise CalibrationFailedError(
+            f"no plan that is near enough keeps {request.deadline_ms:.3g} ms: the fastest, {name!r}, took"
+            f" {times[name].median:.3g} ms, and {max(times[name].ms):.3g} at worst, with {request.threads} thread"
+            f"{'s' * (request.threads > 1)}. Allow more threads, a larger error, or a slower loop."
+        )
+    return min(in_time, key=lambda name: scores[name].distance)
+
+
+def told_plan(plan: Plan) -> str:
+    """What a plan does, in words: "3 of 16 steps of dpmsolver++-16, int8 in blocks and condition"."""
+    cells = plan.cells
+    if cells is None:
+        told = [f"the pruner's steps of {plan.loop}"]
+    else:
+        computed = int((cells == 0).any(axis=-1).sum())
+        told = [f"{computed} of {len(cells)} steps of {plan.loop}"]
+    by_precision: dict[str, list[str]] = {}
+    for part, one in plan.precision.items():
+        by_precision.setdefault(one, []).append(part)
+    told += [f"{one} in {' and '.join(sorted(parts))}" for one, parts in by_precision.items()]
+    told += ["trained weights"] * (plan.weights != "original") + ["some image tokens"] * (plan.tokens is not None)
+    told += ["begins with the chunk before"] * (plan.otherwise is not None)
+    return ", ".join(told)

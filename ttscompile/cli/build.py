@@ -1,0 +1,95 @@
+"""``ttscompile build``: from a checkpoint to the fastest policy that is safe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import require_replaceable
+from ttscompile.cli.frontier import print_frontier
+from ttscompile.cli.options import json_option, number_option, threads_option
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
+from ttscompile.core.paths import on_hub, require_path
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.families import FAMILIES
+from ttscompile.report.summary import document
+
+
+@click.command(cls=FilesCommand)
+@click.argument("checkpoint", type=PATH_OR_HUB)
+@trajectories_options()
+@click.option("-o", "--output", "directory", required=True, type=PATH, help="Write the artifact into this folder.")
+@number_option(
+    "--control-hz",
+    RATE,
+    "Choose the nearest plan that keeps up with a control loop of this rate in Hz, in place of the fastest one.",
+)
+@number_option(
+    "--policy-hz",
+    RATE,
+    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
+    " --control-hz.",
+)
+@number_option(
+    "--latency-ms",
+    MILLISECONDS,
+    "Choose the nearest plan whose longest call takes no longer, in place of --control-hz.",
+)
+@number_option(
+    "--error",
+    ERROR,
+    "Let the default plan be so far from the original, with 95 % confidence, in units of what other noise changes.",
+)
+@threads_option("Threads that the policy will have on the robot.")
+@number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)
+@click.option("--resume", is_flag=True, help="Go on where the same build was interrupted.")
+@json_option
+def build(
+    checkpoint: Path | str,
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    error: float | None,
+    minutes: float,
+    as_json: bool,
+    **how: Any,  # ttscompile.build takes them by the same names
+) -> None:
+    """Compile CHECKPOINT, and choose the fastest plan that is near enough to the original.
+
+    Denoising loops, computed steps, corrections, eight bits and image tokens are tried; all are judged on recorded
+    episodes that nothing was learned from, and timed on this machine. Exit status 1: no plan is near enough, or none of
+    those keeps the deadline.
+    """
+    if not on_hub(checkpoint):
+        require_path(checkpoint, CheckpointError, f"Give {' or '.join(each.reads for each in FAMILIES)}.")
+    require_replaceable(directory)
+    require_recordings(trajectories)
+    console = progress()
+    with only_results_on_stdout(), console.status("compiling") as status:
+
+        def explain(stage: str, notes: tuple[str, ...]) -> None:
+            status.update(f"compiling: after {stage}")
+            if stage == "write":
+                status.stop()  # the search has a bar of its own
+
+        ttscompile.build(
+            checkpoint,
+            directory,
+            trajectories,
+            observation=sources,
+            max_distance=error,
+            max_minutes=minutes,
+            explain=explain,
+            **how,
+        )
+    artifact = load_artifact(directory)
+    if as_json:
+        print_json(document(artifact))
+    else:
+        print_frontier(artifact, directory, results(), how["threads"])
