@@ -157,6 +157,8 @@ def test_names_of_plans_are_held_to_what_they_are_written_by(written: Path, name
         ({"calls": {"validation": None}}, "calibration.calls.validation: expected an integer"),
         ({"skipped": {"fast": 1}}, "calibration.skipped.fast: expected a string"),
         ({"told": {"weights": ["a"]}}, "calibration.told.weights: expected a string"),
+        ({"frontier": {}}, "calibration.frontier: expected a list"),
+        ({"frontier": [{"name": "a"}, {"worst": "1"}]}, r"calibration.frontier\[1\].worst: expected a number"),
     ],
 )
 def test_what_commands_read_of_a_record_has_its_type(written: Path, record: dict[str, Any], place: str) -> None:

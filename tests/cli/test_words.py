@@ -45,6 +45,7 @@ NEEDED = {
         ("A", "--calls", "1", "--trajectories", "calls.npz"),
         ("A", "--calls", "1", "--checkpoint", "policy.ckpt"),
     ],
+    "build": [("policy.ckpt", "-t", "calls.npz", "-o", "out")],
     "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
     "convert": [("policy.ckpt", "-o", "out")],
     "doctor": [("A",)],

@@ -21,6 +21,16 @@ _RECORD: Mapping[str, Any] = {
     "calls": Mapping[str, int],
     "skipped": Mapping[str, str],
     "told": Mapping[str, str],
+    "frontier": tuple[Mapping[str, Any], ...],
+}
+_TRIED: Mapping[str, Any] = {
+    "name": str,
+    "told": str,
+    "distance": float,
+    "interval": tuple[float, ...],
+    "milliseconds": float,
+    "worst": float,
+    "near": bool,
 }
 
 
@@ -32,6 +42,8 @@ def check_record(record: Value) -> None:
         _check(members["budget"].members(), dict.fromkeys(_BUDGET, float | None))
     for score in members["plans"].members().values() if "plans" in members else ():
         _check(score.members(), dict.fromkeys(_SCORE, float | None))
+    for tried in members["frontier"].items() if "frontier" in members else ():
+        _check(tried.members(), _TRIED)
 
 
 def _check(members: Mapping[str, Value], kinds: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from ..core.plan import DENSE, ORIGINAL
 from ..core.spec import SamplerTable
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
-from ..measure.units import flops, plain, share
+from ..measure.units import flops, ms, plain, share
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
@@ -238,7 +238,18 @@ def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
 
 def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What the figures of a calibration mean, in words."""
-    return (*other_noise(record), *learned(record), *left_out(record))
+    return (*chosen(record), *other_noise(record), *learned(record), *left_out(record))
+
+
+def chosen(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """The verdict of a build on its default plan."""
+    rows = [row for row in record.get("frontier", ()) if row.get("name") == record.get("default_plan")]
+    if not rows:
+        return ()
+    (row,) = rows
+    told = f"{row['told']}: {row['distance']:.2g} of what other noise changes, {max(row['interval']):.2g} at worst"
+    times = f"{ms(row['milliseconds'])} ms a call on the machine that built it, {ms(row['worst'])} at worst"
+    return (f"Chosen among {len(record['frontier'])} plans: {told}; {times}. Evaluate it before a robot moves.",)
 
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:

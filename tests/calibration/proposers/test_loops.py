@@ -25,6 +25,7 @@ from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import DENSE, ORIGINAL, Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.measure.timer import Times
+from ttscompile.report.facts import chosen as chosen_of
 
 from .trying import request, trials_of
 
@@ -124,6 +125,9 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     assert rows[DENSE]["distance"] < 1e-5 and rows["schedule"]["near"] and rows["schedule"]["kept"]
     assert rows["schedule"]["interval"][1] <= 0.8 and rows["schedule"]["distance"] <= 0.4
     assert all(row["kept"] == (name in artifact.plans) for name, row in rows.items())
+    (told,) = chosen_of(artifact.manifest.calibration or {})
+    assert told.startswith(f"Chosen among {len(rows)} plans: {rows['schedule']['told']}: ")
+    assert chosen_of({}) == ()
     policy = ttscompile.load(directory)
     assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
 
