@@ -58,6 +58,8 @@ def read_observation(
         missing, unexpected = sorted(specs.keys() - given.keys()), sorted(map(str, obs.keys() - specs.keys()))
         found = f"{sorted(map(str, obs))} (missing: {missing}, unexpected: {unexpected})"
         remedy = "Give exactly the keys that the policy was compiled for."
+        if "task" in unexpected and any(specs[key].dtype == "int64" for key in missing):
+            remedy = "For a text in place of its tokens, load the policy with tokenizer=PATH."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)
     arrays = {}
@@ -107,7 +109,8 @@ def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     remedy = ""
     if spec.image and array.dtype.kind in "iu":
         remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
-    if spec.image and array.shape[-3:] == (*spec.shape[-2:], spec.shape[-3]) != spec.shape[-3:]:
+    channels = spec.shape[-3] if spec.image and array.ndim > 3 else 0
+    if channels == array.shape[-1] and array.shape[-3] != channels:
         remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
     return remedy
 

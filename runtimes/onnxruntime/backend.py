@@ -95,6 +95,10 @@ class OnnxBackend:
         obs = {**call.obs, **self.frames.values(call.obs)}
         self._work.start(obs, call.noise, call.correction, call.known)
 
+    def condition(self) -> FloatArray:
+        """See ``Backend.condition``."""
+        return self._work.condition()
+
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""
         return self._work.logits()

@@ -106,6 +106,10 @@ class Workspace:
         if known is not None:
             hold_known(self._offset, known)
 
+    def condition(self) -> FloatArray:
+        """What a correction reads of the observation, ``[B, N]``."""
+        return self._contexts.condition()
+
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""
         self._stem.run()

@@ -63,6 +63,12 @@ class PlainNetwork:
         other._condition = {n: value.clone() for n, value in self._condition.items() if n in read}
         return other
 
+    def know_steps(self, steps: int) -> None:
+        """Compute all step values: in a branch of ``torch.cond`` nothing can be kept."""
+        if self._pieces.step is not None:
+            for k in range(steps):
+                self._step(k)
+
     def condition(self, features: Sequence[str]) -> Tensor:
         """What a correction reads, ``[B, N]``."""
         types = self._pieces.condition.types()

@@ -100,7 +100,7 @@ class Workspace:
         made = denoise(
             self.network,
             plan,
-            keep,
+            frozenset(np.flatnonzero(keep).tolist()),
             advance,
             self._initial.tensor,
             offset.unbind(),

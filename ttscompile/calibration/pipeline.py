@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,17 +20,21 @@ from .arguments import calls_to_learn_from, require_directory, require_limits
 from .budget import goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
 from .clock import Clock
-from .judge import other_noise
+from .judge import other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
 from .proposer import Proposer, Request, Row, rows_of
-from .result import CalibrationResult
+from .result import BOUND, CalibrationResult
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, Strategy, strategy_of
 from .targets import REPEATS
 from .trials import Trials, base_of
+
+UNHEARD = 0.9
+"""Of what another observation changes, above which other noise changes suspiciously much. On Push-T it is a tenth, and
+0.97 to 1 with data times 100, a hundredth of them, or random ones."""
 
 
 def calibrate(
@@ -88,8 +91,9 @@ def calibrate(
         max_distance: by how much further from the original a plan may be that costs less than the one it was made from;
             None for what its proposer allows.
         threads: how many threads the calls have that are timed for ``latency_ms``.
-        max_minutes: the best plan so far is taken in time to be finished by then, as far as what was done before lets
-            it be known; what has to be done at least is done. Also decides how many calls are used.
+        max_minutes: of work: those in which all of torch's threads compute. The best plan so far is taken in time to be
+            finished by then, as far as what was done before lets it be known; what has to be done at least is done.
+            Also decides how many calls are used. A busy machine takes up to twice as long by the wall clock.
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
         correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
@@ -116,7 +120,8 @@ def calibrate(
         RuntimeUnavailableError: torch does not have the device.
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
     """
-    begun = time.monotonic()
+    elsewhere = ray is not None or device not in (None, "cpu")
+    begun = Clock(wall=elsewhere)
     seed = integer(seed, "seed", CalibrationError)
     rank, updates = integer(rank, "rank", CalibrationError, 1), integer(updates, "updates", CalibrationError, 1)
     if max_intervals is not None:
@@ -167,7 +172,8 @@ def calibrate(
         if not (resume and state.load()):
             state.remove()
         limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
-        clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
+        before = float(state.progress.get("seconds", 0.0)) + begun.elapsed()
+        clock = Clock(60 * max_minutes, before, elsewhere)
         with Bar(progress) as bar:
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": (fewest, limit)}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
@@ -199,6 +205,16 @@ def calibrate(
             budget=schedule.budget.record(),
             told=told,
         )
+        if result.stopped == "time limit":
+            bar.warn(
+                f"the search was cut short after {result.intervals} intervals, since {max_minutes:g} minutes were over:"
+                " with more, plans may be nearer to the original."
+            )
+        if result.doubtful:
+            bar.warn(
+                f"plan {kept.default!r} is {result.plans[kept.default].distance:.2f} of what other noise changes from"
+                f" the original; above {BOUND:g} scores may fall. Allow more time or computed cells, or record more."
+            )
         _write(Path(path), artifact, result, kept)
         state.remove()
         return result
@@ -236,11 +252,23 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
             f"{short} of {len(trials.episodes)} episodes have fewer than {window} calls, and are left out where"
             f" {window} consecutive ones are learned from."
         )
+    heeds(trials)
     rows_recorded = sum(trials.episodes[n].calls for n in trials.split.calibration)
     if corrects and (count := REPEATS * rows_recorded) < fewest:
         bar.warn(
             f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm where"
             " nothing was recorded. Record more episodes."
+        )
+
+
+def heeds(trials: Trials) -> None:
+    """Warn where the original's answers depend on the noise about as much as on the observation."""
+    noise, observed = other_noise(trials), other_observations(trials)
+    if not noise < UNHEARD * observed:
+        trials.bar.warn(
+            f"the original hardly heeds what was recorded: with other noise its actions change by {noise:.4g}, and with"
+            f" another observation by {observed:.4g}. Look at the units of the recordings, and at the order of their"
+            " columns."
         )
 
 
@@ -266,6 +294,7 @@ def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept
         pruner_loop=loop,
         weights=kept.weights,
         starts=kept.starts,
+        envelope=kept.trials.envelope if anew or artifact.envelope is None else None,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
         held=True,

@@ -6,7 +6,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from .budget import ERROR
 from .judge import Score
+
+BOUND = 0.25
+"""Distance from the original up to which plans lost at most 0.03 of the score, on five policies: "What an error means"
+in ``docs/evidence/results.md``."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,11 @@ class CalibrationResult:
     budget: Mapping[str, Any] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
     told: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the default plan is so far from the original that scores may fall, and nobody asked for an error."""
+        return ERROR not in self.budget and self.plans[self.default_plan].distance > BOUND
 
     @property
     def sparsity(self) -> float:

@@ -44,7 +44,10 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         ("identity", manifest.short_identity),
         ("from", ", ".join(f"{k} {v}" for k, v in summary["source"].items()) or "a module"),
         ("sampler", f"{sampler['name']}, K = {sampler['steps']} steps" + ", draws noise" * sampler["stochastic"]),
-        *((f"observation {k!r}", f"{o['dtype']}{o['shape']} a stream") for k, o in summary["observations"].items()),
+        *(
+            (f"observation {k!r}", f"{o['dtype']}{o['shape']} a stream" + ", from pictures of any size" * o["any_size"])
+            for k, o in summary["observations"].items()
+        ),
         ("action", action),
         ("rollout cache", kept),
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),

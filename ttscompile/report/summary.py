@@ -29,7 +29,10 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "sampler": {name: getattr(spec.sampler, name) for name in ("name", "steps", "stochastic", "clip")},
         "sample": list(spec.sample),
         "left_out": spec.left_out,
-        "observations": {k: {"shape": list(o.shape), "dtype": o.dtype} for k, o in spec.observations.items()},
+        "observations": {
+            key: {"shape": list(one.shape), "dtype": one.dtype, "any_size": one.fit is not None}
+            for key, one in spec.observations.items()
+        },
         "chunk": {"action_dim": spec.chunk.action_dim, "start": spec.chunk.start, "stop": spec.chunk.stop},
         "blocks": [
             {"index": i, "kind": b.kind, "type": str(b.type), "group": b.group, "flops": b.flops, "reason": b.reason}
