@@ -24,7 +24,7 @@ class Call:
     """What a backend is given for one call. Everything was checked.
 
     Attributes:
-        obs: normalised observation by key, ``[B, ...]`` each.
+        obs: normalised observation by key, ``[B, ...]`` each; empty for that of the call before, whose prologue stands.
         noise: ``initial [B, T, D]``; ``steps [K, B, T, D]`` if the sampler is stochastic.
         correction: of the sampler's steps; None for none.
         known: what a prefix makes known of the samples; None for nothing.

@@ -282,7 +282,7 @@ class Runtime:
         if plan.correction is not None and far.any():
             cells = plain_cells(plan.correction, call.written.shape[2])
             plain = self._settle(opened, cells, call.written, np.zeros_like(call.written), True)
-            backend.start(replace(call, correction=None))
+            backend.start(replace(call, obs={}, correction=None))
             backend.first_step()
             own, mixed = backend.other_steps(plain.lowered), not far.all()
             if mixed:

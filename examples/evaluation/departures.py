@@ -89,14 +89,13 @@ class Calls:
         self._spec = artifact.manifest.spec
         rng, shape = np.random.default_rng(seed), (count, *self._spec.sample)
         self._initial = rng.standard_normal(shape, dtype=np.float32)
-        self._steps = [len(table.timesteps) for table in self._spec.all_loops.values() if table.stochastic]
-        self._rng = seed
+        self._seed = seed
 
     def answers(self, runtime: Runtime, plan: Plan, observation: Observation) -> tuple[FloatArray, list[float]]:
         """Executed actions, normalised, ``[n, A]``, and how far outside each call is."""
         made, outside = [], list[float]()
         for start in range(0, len(self._initial), BATCH):
-            part, rng = slice(start, start + BATCH), np.random.default_rng((self._rng, start))
+            part, rng = slice(start, start + BATCH), np.random.default_rng((self._seed, start))
             initial = self._initial[part]
             sampler = runtime.view(plan).manifest.spec.sampler
             steps = rng.standard_normal((sampler.steps, *initial.shape), dtype=np.float32)

@@ -92,7 +92,7 @@ class OnnxBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._keep = call.keep
-        obs = {**call.obs, **self.frames.values(call.obs)}
+        obs = {**call.obs, **self.frames.values(call.obs)} if call.obs else {}
         self._work.start(obs, call.noise, call.correction, call.known)
 
     def condition(self) -> FloatArray:

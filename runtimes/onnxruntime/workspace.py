@@ -98,7 +98,8 @@ class Workspace:
         if self._memory:
             self._memory[0].fill(0)
         fill_offset(self._offset, self._sampler, noise, correction)
-        self._contexts.fill(obs)
+        if obs:
+            self._contexts.fill(obs)
         self._known, self._read = known, np.zeros((self.streams, 0), np.float32)
         if correction is not None and correction.reads:
             self._read = correction.read(self._contexts.condition())

@@ -36,6 +36,8 @@ class ReferenceBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._call = call
+        if not call.obs:
+            return
         with fitting(self._view), torch.no_grad():
             self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
 

@@ -106,7 +106,7 @@ class TorchBackend:
         with self._settings():
             self.workspace.load(call)
             self._advance = self._advance_of(call)
-            if not self._whole:
+            if call.obs and not self._whole:
                 self._lines.run("prologue", self.workspace.network.prologue)
 
     def condition(self) -> FloatArray:

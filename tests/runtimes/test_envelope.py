@@ -153,6 +153,19 @@ def test_so_have_calls_whose_plan_the_pruner_makes(made: tuple[Path, bytes], run
         assert_equal_but_for_rounding(sample[-1:], wanted[1:], 2 * call_terms(artifact))
 
 
+@pytest.mark.parametrize("runtime", ["reference", "onnxruntime", "torch"])
+def test_the_prologue_is_computed_once(made: tuple[Path, bytes], runtime: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be an image encoder, of which no call has time for two."""
+    artifact = load_artifact(made[0])
+    opened, given = open_runtime(artifact, runtime), two_calls(artifact)
+    started, start = [], type(opened.backend).start
+    monkeypatch.setattr(
+        type(opened.backend), "start", lambda self, call: (started.append(sorted(call.obs)), start(self, call))[1]
+    )
+    opened.predict(*some(given, [1]), artifact.plans["fast"])
+    assert started == [sorted(given[0]), []]
+
+
 def test_others_are_as_they_would_be_without(made: tuple[Path, bytes]) -> None:
     """What has no correction has nothing to lose, and an artifact without an envelope says nothing of it."""
     artifact = load_artifact(made[0])

@@ -8,6 +8,7 @@ from typing import Any
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
 from ..artifact.view import view_of
+from ..core.envelope import FAR
 from ..ir.flops import graph_flops
 from ..ir.pieces import frame_name
 from ..runtimes.liveness import rollout_needs
@@ -56,6 +57,7 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "uses": [asdict(use) for use in uses(artifact)],
         "rollout_cache": asdict(rollout_needs(view_of(artifact))),
         "default_plan": manifest.default_plan,
+        "envelope": None if artifact.envelope is None else {"components": len(artifact.envelope.center), "far": FAR},
         "calibration": None if manifest.calibration is None else dict(manifest.calibration),
     }
 
