@@ -63,6 +63,13 @@ def test_an_artifact_knows_what_it_was_calibrated_on(compiled: Path, recording: 
         policy.predict_action({"obs": times * recorded})
         report = policy.last_report
         assert report is not None and report.far == far == (report.outside[0] > FAR)
+    with np.load(recording) as known:
+        nearer = {name: np.float32(0.3) * known[name] if name == "obs" else known[name] for name in known.files}
+    np.savez(tmp_path / "nearer.npz", **nearer)
+    ttscompile.calibrate(folder, [tmp_path / "nearer.npz"], target_sparsity=0.7, max_intervals=2, progress=False)
+    after = load_artifact(folder)
+    assert after.envelope is not None
+    assert not np.array_equal(after.envelope.center, artifact.envelope.center), "it is of the last recordings"
     policy.reset()
     policy.predict_action({"obs": 100 * recorded}, plan="dense")
     assert policy.last_report is not None and policy.last_report.outside == ()

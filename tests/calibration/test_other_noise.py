@@ -14,12 +14,13 @@ import torch
 
 import ttscompile
 from tests.once import Once
+from ttscompile.artifact.ceiling import BOUND
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.judge import Score, other_noise, other_observations
 from ttscompile.calibration.pipeline import UNHEARD, heeds
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.result import BOUND, CalibrationResult
+from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import DRAWS, Trials
 from ttscompile.report import facts
@@ -117,6 +118,18 @@ def test_a_plan_that_is_far_off_is_doubtful(distance: float, budget: dict[str, f
     made = result(10.0)
     plans = {**made.plans, "schedule": replace(made.plans["schedule"], distance=distance)}
     assert replace(made, plans=plans, budget=budget).doubtful == doubtful
+
+
+@pytest.mark.parametrize(
+    ("distance", "word"), [(BOUND, "within"), (BOUND + 0.01, "above"), (float("nan"), "above"), ("far", "")]
+)
+def test_a_record_has_a_verdict(distance: object, word: str) -> None:
+    record = result(10.0).record()
+    record["plans"]["schedule"]["distance"] = distance
+    assert [one for one in facts.remarks(record) if "quarter of what other noise changes" in one] == list(
+        facts.verdict(record)
+    )
+    assert (word in "".join(facts.verdict(record))) and bool(facts.verdict(record)) == bool(word)
 
 
 @pytest.mark.parametrize(("shift", "warned"), [(1.0, False), (0.0, True)])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from ..artifact.ceiling import few_steps, usual_sparsity
+from ..artifact.ceiling import BOUND, few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import locked, update_plans
@@ -24,7 +25,7 @@ from .judge import other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
 from .proposer import Proposer, Request, Row, rows_of
-from .result import BOUND, CalibrationResult
+from .result import CalibrationResult
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
@@ -142,6 +143,8 @@ def calibrate(
     # All the while: a second calibration would undo the first.
     with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(there):
         artifact = load_artifact(Path(path))
+        if SCHEDULE in learn:  # that of an earlier calibration would judge this one's plans
+            artifact = replace(artifact, envelope=None)
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
         request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)

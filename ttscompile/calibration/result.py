@@ -6,12 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from ..artifact.ceiling import BOUND
 from .budget import ERROR
 from .judge import Score
-
-BOUND = 0.25
-"""Distance from the original up to which plans lost at most 0.03 of the score, on five policies: "What an error means"
-in ``docs/evidence/results.md``."""
 
 
 @dataclass(frozen=True)
