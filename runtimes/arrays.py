@@ -55,9 +55,12 @@ def read_observation(
         raise ObservationError(f"the observation is a {type(obs).__name__}; expected {expected}.")
     given = {key: value for key in specs if (value := obs.get(key, _MISSING)) is not _MISSING}
     if len(given) < len(specs) or (not others and len(obs) != len(specs)):
-        names = [sorted(map(str, each))[:20] for each in (obs, specs.keys() - given.keys(), obs.keys() - specs.keys())]
+        missing, unexpected = specs.keys() - given.keys(), obs.keys() - specs.keys()
+        names = [sorted(map(str, each))[:20] for each in (obs, missing, unexpected)]
         found = "{:.400} (missing: {:.400}, unexpected: {:.400})".format(*map(str, names))
         remedy = "Give exactly the keys that the policy was compiled for."
+        if "task" in unexpected and any(specs[key].dtype == "int64" for key in missing):
+            remedy = "For a text in place of its tokens, load the policy with tokenizer=PATH."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)
     arrays = {}
@@ -107,7 +110,8 @@ def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     remedy = ""
     if spec.image and array.dtype.kind in "iu":
         remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
-    if spec.image and array.shape[-3:] == (*spec.shape[-2:], spec.shape[-3]) != spec.shape[-3:]:
+    channels = spec.shape[-3] if spec.image and array.ndim > 3 else 0
+    if channels == array.shape[-1] and array.shape[-3] != channels:
         remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
     return remedy
 

@@ -24,7 +24,7 @@ class Call:
     """What a backend is given for one call. Everything was checked.
 
     Attributes:
-        obs: normalised observation by key, ``[B, ...]`` each.
+        obs: normalised observation by key, ``[B, ...]`` each; empty for that of the call before, whose prologue stands.
         noise: ``initial [B, T, D]``; ``steps [K, B, T, D]`` if the sampler is stochastic.
         correction: of the sampler's steps; None for none.
         known: what a prefix makes known of the samples; None for nothing.
@@ -48,6 +48,8 @@ class Backend(Protocol[Lowered]):
 
         prepare    start    first_step                                other_steps -> sample
                             logits, where the plan is the pruner's
+
+    Where a call may be far outside of what was recorded, ``condition`` stands before ``first_step``.
 
     Methods may raise anything: the runtime then ends the episode. ``lower`` and ``logits`` are called on a thread of
     their own while ``first_step`` runs; nothing else is.
@@ -75,6 +77,9 @@ class Backend(Protocol[Lowered]):
 
     def start(self, call: Call) -> None:
         """Take in a call, and run what the observation decides before the loop: the prologue."""
+
+    def condition(self) -> FloatArray:
+        """What a correction reads of the observation of the call, float32 ``[B, N]``; asked for after ``start``."""
 
     def logits(self) -> FloatArray:
         """The pruner's logits for the call, float32 ``[B, K, blocks, 4]``; asked for only if there is a pruner."""

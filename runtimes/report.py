@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ttscompile.core.envelope import FAR
 from ttscompile.core.lattice import PlanArray
 from ttscompile.core.plan import ORIGINAL
 
@@ -48,6 +49,9 @@ class CallReport:
         timings: wall time in milliseconds.
         frames: how many frames were computed and how many were known, and what that took and saved.
         loop: name of the loop that was executed.
+        outside: of each stream of a plan with a correction, how far the observation is from what was recorded: 1 for
+            the furthest recorded one. Above ``FAR`` the stream had as many steps, evenly spaced, and no correction.
+            Empty where nothing is said of that: ``core.envelope``.
     """
 
     plan: PlanArray
@@ -58,3 +62,9 @@ class CallReport:
     timings: Timings
     frames: FrameWork = field(default_factory=FrameWork)
     loop: str = ORIGINAL
+    outside: tuple[float, ...] = ()
+
+    @property
+    def far(self) -> bool:
+        """Whether a stream was so far outside that it had no correction."""
+        return any(distance > FAR for distance in self.outside)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import View, view_of
+from ttscompile.core.envelope import FAR, plain_cells
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
 from ttscompile.core.plan import DENSE, Plan, Variant
 from ttscompile.core.spec import FloatArray, Noise, PolicySpec
@@ -47,6 +48,19 @@ class _Settled:
     lowered: tuple[Any, ...]  # of each stream, by the backend
     legalised: tuple[int, ...]  # replaced cells of each stream
     pruner: float = 0.0  # ms, from the condition values to the instructions; 0 if the plan was given
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What a call gave, and how."""
+
+    sample: FloatArray
+    settled: _Settled
+    outside: FloatArray  # ``CallReport.outside``
+    waited: float  # ms, for the pruner
+    prologue: float  # reading of ``time.perf_counter`` after it
+    frames: FrameWork
+    mixed: bool  # whether some streams were far outside, and others not: then no residual can be reused
 
 
 class _Opened:
@@ -218,20 +232,13 @@ class Runtime:
         backend.prepare(streams, None if settled is None else settled.lowered)
 
         start = time.perf_counter()
-        backend.start(Call(obs, noise, plan.correction, known, keep, written))
-        prologue = time.perf_counter()
-        waited = 0.0
-        if settled is None:
-            settled, waited = self._prune_beside_first_step(written)
-        else:
-            backend.first_step()
-        sample = backend.other_steps(settled.lowered)
-        if plan.correction is not None:
-            sample = with_prefix(bounded(spec.sampler, sample), known)
-        stop = time.perf_counter()
+        made = self._denoised(opened, plan, Call(obs, noise, plan.correction, known, keep, written), settled)
+        stop, settled = time.perf_counter(), made.settled
+        if made.mixed:
+            keep, written = np.zeros_like(keep), np.zeros_like(written)
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
-        self._streams, self._chunk = streams, sample
+        self._streams, self._chunk = streams, made.sample
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
         report = CallReport(
@@ -241,17 +248,52 @@ class Runtime:
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
             flops=tuple(manifest.flops.call(one, plan.pruned, plan.correction) for one in settled.plans),
-            frames=opened.frames.work,
+            frames=made.frames,
+            outside=tuple(made.outside.tolist()),
             timings=Timings(
-                prologue=_milliseconds(start, prologue),
+                prologue=_milliseconds(start, made.prologue),
                 pruner=settled.pruner,
-                wait_pruner=waited,
-                decode=_milliseconds(prologue, stop) - waited,
+                wait_pruner=made.waited,
+                decode=_milliseconds(made.prologue, stop) - made.waited,
                 total=_milliseconds(start, stop),
-                frames=opened.frames.work.waited,
+                frames=made.frames.waited,
             ),
         )
-        return sample, report
+        return made.sample, report
+
+    def _denoised(self, opened: _Opened, plan: Plan, call: Call, settled: _Settled | None) -> _Made:
+        """The sample of a call. Streams that are far outside of what was recorded have ``plain_cells``, uncorrected."""
+        backend, envelope, waited, mixed = opened.backend, self._artifact.envelope, 0.0, False
+        backend.start(call)
+        prologue, frames, outside = time.perf_counter(), opened.frames.work, np.zeros(0, np.float32)
+        if plan.correction is None or envelope is None:
+            far = np.zeros(len(call.noise.initial), np.bool_)
+        else:
+            outside = envelope.distance(backend.condition())
+            far = outside > FAR
+        if not far.all():
+            if settled is None:
+                settled, waited = self._prune_beside_first_step(call.written)
+            else:
+                backend.first_step()
+            sample = backend.other_steps(settled.lowered)
+            if plan.correction is not None:
+                sample = with_prefix(bounded(opened.view.manifest.spec.sampler, sample), call.known)
+        if plan.correction is not None and far.any():
+            cells = plain_cells(plan.correction, call.written.shape[2])
+            plain = self._settle(opened, cells, call.written, np.zeros_like(call.written), True)
+            backend.start(replace(call, obs={}, correction=None))
+            backend.first_step()
+            own, mixed = backend.other_steps(plain.lowered), not far.all()
+            if mixed:
+                assert settled is not None
+                which = far[:, None, None]
+                own, plans = np.where(which, own, sample), np.where(which, plain.plans, settled.plans)
+                legalised = tuple(np.where(far, plain.legalised, settled.legalised).tolist())
+                plain = replace(settled, plans=plans, legalised=legalised)
+            settled, sample = plain, own
+        assert settled is not None
+        return _Made(sample, settled, outside, waited, prologue, frames, mixed)
 
     def noise_spec(self, plan: Plan) -> PolicySpec:
         """What noise has to fit: of the loop whose last steps these are, where the plan begins with a chunk."""

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
+from ttscompile.core.envelope import plain_cells
 from ttscompile.core.lattice import dense_plan
 from ttscompile.core.spec import ORIGINAL
 from ttscompile.errors import IllegalPlanError
@@ -45,4 +46,8 @@ def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArra
     inputs: dict[str, npt.NDArray[Any]] = {"plan": cells[None], "rollout_keep": readable_rollout(view)}
     if own.pruned:
         inputs |= {USE_PRUNER: np.array(True), **view.pruner}
-    return inputs if own.correction is None else inputs | own.correction.inputs()
+    if own.correction is None:
+        return inputs
+    if artifact.envelope is not None:
+        inputs |= artifact.envelope.inputs(plain_cells(own.correction, len(view.manifest.blocks)))
+    return inputs | own.correction.inputs()

@@ -62,9 +62,10 @@ def folder(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 def ttscompile_prints(words: list[str]) -> str:
-    """What the command line prints; it must succeed."""
+    """What the command line prints; it must succeed. A search of a moment finds a doubtful plan, and says so."""
     result = CliRunner().invoke(main, words, prog_name="ttscompile", catch_exceptions=False)
-    assert result.exit_code == 0, f"{' '.join(words)}: {result.output}"
+    doubtful = words[0] == "calibrate" and "scores may fall" in result.stderr
+    assert result.exit_code == doubtful, f"{' '.join(words)}: {result.output}"
     return result.output
 
 

@@ -11,7 +11,8 @@ from torch.nn import functional
 
 from ttscompile import ObservationSpec
 from ttscompile.core.images import fitted
-from ttscompile.errors import SpecError, TrajectoryError
+from ttscompile.errors import ObservationError, SpecError, TrajectoryError
+from ttscompile.runtimes.arrays import check_observation, read_observation
 from ttscompile.trajectories import load_trajectories
 
 
@@ -60,3 +61,27 @@ def test_a_recording_is_checked_before_it_is_resized(
     np.savez(file, top=images, episode_ends=np.array([2, 4]))
     with pytest.raises(TrajectoryError, match=f"calls.npz: 'top' .*({message})"):
         load_trajectories([file], {"top": spec}, 1)
+
+
+@pytest.mark.parametrize(
+    ("shape", "advised"),
+    [
+        ((1, 48, 64, 3), True),  # of another size than the policy takes, too
+        ((1, 8, 8, 3), True),
+        ((1, 3, 48, 64), False),
+        ((1, 48, 64, 4), False),
+    ],
+)
+def test_channels_that_are_last_are_told_of(shape: tuple[int, ...], advised: bool) -> None:
+    spec = ObservationSpec((3, 8, 8), window=False, bounds=(0.0, 1.0))
+    with pytest.raises(ObservationError, match="wrong shape") as caught:
+        check_observation({"top": np.zeros(shape, np.float32)}, {"top": spec})
+    assert ("Its channels are last: use np.moveaxis(image, -1, -3)" in str(caught.value)) == advised
+
+
+def test_a_text_without_a_tokenizer_is_told_of() -> None:
+    tokens = ObservationSpec((4,), dtype="int64", window=False, bounds=(0.0, 9.0))
+    for specs, advised in (({"state": ObservationSpec((2,)), "tokens": tokens}, True), ({"state": tokens}, False)):
+        with pytest.raises(ObservationError, match=r"unexpected: \['task'\]") as caught:
+            read_observation({"state": np.zeros((1, 2), np.float32), "task": "push"}, specs)
+        assert ("load the policy with tokenizer=PATH" in str(caught.value)) == advised

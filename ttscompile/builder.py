@@ -64,7 +64,7 @@ def build(
         policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
         latency_ms: that the longest call may take, in place of ``control_hz``.
         max_distance: how far from the original the default may be, with 95 % confidence, in units of what other noise
-            changes; None for ``calibration.proposer.NEAR``.
+            changes; None for a quarter, ``artifact.ceiling.BOUND``.
         threads: that calls have.
         max_minutes: for all but the conversion.
         seed: of everything random.

@@ -254,19 +254,21 @@ class ExecutorState:
         self._job = Job(self.epoch, window.frames, window.time, self.plan, now, schedule.runs_out(now), prefix)
         return self._job
 
-    def finish(self, job: Job, actions: FloatArray, now: float) -> str:
+    def finish(self, job: Job, actions: FloatArray, now: float, far: bool = False) -> str:
         """Take the chunk of a call.
 
         Args:
             job: the call.
             actions: ``[horizon + reserve, Da]``, the playable part of the prediction.
             now: when it was done.
+            far: see ``CallReport``.
 
         Returns:
             What became of it: ``scheduled``, ``discarded``, ``refused`` or ``overdue``.
         """
         counts, self._job = self.recorder.counts, None
         counts.calls += 1
+        counts.calls_outside += far
         latency = now - job.started
         self._latencies[job.plan].add(latency)
         self.recorder.latency_ms.add(1e3 * latency)

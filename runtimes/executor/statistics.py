@@ -72,6 +72,7 @@ class Counts:
     frames_replaced: int = 0
     frames_early: int = 0
     calls: int = 0
+    calls_outside: int = 0
     chunks: int = 0
     chunks_refused: int = 0
     chunks_overdue: int = 0
@@ -99,7 +100,8 @@ class ExecutorStatistics:
         frames_replaced: of these, of the same time as one that was there.
         frames_early: of these, handed to ``prepare_frame`` before the call that was expected to read them.
         calls: of the policy, finished; those that measured its latency at the start are not counted.
-        chunks: of these, scheduled.
+        calls_outside: of these, so far outside of what was recorded that they had no correction.
+        chunks: of the calls, scheduled.
         chunks_refused: of these, refused by the guard.
         chunks_overdue: wholly in the past when they came.
         chunks_discarded: computed from observations before a reset.
@@ -128,6 +130,7 @@ class ExecutorStatistics:
     frames_replaced: int
     frames_early: int
     calls: int
+    calls_outside: int
     chunks: int
     chunks_refused: int
     chunks_overdue: int

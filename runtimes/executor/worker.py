@@ -225,13 +225,13 @@ class Worker:
             expected = f"[1, T, Da] with T of at least {last} and Da = {resolved.channels}"
             raise ExecutorError(f"the policy's action_pred has shape {list(predicted.shape)}; expected {expected}.")
         actions: npt.NDArray[np.float32] = predicted[0, resolved.first : last].astype(np.float32)
+        report = getattr(self._policy, "last_report", None)
         with self.lock:
             now = self._clock.now()
-            outcome = self._opened.finish(job, actions, now)
+            outcome = self._opened.finish(job, actions, now, getattr(report, "far", False))
             self.news.notify_all()
         if self._trace.on:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
-            report = getattr(self._policy, "last_report", None)
             if self._seeing and report is not None:
                 frames = report.frames
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}

@@ -92,8 +92,12 @@ class OnnxBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._keep = call.keep
-        obs = {**call.obs, **self.frames.values(call.obs)}
+        obs = {**call.obs, **self.frames.values(call.obs)} if call.obs else {}
         self._work.start(obs, call.noise, call.correction, call.known)
+
+    def condition(self) -> FloatArray:
+        """See ``Backend.condition``."""
+        return self._work.condition()
 
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""

@@ -98,13 +98,18 @@ class Workspace:
         if self._memory:
             self._memory[0].fill(0)
         fill_offset(self._offset, self._sampler, noise, correction)
-        self._contexts.fill(obs)
+        if obs:
+            self._contexts.fill(obs)
         self._known, self._read = known, np.zeros((self.streams, 0), np.float32)
         if correction is not None and correction.reads:
             self._read = correction.read(self._contexts.condition())
             self._offset += correction.from_condition(self._read)
         if known is not None:
             hold_known(self._offset, known)
+
+    def condition(self) -> FloatArray:
+        """What a correction reads of the observation, ``[B, N]``."""
+        return self._contexts.condition()
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""

@@ -36,8 +36,15 @@ class ReferenceBackend:
     def start(self, call: Call) -> None:
         """See ``Backend.start``."""
         self._call = call
+        if not call.obs:
+            return
         with fitting(self._view), torch.no_grad():
             self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
+
+    def condition(self) -> FloatArray:
+        """See ``Backend.condition``."""
+        with fitting(self._view), torch.no_grad():
+            return np.asarray(self.model.condition(self._contexts).numpy(), dtype=np.float32)
 
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""

@@ -90,7 +90,9 @@ class TorchBackend:
     def prepare(self, streams: int, plans: Sequence[Instructions] | None) -> None:
         """Make the workspace of a batch size."""
         self._pruned = plans is None
-        self._whole = plans is not None and self._lines.captures and len(set(plans)) == 1 and plans[0] in self._named
+        one = plans is not None and len(set(plans)) == 1 and plans[0] in self._named
+        # Whether a call is far outside has to be known before its loop.
+        self._whole = one and self._lines.captures and self._view.artifact.envelope is None
         if self.workspace.streams == streams:
             return
         self._lines.forget()
@@ -104,8 +106,13 @@ class TorchBackend:
         with self._settings():
             self.workspace.load(call)
             self._advance = self._advance_of(call)
-            if not self._whole:
+            if call.obs and not self._whole:
                 self._lines.run("prologue", self.workspace.network.prologue)
+
+    def condition(self) -> FloatArray:
+        """See ``Backend.condition``."""
+        with self._settings():
+            return np.asarray(self.workspace.network.condition().float().cpu().numpy(), dtype=np.float32)
 
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
+from ttscompile.core.envelope import FAR, plain_cells
 from ttscompile.core.spec import Affine, PolicySpec
 from ttscompile.errors import ObservationError
 from ttscompile.ir.idle_form import idle_form
@@ -49,6 +50,13 @@ class CallModule(nn.Module):
         self._keep("idle", {} if self._idle is None else self._idle.tensors())
         bias = np.zeros((1, 1, 1, 1), np.float32) if correction is None else correction.bias
         self._keep("offset", {"noise": manifest.spec.sampler.noise_to_next[:, None, None, None], "bias": bias})
+        envelope = view.artifact.envelope
+        self._far: Advance | None = None
+        if correction is not None and envelope is not None:
+            self._far = type(advance)(manifest.spec, None, CPU)
+            self._keep("far", self._far.tensors())
+            self._keep("envelope", {"reading": envelope.reading, "center": envelope.center})
+            self._plain_cells = plain_cells(correction, len(manifest.blocks))
         for key, each in manifest.spec.observations.items():
             self._keep(f"normalizer {key}", _numbers(each.normalizer))
         self._keep("actions", _numbers(manifest.spec.chunk.normalizer))
@@ -88,18 +96,30 @@ class CallModule(nn.Module):
             idle=idle,
         )
 
-    def _offset(
-        self, network: PlainNetwork, advance: Advance, initial: Tensor, steps: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """What each step adds to the sample, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``.
+    def _is_far(self, network: PlainNetwork) -> Tensor:
+        """Which streams are so far outside of what was recorded that they have no correction, bool ``[B]``."""
+        envelope = self._kept("envelope")
+        away = network.condition(self._features) @ envelope["reading"] - envelope["center"]
+        far: Tensor = torch.linalg.vector_norm(away, dim=1) > FAR
+        return far
+
+    def _moves(
+        self, network: PlainNetwork, initial: Tensor, steps: Tensor | None, corrected: bool = True
+    ) -> tuple[Advance, Tensor, Tensor | None]:
+        """The sampler; what each step adds, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``.
 
         Raises:
             ObservationError: noise of the steps of another shape, or missing.
         """
+        advance = self._advance.on(self._kept("advance"))
+        if not corrected:
+            assert self._far is not None
+            advance = self._far.on(self._kept("far"))
         spec = self._spec
         horizon, dimensions = spec.sample
         own = self._kept("offset")
-        offset = own["bias"].expand(spec.sampler.steps, dimensions, len(initial), horizon)
+        bias = own["bias"] if corrected else torch.zeros_like(own["bias"])
+        offset = bias.expand(spec.sampler.steps, dimensions, len(initial), horizon)
         if spec.sampler.stochastic:
             if steps is None or tuple(steps.shape) != (spec.sampler.steps, *initial.shape):
                 found = "none" if steps is None else str(list(steps.shape))
@@ -110,7 +130,7 @@ class CallModule(nn.Module):
         if advance.reading is not None:
             read, added = advance.of_condition(network.condition(self._features))
             offset = offset + added
-        return nn.functional.pad(offset, (0, advance.memories * horizon)), read
+        return advance, nn.functional.pad(offset, (0, advance.memories * horizon)), read
 
     def _actions(self, sample: Tensor) -> Tensor:
         """The actions of a denoised sample ``[B, T, D]``, in their own units."""

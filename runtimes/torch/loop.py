@@ -6,7 +6,7 @@ Sample and what belongs to it have the action dimensions first, ``[D, B, T]``, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol
@@ -14,7 +14,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ttscompile.core.lattice import BoolArray
 from ttscompile.runtimes.instructions import Instructions
 
 from .idle_steps import IdleSteps
@@ -56,7 +55,7 @@ class Denoised:
 def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     network: Network,
     plan: Instructions,
-    keep: BoolArray,
+    keep: Container[int],
     advance: Advance,
     initial: Tensor,
     offset: Sequence[Tensor],
@@ -69,7 +68,7 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     Args:
         network: of the call.
         plan: lowered.
-        keep: bool ``[K, blocks]``; computed residuals that the result holds.
+        keep: computed residuals that the result holds, by flat index.
         advance: the sampler.
         initial: the sample at step 0, ``[B, T, D]``.
         offset: what each step adds to the sample, K of ``[D, B, (1 + S) T]``.
@@ -89,8 +88,9 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
             offset[landing] = offset[landing] + torch.nn.functional.pad(added, (0, advance.memories * advance.horizon))
         return state
 
-    steps, blocks = keep.shape
-    state, residuals = begin(initial, advance), dict[int, Tensor]()
+    steps, blocks = plan.computed.shape
+    residuals: dict[int, Tensor] = {}  # spelt so that torch.export can follow
+    state = begin(initial, advance)
     operands, cells, k = _Operands(plan, blocks, rollout), iter(plan.cells), 0
     while k < steps:
         if network.idle is not None and plan.idle[k]:
@@ -108,7 +108,7 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
                 stream = stream + operands.total()
             residual = operands.current[b] = network.block(b, k, stream)
             stream, reached = stream + residual, b + 1
-            if keep[k, b]:
+            if cell in keep:
                 residuals[cell] = residual
         if reached != blocks:
             stream = stream + operands.total()

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, overload
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ttscompile.artifact.load import load_artifact
@@ -23,6 +24,7 @@ from ttscompile.runtimes.instructions import Instructions, instructions_of
 
 from .call_module import CPU, CallModule
 from .loop import denoise
+from .planned_loop import either
 from .pruned_call import PrunedCall
 from .sampler import Advance
 
@@ -90,6 +92,7 @@ class SparseCall(CallModule):
         require_legal(schedule, manifest.groups, np.zeros(schedule.shape, np.bool_))
         super().__init__(view, view.weights, Advance(manifest.spec, correction, CPU), correction)
         self._plan: Instructions = instructions_of(schedule[0], manifest.groups)
+        self._plain = None if self._far is None else instructions_of(self._plain_cells, manifest.groups)
 
     def forward(self, obs: Mapping[str, Tensor], initial: Tensor, steps: Tensor | None = None) -> Tensor:
         """One call.
@@ -105,7 +108,19 @@ class SparseCall(CallModule):
         Raises:
             ObservationError: an observation or noise of another shape or dtype, or missing.
         """
-        network, advance = self._network(obs, initial), self._advance.on(self._kept("advance"))
-        offset, read = self._offset(network, advance, initial, steps)
-        nothing = np.zeros(self._plan.computed.shape, np.bool_)
-        return self._actions(denoise(network, self._plan, nothing, advance, initial, offset.unbind(), {}, read).sample)
+        network = self._network(obs, initial)
+        advance, offset, read = self._moves(network, initial, steps)
+        sample = denoise(network, self._plan, (), advance, initial, offset.unbind(), {}, read).sample
+        if self._plain is None:
+            return self._actions(sample)
+        plain, far = self._plain, self._is_far(network)
+        uncorrected, others, _ = self._moves(network, initial, steps, corrected=False)
+
+        def some_plain() -> Tensor:
+            made = denoise(network, plain, (), uncorrected, initial, others.unbind(), {}, None).sample
+            return torch.where(far[:, None, None], made, sample).contiguous()
+
+        if not torch.compiler.is_compiling():
+            return self._actions(some_plain() if far.any() else sample)
+        network.know_steps(len(plain.counts))
+        return self._actions(either(far.any(), some_plain, sample))

@@ -44,6 +44,7 @@ class PlainNetwork:
         graphs = pieces.graphs()
         self._reads = {name: (*graph.inputs, *graph.constants) for name, graph in graphs.items()}
         self._axes = {name: kind.batch_axis for graph in graphs.values() for name, kind in graph.inputs.items()}
+        self._blocks = tuple(map(block_name, range(len(pieces.blocks))))  # no text is made while something is traced
         self._streams_of = {name: piece.stream for name, piece in pieces.loop.items()}
 
     def of(self, members: Tensor) -> PlainNetwork:
@@ -63,6 +64,12 @@ class PlainNetwork:
         other._condition = {n: value.clone() for n, value in self._condition.items() if n in read}
         return other
 
+    def know_steps(self, steps: int) -> None:
+        """Compute all step values: in a branch of ``torch.cond`` nothing can be kept."""
+        if self._pieces.step is not None:
+            for k in range(steps):
+                self._step(k)
+
     def condition(self, features: Sequence[str]) -> Tensor:
         """What a correction reads, ``[B, N]``."""
         types = self._pieces.condition.types()
@@ -79,7 +86,7 @@ class PlainNetwork:
 
     def block(self, b: int, k: int, stream: Tensor) -> Tensor:
         """See ``loop.Network``."""
-        return self._at(k, block_name(b), stream)
+        return self._at(k, self._blocks[b], stream)
 
     def tail(self, stream: Tensor, k: int) -> Tensor:
         """See ``loop.Network``."""

@@ -76,7 +76,7 @@ class SteppedAdvance(Advance):
             added = self.jump([layer.index_select(0, number)[0] for layer in self.layers], read, history)
             return offset + torch.nn.functional.pad(added, (0, self.memories * self.horizon))
 
-        return _either((number >= 0)[0], jump, offset)
+        return either((number >= 0)[0], jump, offset)
 
 
 def denoise_as_planned(
@@ -124,7 +124,7 @@ def denoise_as_planned(
                 reused = torch.where(is_source[Source.ROLLOUT], earlier[b], reused)
             computing = is_source[Source.COMPUTE]
             evaluate = partial(_evaluated, network, block_name(b), stream, contexts, computing, reused)
-            residual = _either(computing.any(), evaluate, reused)
+            residual = either(computing.any(), evaluate, reused)
             own[b] = torch.where(computing, residual, own[b])
             of_group[groups[b]] = torch.where(computing, residual, of_group[groups[b]])
             if earlier is not None:
@@ -159,7 +159,7 @@ def _evaluated(
 _while: Callable[..., tuple[Tensor, ...]] = while_loop
 
 
-def _either(flag: Tensor, then: Callable[[], Tensor], otherwise: Tensor) -> Tensor:
+def either(flag: Tensor, then: Callable[[], Tensor], otherwise: Tensor) -> Tensor:
     """What a function gives, which is not evaluated where the flag is false; there it is ``otherwise``."""
 
     def same() -> Tensor:  # a branch must not give what flows into it

@@ -20,6 +20,7 @@ from .call_module import CPU, CallModule
 from .loop import denoise
 from .plain_network import PlainNetwork
 from .planned_loop import SteppedAdvance, denoise_as_planned
+from .sampler import Advance
 
 Rollout = tuple[Tensor, Tensor]
 """The rollout cache of an episode: residuals float32 ``[K, blocks, ...]``, each of the type of the residual stream; and
@@ -73,17 +74,22 @@ class PrunedCall(CallModule):
             IllegalPlanError: the pruner's weights are broken, so that its logits are NaN. Exported, the actions of such
                 a stream are NaN.
         """
-        network, advance = self._network(obs, initial), self._advance.on(self._kept("advance"))
-        assert isinstance(advance, SteppedAdvance)
-        offset, read = self._offset(network, advance, initial, steps)
+        network = self._network(obs, initial)
         empty = self.empty_rollout(len(initial))
         if rollout is not None:
             self._check(rollout, empty)
         residuals, written = empty if rollout is None else rollout
         if not torch.compiler.is_compiling():
-            return self._by_plan(network, advance, initial, offset, read, residuals, written, rollout is not None)
+            return self._by_plan(network, initial, steps, residuals, written, rollout is not None)
         logits = network.logits()
         plan = _repaired(logits.argmax(-1).to(torch.int8), written)
+        advance, offset, read = self._moves(network, initial, steps)
+        if self._far is not None:  # the loop is in the program once: one stream that is far outside decides for all
+            far = self._is_far(network).any()
+            uncorrected, other_offset, _ = self._moves(network, initial, steps, corrected=False)
+            advance, offset = advance.on(_chosen(far, uncorrected, advance)), torch.where(far, other_offset, offset)
+            plan = torch.where(far, torch.tensor(self._plain_cells), plan)
+        assert isinstance(advance, SteppedAdvance)
         cache = residuals if rollout is not None else None
         sample, cache = denoise_as_planned(network, self._groups, plan, advance, initial, offset, read, cache)
         broken = torch.where(logits.isnan().flatten(1).any(1), torch.nan, 0.0)
@@ -93,10 +99,8 @@ class PrunedCall(CallModule):
     def _by_plan(
         self,
         network: PlainNetwork,
-        advance: SteppedAdvance,
         initial: Tensor,
-        offset: Tensor,
-        read: Tensor | None,
+        steps: Tensor | None,
         residuals: Tensor,
         written: Tensor,
         keeps: bool,
@@ -104,12 +108,17 @@ class PrunedCall(CallModule):
         """The call, with a batch for each different plan."""
         logits = network.logits().detach().cpu().numpy()
         plans, _ = repair_plan(pruner_plan(logits), written.cpu().numpy())
-        alike: dict[bytes, list[int]] = {}
+        far = np.zeros(len(plans), np.bool_) if self._far is None else self._is_far(network).cpu().numpy()
+        if far.any():
+            plans = np.where(far[:, None, None], self._plain_cells, plans)
+        moves = {bool(one): self._moves(network, initial, steps, corrected=not one) for one in np.unique(far)}
+        alike: dict[tuple[bytes, bool], list[int]] = {}
         for stream, one in enumerate(plans):
-            alike.setdefault(one.tobytes(), []).append(stream)
-        keep = np.full(plans.shape[1:], keeps)
+            alike.setdefault((one.tobytes(), bool(far[stream])), []).append(stream)
+        keep = range(plans[0].size if keeps else 0)
         sample, after, axis = initial.clone(), residuals.clone() if keeps else residuals, self._type.batch_axis or 0
-        for some in alike.values():
+        for (_, away), some in alike.items():
+            advance, offset, read = moves[away]
             members = torch.tensor(some, device=initial.device)
             line: Instructions = self._lowering.lower(plans[some[0]])
             reads = {
@@ -138,6 +147,12 @@ class PrunedCall(CallModule):
             if found.shape != expected.shape or found.dtype != expected.dtype:
                 kinds = [f"{value.dtype} {list(value.shape)}" for value in (expected, found)]
                 raise ObservationError(f"rollout: expected {name} {kinds[0]}; found {kinds[1]}. Use empty_rollout.")
+
+
+def _chosen(far: Tensor, uncorrected: Advance, corrected: Advance) -> dict[str, Tensor]:
+    """The tensors of one of two, which a tensor decides; without a correction no jump is numbered."""
+    plain, tensors = uncorrected.tensors(), corrected.tensors()
+    return tensors | {name: torch.where(far, plain[name], tensors[name]) for name in ("updates", "remember", "number")}
 
 
 def _repaired(plan: Tensor, written: Tensor) -> Tensor:

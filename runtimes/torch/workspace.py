@@ -76,8 +76,8 @@ class Workspace:
     def load(self, call: Call) -> None:
         """Take in what a call is given."""
         known = call.known
-        for key, inlet in self._obs.items():
-            np.copyto(inlet.array, call.obs[key])
+        for key, value in call.obs.items():
+            np.copyto(self._obs[key].array, value)
         fill_initial(_floats(self._initial), call.noise, known)
         offset, free = _floats(self._offset)[..., : self._horizon], _floats(self._free)
         fill_offset(offset, self._sampler, call.noise, call.correction)
@@ -100,7 +100,7 @@ class Workspace:
         made = denoise(
             self.network,
             plan,
-            keep,
+            frozenset(np.flatnonzero(keep).tolist()),
             advance,
             self._initial.tensor,
             offset.unbind(),

@@ -261,7 +261,7 @@ def test_recordings_that_are_too_short_are_told_of(
 @pytest.mark.slow
 def test_constant_observations_are_fine(artifact: Path, tmp_path: Path) -> None:
     path = tmp_path / "constant.npz"
-    obs = np.repeat(np.arange(4, dtype=np.float32), 6)[:, None, None] * np.ones((2, 3), np.float32)
+    obs = np.repeat(np.arange(4, dtype=np.float32) / 8, 6)[:, None, None] * np.ones((2, 3), np.float32)
     np.savez(path, obs=obs, episode_ends=[6, 12, 18, 24])
     result = quick(artifact, path, max_intervals=None)
     assert result.default_plan == "schedule"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +14,12 @@ import torch
 
 import ttscompile
 from tests.once import Once
+from ttscompile.artifact.ceiling import BOUND
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import load_episodes
-from ttscompile.calibration.judge import Score, other_noise
+from ttscompile.calibration.judge import Score, other_noise, other_observations
+from ttscompile.calibration.pipeline import UNHEARD, heeds
+from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import DRAWS, Trials
@@ -97,6 +103,50 @@ def test_record_table_and_words_say_the_ratio() -> None:
     assert "Two dense calls with different noise are 10 apart" in told
     assert "'What an error means'" in told
     assert all("other noise" not in row[0] for row in facts.record_table(record).rows), "told once"
+
+
+@pytest.mark.parametrize(
+    ("distance", "budget", "doubtful"),
+    [
+        (BOUND, {"target_sparsity": 0.9}, False),
+        (BOUND + 0.01, {"target_sparsity": 0.9}, True),
+        (BOUND + 0.01, {"max_action_error": 8.0}, False),  # who names an error knows what it means
+    ],
+)
+def test_a_plan_that_is_far_off_is_doubtful(distance: float, budget: dict[str, float], doubtful: bool) -> None:
+    """By the default plan alone: ``fast`` may be far off."""
+    made = result(10.0)
+    plans = {**made.plans, "schedule": replace(made.plans["schedule"], distance=distance)}
+    assert replace(made, plans=plans, budget=budget).doubtful == doubtful
+
+
+@pytest.mark.parametrize(
+    ("distance", "word"), [(BOUND, "within"), (BOUND + 0.01, "above"), (float("nan"), "above"), ("far", "")]
+)
+def test_a_record_has_a_verdict(distance: object, word: str) -> None:
+    record = result(10.0).record()
+    record["plans"]["schedule"]["distance"] = distance
+    assert [one for one in facts.remarks(record) if "quarter of what other noise changes" in one] == list(
+        facts.verdict(record)
+    )
+    assert (word in "".join(facts.verdict(record))) and bool(facts.verdict(record)) == bool(word)
+
+
+@pytest.mark.parametrize(("shift", "warned"), [(1.0, False), (0.0, True)])
+def test_a_policy_that_hardly_heeds_what_was_recorded_is_told_of(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], shift: float, warned: bool
+) -> None:
+    """Four answers to each of eight observations: with other noise 0.1 apart on average, with others as far or more."""
+    spec = policies.spec()
+    answers = (
+        np.random.default_rng(0).normal(0, 0.1, (8, DRAWS, *spec.sample)) + shift * np.arange(8)[:, None, None, None]
+    )
+    sample = SimpleNamespace(answers=answers.astype(np.float32))
+    held: Any = SimpleNamespace(artifact=SimpleNamespace(manifest=SimpleNamespace(spec=spec)), held_out=sample)
+    held.bar = Bar(shown=True)
+    assert (other_noise(held) < UNHEARD * other_observations(held)) == (not warned)
+    heeds(held)
+    assert ("hardly heeds what was recorded" in capsys.readouterr().err) == warned
 
 
 @pytest.mark.parametrize("other_noise", [None, 0.0])

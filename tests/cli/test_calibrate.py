@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -81,6 +82,14 @@ def test_a_plan_that_is_not_what_was_asked_for_is_a_failed_check(monkeypatch: py
     result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz"])
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == "failed: no better than the uniform schedule\n"
+
+
+@pytest.mark.parametrize("doubtful", [False, True])
+def test_a_plan_that_is_far_off_is_written_and_a_failed_check(monkeypatch: pytest.MonkeyPatch, doubtful: bool) -> None:
+    monkeypatch.setattr("ttscompile.calibrate", lambda *_, **__: SimpleNamespace(doubtful=doubtful), raising=False)
+    result = CliRunner().invoke(main, ["calibrate", "out", "--trajectories", "a.npz"])
+    assert result.exit_code == doubtful
+    assert "identity" in result.stdout
 
 
 def test_every_strategy_can_be_asked_for(asked: list[Any]) -> None:

@@ -147,6 +147,22 @@ def test_files_that_torch_did_not_write(tmp_path: Path) -> None:
         load_checkpoint_policy(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("model.onnx", "an ONNX model .*checkpoint that it was exported from"),
+        ("octo.msgpack", "a checkpoint of Flax .*Convert it to PyTorch"),
+        ("calls.npz", "no checkpoint .*the training saved"),
+        ("model.onnx.ckpt", "or a truncated one"),  # a name that only looks like one
+    ],
+)
+def test_files_of_another_kind_are_not_called_truncated(tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / name).write_bytes(b"hello" * 20)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint_policy(tmp_path / name)
+    assert ("truncated" in str(caught.value)) == (name == "model.onnx.ckpt")
+
+
 def test_every_row_is_reached(tmp_path: Path) -> None:
     """By one of the cases above: a row behind another that matches more would never be."""
     told = [said(refuse_payload, payload) for payload, *_ in PAYLOADS] + [

@@ -38,7 +38,7 @@ def test_a_card_of_a_calibrated_artifact_has_its_figures(
 ) -> None:
     calibrated = tmp_path / "calibrated"
     shutil.copytree(toy_artifact, calibrated)
-    obs = np.random.default_rng(0).standard_normal((40, 2), np.float32)
+    obs = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 2)).astype(np.float32)
     np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=[10, 20, 30, 40])
     ttscompile.calibrate(calibrated, [tmp_path / "calls.npz"], target_sparsity=0.5, strategy="interval")
     identity = load_artifact(calibrated).manifest.identity

@@ -48,15 +48,15 @@ def test_a_mutation_moves_cells_within_their_blocks() -> None:
 
 
 def test_generations_get_better_and_begin_with_whole_steps(make_task: MakeTask) -> None:
-    task = make_task(20)
+    task = make_task(26)
     search = Evo(task)
     assert search._population.shape == (POPULATION, 10, 6)
-    assert search._population[0][list(spacings(10, 3)[0])].all()
+    assert search._population[0][list(spacings(10, 4)[0])].all()
     losses = []
     for generation in range(6):
         search.advance(generation)
         losses.append(search.loss)
-        assert (search._population.sum((1, 2)) == 20).all()
+        assert (search._population.sum((1, 2)) == 26).all()
     assert losses == sorted(losses, reverse=True)
     assert losses[-1] < losses[0]
     with Counted() as counted:

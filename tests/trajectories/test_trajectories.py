@@ -45,6 +45,22 @@ def test_calls_are_divided_into_episodes(file: Path) -> None:
     assert second.name == "calls.npz[1]"
 
 
+@pytest.mark.parametrize(
+    ("content", "found"), [(b"a,b\n1,2\n", "one that begins with b'a,b\\\\n1,'"), (b"", "an empty one")]
+)
+def test_a_file_that_is_no_archive_is_told_so(file: Path, content: bytes, found: str) -> None:
+    file.write_bytes(content)
+    with pytest.raises(TrajectoryError, match=f"expected an .npz, a zip archive of arrays; found {found}") as caught:
+        load(file)
+    assert "pickle" not in str(caught.value)
+
+
+def test_an_archive_without_arrays_is_told_so(file: Path) -> None:
+    np.savez(file)
+    with pytest.raises(TrajectoryError, match="'episode_ends'; it has no arrays at all. Add"):
+        load(file)
+
+
 def test_compressed_files_and_several_files(file: Path, tmp_path: Path) -> None:
     np.savez_compressed(file, **arrays())
     other = saved(tmp_path / "other.npz", **{**arrays(7), "obs": arrays(7)["obs"] + 1})
@@ -180,10 +196,11 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     np.save(single, np.zeros(3))
     with pytest.raises(TrajectoryError, match=r"found a single one\. Use np\.savez"):
         load(single)
-    text = tmp_path / "text.npz"
-    text.write_text("hello")
-    with pytest.raises(TrajectoryError, match="cannot be read as .npz"):
-        load(text)
+    cut = tmp_path / "cut.npz"
+    np.savez(cut, obs=np.zeros(30))
+    cut.write_bytes(cut.read_bytes()[:100])
+    with pytest.raises(TrajectoryError, match="cannot be read as .npz .*truncated"):
+        load(cut)
     archive = tmp_path / "archive.npz"
     with zipfile.ZipFile(archive, "w") as z:
         z.writestr("obs.npy", b"no array")

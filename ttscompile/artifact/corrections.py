@@ -1,4 +1,7 @@
-"""Corrections among the arrays of an artifact's plans: ``correction/PLAN/FIELD``, with jumps or without."""
+"""Corrections among the arrays of an artifact's plans: ``correction/PLAN/FIELD``, with jumps or without.
+
+Beside them stands what was recorded to fit them: ``envelope/FIELD``.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import Correction, groups_of
+from ..core.envelope import Envelope
 from ..errors import ArtifactError, IllegalPlanError
 from .manifest import Manifest
 from .strict_json import REMEDY
 
-PREFIX = "correction/"
+PREFIX, ENVELOPE = "correction/", "envelope/"
 
 _OF_ALL = tuple(field.name for field in fields(Correction) if field.default_factory is MISSING)
 _OF_JUMPS = tuple(field.name for field in fields(Correction) if field.name not in _OF_ALL)
@@ -24,6 +28,34 @@ def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArra
     """The arrays of a plan's correction, by name."""
     names = (*_OF_ALL, *(_OF_JUMPS if correction.jumps else ()))
     return {f"{PREFIX}{plan}/{name}": np.asarray(getattr(correction, name)) for name in names}
+
+
+def envelope_arrays(envelope: Envelope | None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an envelope, by name; none if there is none."""
+    of = () if envelope is None else fields(Envelope)
+    return {f"{ENVELOPE}{one.name}": getattr(envelope, one.name) for one in of}
+
+
+def read_envelope(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> Envelope | None:
+    """The envelope among some arrays; None if there is none.
+
+    Raises:
+        ArtifactError: one with too few or too many fields, or that does not fit the policy.
+    """
+    parts = {name.removeprefix(ENVELOPE): array for name, array in stored.items() if name.startswith(ENVELOPE)}
+    if not parts:
+        return None
+    expected, numbers = sorted(field.name for field in fields(Envelope)), manifest.condition_numbers
+    if sorted(parts) != expected:
+        raise ArtifactError(f"{where}: expected an envelope of {expected}; found {sorted(parts)}. {REMEDY}")
+    try:
+        envelope = Envelope(**parts)
+    except IllegalPlanError as error:
+        raise ArtifactError(f"{where}: {error} {REMEDY}") from error
+    if len(envelope.reading) != numbers:
+        found = f"an envelope of {numbers} numbers of the condition; found one of {len(envelope.reading)}"
+        raise ArtifactError(f"{where}: expected {found}. {REMEDY}")
+    return envelope
 
 
 def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import Correction
-from ..core.lattice import PlanArray, Source, check_plan, dense_plan
+from ..core.envelope import Envelope
+from ..core.lattice import PlanArray, check_schedule, dense_plan
 from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
 from ..core.spec import BF16, FP16, FP32, INT8
@@ -38,7 +38,7 @@ from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
 from .codec import MAX_MANIFEST_BYTES, decode, identities
-from .corrections import PREFIX, read_corrections
+from .corrections import ENVELOPE, PREFIX, read_corrections, read_envelope
 from .files import check_file, read_file
 from .folder import Folder, Stamp
 from .graph_json import graph_from_json
@@ -69,6 +69,7 @@ class Artifact:
         plans: by name, ``dense`` the first of them.
         block_weights: by the name of weights that plans may have, the constants that blocks have in place of those of
             ``weights``; read-only views of the files.
+        envelope: of what its corrections were fitted on; None where that is not known.
     """
 
     path: Path
@@ -80,6 +81,7 @@ class Artifact:
     loop_pruners: Mapping[str, Mapping[str, npt.NDArray[Any]]]
     plans: Mapping[str, Plan]
     block_weights: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+    envelope: Envelope | None
     _folder: Folder = field(repr=False)
     _stamps: Mapping[str, Stamp] = field(repr=False)
     _unpacked: Unpacked | None = field(default=None, repr=False)
@@ -288,6 +290,7 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
         loop_pruners={loop: tensors.read(directory / file) for loop, file in manifest.loop_pruners.items()},
         plans=_plans(directory, manifest),
         block_weights=MappingProxyType(block_weights),
+        envelope=read_envelope(_optional(directory, manifest.stores.plans), manifest, str(directory)),
         _folder=folder,
         _stamps=stamps,
     )
@@ -318,7 +321,7 @@ def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
     """All plans by name, with their cells and corrections."""
     stored = _optional(directory, manifest.stores.plans)
     where = directory / (manifest.stores.plans or MANIFEST)
-    schedules = {name: array for name, array in stored.items() if not name.startswith(PREFIX)}
+    schedules = {name: array for name, array in stored.items() if not name.startswith((PREFIX, ENVELOPE))}
     expected = sorted(name for name, plan in manifest.plans.items() if plan.kind == "schedule")
     if expected != sorted(schedules):
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
@@ -355,20 +358,3 @@ def plan_of(
         otherwise=otherwise,
         repair=True,
     )
-
-
-def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -> None:
-    """Raise unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0.
-
-    Raises:
-        IllegalPlanError: it is not.
-    """
-    if plan.dtype != np.int8 or plan.ndim != 2:
-        found = f"{plan.dtype}{list(plan.shape)}"
-        raise IllegalPlanError(f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {found}.")
-    try:
-        check_plan(plan, steps, blocks, 1)
-    except IllegalPlanError as error:
-        raise IllegalPlanError(f"schedule {name!r}: {error}") from error
-    if (plan[0] != Source.COMPUTE).any():
-        raise IllegalPlanError(f"schedule {name!r}: expected COMPUTE in all of step 0; found {plan[0].tolist()}.")

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import condition_flops, numbers_of
-from ..core.lattice import plan_flops, sparsity
+from ..core.lattice import check_schedule, plan_flops, sparsity
 from ..core.plan import DENSE, ORIGINAL, Plan, Variant
 from ..core.spec import SamplerTable
 from ..core.update import update_flops
@@ -26,7 +26,6 @@ from . import tensors
 from .bind import REPORT, interface
 from .calibration_record import check_record
 from .codec import plan_fault
-from .load import check_schedule
 from .manifest import PLAN_NAME, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
 from .strict_json import Value, dump_compact, parse
 from .towers import TokensRecord

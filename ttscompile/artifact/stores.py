@@ -10,19 +10,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.envelope import Envelope
 from ..core.plan import ORIGINAL, Plan
 from ..ir.pieces import PRUNER, of_loop
 from . import tensors
 from .bind import bind, places_of
-from .corrections import correction_arrays, require_fit
+from .corrections import correction_arrays, envelope_arrays, require_fit
 from .files import content_hash, describe, replace_file
 from .load import Artifact
 from .manifest import Manifest
 
 
-def plan_arrays_of(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, npt.NDArray[Any]]:
-    """Schedules and corrections of plans, by the names that they have in the file."""
-    arrays = dict[str, npt.NDArray[Any]]()
+def plan_arrays_of(
+    manifest: Manifest, plans: Mapping[str, Plan], envelope: Envelope | None
+) -> dict[str, npt.NDArray[Any]]:
+    """Schedules and corrections of plans, and the envelope, by the names that they have in the file."""
+    arrays = envelope_arrays(envelope)
     for name, record in manifest.plans.items():
         if record.kind == "schedule":
             arrays[name] = np.asarray(plans[name].cells)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
+from ..core.envelope import Envelope
 from ..core.paths import require_free_or_path
 from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..errors import ArtifactError
@@ -117,6 +118,7 @@ def update_plans(
     pruner_loop: str = ORIGINAL,
     weights: Mapping[str, BlockWeights] | None = None,
     starts: Mapping[str, StartRecord] | None = None,
+    envelope: Envelope | None = None,
     model_identity: str | None = None,
     golden: Callable[[Artifact], Mapping[str, GoldenPlan]] | None = None,
     held: bool = False,
@@ -136,6 +138,7 @@ def update_plans(
         pruner_loop: the loop whose pruner has these.
         weights: of blocks, which these plans name, by name; those that are there need not be given again.
         starts: loops that begin with the chunk of the call before, by name; likewise.
+        envelope: of what the corrections of these plans were fitted on; None keeps the one that is there.
         model_identity: of the artifact that was calibrated; refuses another one.
         golden: records what the reference runtime makes of the plans (``record_golden.record_plans``), given the
             artifact as it will be; None leaves the artifact without, and its plans cannot be verified.
@@ -161,7 +164,9 @@ def update_plans(
             if default_plan not in {DENSE, *manifest.plans}:
                 raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *manifest.plans]}.")
             manifest = replace(manifest, default_plan=default_plan, calibration=told)
-            manifest = store_arrays(directory, manifest, "plans", plan_arrays_of(manifest, plans))
+            manifest = store_arrays(
+                directory, manifest, "plans", plan_arrays_of(manifest, plans, envelope or artifact.envelope)
+            )
             pruners = dict[str, Mapping[str, npt.NDArray[Any]]]()
             if pruner_weights is not None:
                 own = pruner_loop if pruner_loop in manifest.loop_pruners else ORIGINAL

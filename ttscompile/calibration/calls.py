@@ -17,6 +17,7 @@ from ..errors import CalibrationError
 from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode, load_trajectories
+from ..trajectories.ranges import check_ranges
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
@@ -70,6 +71,7 @@ def load_episodes(
             "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"
             " learned from. Record more; about sixteen are enough."
         )
+    check_ranges(episodes, spec)
     return episodes
 
 

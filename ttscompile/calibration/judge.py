@@ -156,11 +156,21 @@ def _loop_spec(trials: Trials, plan: Plan) -> Any:
 
 def other_noise(trials: Trials) -> float:
     """How far two answers of the original to one held-out observation are apart, in the units of the actions."""
+    part = _in_units(trials)
+    return float(np.mean([np.abs(part[:, i] - part[:, j]) for i, j in combinations(range(part.shape[1]), 2)]))
+
+
+def other_observations(trials: Trials) -> float:
+    """The same of two answers to different held-out observations; 0 where there is one alone."""
+    part = _in_units(trials)
+    return float(np.mean([np.abs(part - np.roll(part, n, 0)).mean() for n in range(1, len(part))] or [0.0]))
+
+
+def _in_units(trials: Trials) -> Numbers:
+    """What the original executes, ``[N, R, Ta, Da]``."""
     spec, answers = trials.artifact.manifest.spec, trials.held_out.answers.astype(np.float64)
     part = answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
-    scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
-    apart = [np.abs(part[:, i] - part[:, j]) / scale for i, j in combinations(range(answers.shape[1]), 2)]
-    return float(np.mean(apart))
+    return np.asarray(part / (1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)))
 
 
 class _Answers:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..artifact.ceiling import few_steps, usual_sparsity
+from ..artifact.ceiling import BOUND, few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import locked, update_plans
@@ -26,10 +25,10 @@ from .budget import goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
 from .choose import choose
 from .clock import Clock
-from .judge import other_noise
+from .judge import other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
-from .proposer import LOOPS, NEAR, Proposer, Request, Row, rows_of
+from .proposer import LOOPS, Proposer, Request, Row, rows_of
 from .result import CalibrationResult
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
@@ -37,6 +36,10 @@ from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, Strategy, strategy_of
 from .targets import REPEATS
 from .trials import MANY_DRAWS, OBSERVATIONS, Trials, base_of
+
+UNHEARD = 0.9
+"""Of what another observation changes, above which other noise changes suspiciously much. On Push-T it is a tenth, and
+0.97 to 1 with data times 100, a hundredth of them, or random ones."""
 
 
 def calibrate(
@@ -95,8 +98,9 @@ def calibrate(
             None for what its proposer allows. Where loops are learned: how far from the original the default may be,
             with 95 % confidence.
         threads: how many threads the calls have that are timed for ``latency_ms``.
-        max_minutes: the best plan so far is taken in time to be finished by then, as far as what was done before lets
-            it be known; what has to be done at least is done. Also decides how many calls are used.
+        max_minutes: of work: those in which all of torch's threads compute. The best plan so far is taken in time to be
+            finished by then, as far as what was done before lets it be known; what has to be done at least is done.
+            Also decides how many calls are used. A busy machine takes up to twice as long by the wall clock.
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
         correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
@@ -123,7 +127,8 @@ def calibrate(
         RuntimeUnavailableError: torch does not have the device.
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
     """
-    begun = time.monotonic()
+    elsewhere = ray is not None or device not in (None, "cpu")
+    begun = Clock(wall=elsewhere)
     seed = integer(seed, "seed", CalibrationError)
     rank, updates = integer(rank, "rank", CalibrationError, 1), integer(updates, "updates", CalibrationError, 1)
     if max_intervals is not None:
@@ -147,11 +152,13 @@ def calibrate(
     # All the while: a second calibration would undo the first.
     with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(there):
         artifact = load_artifact(Path(path))
+        if anew:  # that of an earlier calibration would judge this one's plans
+            artifact = replace(artifact, envelope=None)
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
         request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
         if chooses:  # its bound is of what is chosen in the end, and not of each that learns
-            near = NEAR if max_distance is None else max_distance
+            near = BOUND if max_distance is None else max_distance
             request = replace(request, margin=None, bound=near, deadline_ms=latency_ms, threads=goal.threads)
         made = [(row, row.make(request)) for row in rows]
         for _, proposer in made:
@@ -180,7 +187,8 @@ def calibrate(
         if not (resume and state.load()):
             state.remove()
         limit = state.progress.setdefault("calls", limit)  # whatever time there is to go on
-        clock = Clock(60 * max_minutes, float(state.progress.get("seconds", 0.0)), begun)
+        before = float(state.progress.get("seconds", 0.0)) + begun.elapsed()
+        clock = Clock(60 * max_minutes, before, elsewhere)
         with Bar(progress) as bar:
             opened: dict[str, Any] = {"clock": clock, "bar": bar, "pool": pool, "device": there}
             if chooses:
@@ -221,6 +229,16 @@ def calibrate(
             told=told,
             frontier=() if frontier is None else tuple(one.record() for one in frontier.tried),
         )
+        if result.stopped == "time limit":
+            bar.warn(
+                f"the search was cut short after {result.intervals} intervals, since {max_minutes:g} minutes were over:"
+                " with more, plans may be nearer to the original."
+            )
+        if result.doubtful:
+            bar.warn(
+                f"plan {kept.default!r} is {result.plans[kept.default].distance:.2f} of what other noise changes from"
+                f" the original; above {BOUND:g} scores may fall. Allow more time or computed cells, or record more."
+            )
         _write(Path(path), artifact, result, kept, anew)
         state.remove()
         return result
@@ -258,11 +276,23 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
             f"{short} of {len(trials.episodes)} episodes have fewer than {window} calls, and are left out where"
             f" {window} consecutive ones are learned from."
         )
+    heeds(trials)
     rows_recorded = sum(trials.episodes[n].calls for n in trials.split.calibration)
     if corrects and (count := REPEATS * rows_recorded) < fewest:
         bar.warn(
             f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm where"
             " nothing was recorded. Record more episodes."
+        )
+
+
+def heeds(trials: Trials) -> None:
+    """Warn where the original's answers depend on the noise about as much as on the observation."""
+    noise, observed = other_noise(trials), other_observations(trials)
+    if not noise < UNHEARD * observed:
+        trials.bar.warn(
+            f"the original hardly heeds what was recorded: with other noise its actions change by {noise:.4g}, and with"
+            f" another observation by {observed:.4g}. Look at the units of the recordings, and at the order of their"
+            " columns."
         )
 
 
@@ -287,6 +317,7 @@ def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept
         pruner_loop=loop,
         weights=kept.weights,
         starts=kept.starts,
+        envelope=kept.trials.envelope if anew or artifact.envelope is None else None,
         model_identity=artifact.manifest.model_identity,
         golden=record_plans,
         held=True,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy.typing as npt
 
+from ..artifact.ceiling import BOUND
 from ..errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -25,10 +26,6 @@ if TYPE_CHECKING:
     from .judge import Score
     from .trials import Trials
 
-
-NEAR = 0.25
-"""Distance from the original up to which a plan may become the default: docs/evidence/results.md, 'What a distance
-means', has what plans below and above it lost."""
 
 SURE = 2.0
 """The upper limit of the distance, with 95 % confidence over episodes, may be so many times as far. Of a plan of
@@ -96,7 +93,7 @@ class Request:
     rank: int = 16
     updates: int = 600
     margin: float | None = None
-    bound: float = NEAR
+    bound: float = BOUND
     deadline_ms: float | None = None
     threads: int = 1
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..core.envelope import Envelope
 from ..core.spec import FloatArray
+from .calls import IntArray
 
 RIDGE = 1e-4
 """Times the mean square of a feature, for each call. That of a component of the condition is 1."""
@@ -52,6 +55,25 @@ class Components:
         """Those of other calls, ``[n, F]``, from their condition ``[n, N]``."""
         reading = torch.from_numpy(self.reading).double()
         return condition[:, : len(reading)].double() @ reading - torch.from_numpy(self.center).double()
+
+
+def envelope_of(condition: Tensor, episodes: IntArray, most: int) -> Envelope | None:
+    """What was recorded, of the conditions of some calls; None where they say nothing.
+
+    Components are those of every other episode, and the furthest call is that of any: with few calls, others are far
+    from the components of these, and nobody could say how far is too far.
+
+    Args:
+        condition: ``[n, N]``.
+        episodes: of each call, ``[n]``.
+        most: components at most.
+    """
+    _, which = np.unique(episodes, return_inverse=True)
+    own = Components.of(condition[torch.from_numpy(which % 2 == 0)], most)
+    furthest = float(own.of_others(condition).norm(dim=1).max())
+    if not own.reading.shape[1] or not furthest > 0:
+        return None
+    return Envelope(own.reading / np.float32(furthest), own.center / np.float32(furthest))
 
 
 class Solved(NamedTuple):

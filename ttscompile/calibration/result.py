@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from ..artifact.ceiling import BOUND
+from .budget import ERROR
 from .judge import Score
 
 
@@ -49,6 +51,11 @@ class CalibrationResult:
     skipped: Mapping[str, str] = field(default_factory=dict)
     told: Mapping[str, str] = field(default_factory=dict)
     frontier: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the default plan is so far from the original that scores may fall, and nobody asked for an error."""
+        return ERROR not in self.budget and self.plans[self.default_plan].distance > BOUND
 
     @property
     def sparsity(self) -> float:

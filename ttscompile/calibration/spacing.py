@@ -11,9 +11,10 @@ from math import comb
 
 import numpy as np
 
-CROWDING = (2.0, 3.0, 1.5, 4.0, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
+CROWDING = (3.0, 2.0, 4.0, 1.5, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
 """1 is even, above it the steps crowd towards the end, below it towards the start. In the order in which they are
-tried: late steps mattered most wherever it was measured, and time may end the search."""
+tried, since time may end the search: late steps mattered most wherever it was measured. Of 3 steps among 16 the first
+is 0, 11, 15, with a third less error on Push-T than 0, 8, 14, which 2.0 is."""
 
 FEW = 128
 """Where there are no more placements, a search tries them all: those of three steps among 16 are 105."""

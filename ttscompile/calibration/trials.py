@@ -17,6 +17,8 @@ import torch
 
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
+from ..core.correction import COMPONENTS, numbers_of
+from ..core.envelope import Envelope
 from ..core.lattice import dense_plan
 from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..core.spec import FloatArray, Noise, PolicySpec
@@ -29,6 +31,7 @@ from .calls import FRACTION, Calls, IntArray, Split, calls_at, observed, split_e
 from .clock import Clock
 from .execute import Executor
 from .progress import Bar
+from .regression import envelope_of
 from .state import StateFile
 from .targets import SHARE, dense_rounds, draw_calls, with_targets
 
@@ -157,6 +160,15 @@ class Trials:
     def windows(self) -> Calls:
         """The same in windows of consecutive calls, for what reads what an earlier call computed."""
         return self._to_learn_from(window_of(self.episodes, self.split))
+
+    @property
+    def envelope(self) -> Envelope | None:
+        """Of the observations that were learned from; None where none were, or their condition is not read."""
+        for calls in self._calls.values():
+            condition = self.executor.model.condition(calls.contexts)
+            most = min(COMPONENTS, numbers_of([tuple(condition.shape[1:])]))
+            return envelope_of(condition, calls.episodes, most) if most else None
+        return None
 
     def _to_learn_from(self, window: int) -> Calls:
         if window not in self._calls:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -14,6 +13,7 @@ from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
 from ..pool import Here, Pool, Work
 from .calls import Actions, Calls, IntArray
+from .clock import Clock
 from .execute import Executor
 from .fit_correction import fit_correction
 from .schedule_runs import ScheduleRuns
@@ -105,9 +105,9 @@ class WholeSteps:
     def measured(self, steps: Sequence[int]) -> tuple[Errors, float]:
         """The errors of a schedule, and ``_pace``: what is done for a candidate, wherever that is."""
         reads = self.reads(len(steps))
-        begun = time.monotonic()
+        clock = Clock()
         errors = min((self._error_of(steps, with_) for with_ in (reads, None)), key=lambda found: found.normalised)
-        self._pace = max(self._pace, (time.monotonic() - begun) / len(steps))
+        self._pace = max(self._pace, clock.elapsed() / len(steps))
         return errors, self._pace
 
     def correction(self, steps: Sequence[int]) -> Correction | None:

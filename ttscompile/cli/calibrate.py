@@ -11,6 +11,7 @@ import ttscompile
 from ttscompile.calibration.proposer import NAMES as LEARNED
 from ttscompile.calibration.proposer import PROPOSERS
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
+from ttscompile.cli.ending import Status
 from ttscompile.cli.options import (
     artifact_argument,
     count_option,
@@ -86,7 +87,8 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     type=MINUTES,
     default=15.0,
     show_default=True,
-    help="Take the best plan that is found in so many minutes, about. Also decides how many calls are used.",
+    help="Take the best plan that is found in so many minutes of work, about: where the machine does other things, too,"
+    " it takes up to twice as long. Also decides how many calls are used.",
 )
 @click.option(
     "--device",
@@ -107,10 +109,15 @@ def calibrate(
 
     What learns proposes plans; they are judged on episodes that nothing was learned from, by how far what they answer
     is from what the original answers. Beside the plan that keeps the budget the artifact gets 'safe', which computes
-    twice as much, and 'fast', which computes half. Exit status 1: nothing was kept, or the budget was not.
+    twice as much, and 'fast', which computes half. Exit status 1: nothing was kept, the budget was
+    not, or the default plan is further than a quarter of what other noise changes from the original.
     """
     manifest_of(directory)
     require_recordings(trajectories)
     with only_results_on_stdout():
-        ttscompile.calibrate(directory, trajectories=list(trajectories), observation=sources, **budget_and_search)
+        result = ttscompile.calibrate(
+            directory, trajectories=list(trajectories), observation=sources, **budget_and_search
+        )
     print_written(directory, as_json)
+    if result.doubtful:
+        raise click.exceptions.Exit(Status.FAILED)

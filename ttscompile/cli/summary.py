@@ -44,11 +44,15 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         ("identity", manifest.short_identity),
         ("from", ", ".join(f"{k} {v}" for k, v in summary["source"].items()) or "a module"),
         ("sampler", f"{sampler['name']}, K = {sampler['steps']} steps" + ", draws noise" * sampler["stochastic"]),
-        *((f"observation {k!r}", f"{o['dtype']}{o['shape']} a stream") for k, o in summary["observations"].items()),
+        *(
+            (f"observation {k!r}", f"{o['dtype']}{o['shape']} a stream" + ", from pictures of any size" * o["any_size"])
+            for k, o in summary["observations"].items()
+        ),
         ("action", action),
         ("rollout cache", kept),
         ("precision", _told_precision(summary["precision"], len(summary["blocks"]))),
         *((f"piece {one['piece']}", _told_frames(one, captured)) for one in summary["frames"]),
+        *((("envelope", _told_envelope(summary["envelope"])),) if summary["envelope"] else ()),
         *facts.tokens(manifest),
         *facts.starts(manifest),
     )
@@ -80,6 +84,11 @@ def print_facts(console: Console, made: Table) -> None:
 def _told_frames(piece: dict[str, Any], captured: float) -> str:
     rows = f"{piece['rows']} a call of {flops(piece['flops'])} each"
     return f"computed once a frame, {rows}: {share(piece['rows'] * piece['flops'] / captured)} of the captured policy"
+
+
+def _told_envelope(envelope: dict[str, Any]) -> str:
+    recorded = f"{envelope['components']} components of what was recorded"
+    return f"{recorded}; beyond {envelope['far']:g} times the furthest call there is no correction"
 
 
 def _told_precision(precision: dict[str, Any], blocks: int) -> str:

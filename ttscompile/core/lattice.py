@@ -166,6 +166,23 @@ def dense_plan(steps: int, blocks: int) -> PlanArray:
     return np.full((steps, blocks), Source.COMPUTE.value, dtype=np.int8)
 
 
+def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -> None:
+    """Raise unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0.
+
+    Raises:
+        IllegalPlanError: it is not.
+    """
+    if plan.dtype != np.int8 or plan.ndim != 2:
+        found = f"{plan.dtype}{list(plan.shape)}"
+        raise IllegalPlanError(f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {found}.")
+    try:
+        check_plan(plan, steps, blocks, 1)
+    except IllegalPlanError as error:
+        raise IllegalPlanError(f"schedule {name!r}: {error}") from error
+    if (plan[0] != Source.COMPUTE).any():
+        raise IllegalPlanError(f"schedule {name!r}: expected COMPUTE in all of step 0; found {plan[0].tolist()}.")
+
+
 def whole_steps_plan(steps: int, blocks: int, chosen: Iterable[int]) -> PlanArray:
     """Every block computed at the chosen steps, TIMESTEP elsewhere: int8 ``[K, blocks]``."""
     plan = np.full((steps, blocks), Source.TIMESTEP, dtype=np.int8)

@@ -24,8 +24,9 @@ def artifact_findings(directory: Path) -> list[Finding]:
     try:
         from ..artifact.load import load_artifact
     except ModuleNotFoundError as error:
-        remedy = f"Run: pip install {error.name}."
-        return [Finding(PART, "load", f"not tried: {error.name} is not installed", Level.PROBLEM, remedy)]
+        package = (error.name or "").partition(".")[0]
+        remedy = f"Run: pip install {package}."
+        return [Finding(PART, "load", f"not tried: {package} is not installed", Level.PROBLEM, remedy)]
     try:
         artifact = load_artifact(directory)
     except TtscompileError as error:

@@ -35,6 +35,12 @@ _NO_LOOP = (
 )
 _LLAMA = "There is no denoising loop to compile. llama.cpp runs such files."
 _MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
+_BY_NAME = (
+    (r"\.onnx$", "an ONNX model", "It has no denoising loop. Convert the checkpoint that it was exported from."),
+    (r"\.msgpack$", "a checkpoint of Flax", _JAX),
+    (r"\.(npz|npy|zarr|txt|json|ya?ml|md)$", "no checkpoint", "Give the file or the folder that the training saved."),
+)
+"""Of files that nothing inside tells of: sign in the name, what it is, remedy."""
 _WEIGHTS = (
     "Weights do not say how they are connected. Convert what the training saved, which holds the configuration too; or"
     " build the network, load them into it, and use ttscompile.compile_denoiser(module, spec)."
@@ -173,6 +179,9 @@ def refuse_file(path: Path) -> None:
         raise _refused(path, "an HDF5 file, data or Keras weights", "its first bytes", _WEIGHTS)
     if head.startswith(b"GGUF"):
         raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _LLAMA)
+    for sign, what, remedy in _BY_NAME:
+        if re.search(sign, path.name):
+            raise _refused(path, what, "its name", remedy)
     if not zipfile.is_zipfile(path):
         return
     try:

@@ -23,6 +23,7 @@ from ..core.correction import (
     no_correction,
     numbers_of,
 )
+from ..core.envelope import CENTER, ENVELOPE, PLAIN
 from ..core.spec import PolicySpec
 from ..errors import LoweringError
 from ..ir.graph import Graph
@@ -44,6 +45,9 @@ def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tu
     for name, array in ((ANCHORS, given.anchors), (CORRECTION, given.weights), (CORRECTION_BIAS, given.bias)):
         inputs.append(tensor(name, array.dtype, array.shape))
         main.default(name, array)
+    cells = spec.sampler.steps, len(program.blocks)
+    main.default(PLAIN, np.zeros(cells, np.int8))
+    inputs.append(tensor(PLAIN, np.int8, cells))
     if numbers := condition_numbers(program):
         inputs += _of_condition(main, spec, numbers)
     if may_jump(spec.sample):
@@ -79,6 +83,7 @@ def _of_every_policy(program: Program) -> tuple[Values, Values]:
         tensor("action_pred", np.float32, ["B", horizon, chunk.action_dim]),
         tensor("executed_plan", np.int8, ["B", steps, count]),
         tensor("legalised", np.int64, ["B"]),
+        tensor("outside", np.float32, ["B"]),
         tensor("rollout_rows_next", np.float32, ["R_next", *row]),
         tensor("rollout_index_next", np.int64, ["B", steps, count]),
     ]
@@ -97,9 +102,13 @@ def _of_pruner(main: GraphWriter, head: Graph, weights: Weights) -> Values:
 def _of_condition(main: GraphWriter, spec: PolicySpec, numbers: int) -> Values:
     """Those of a correction that reads N numbers of the condition; they read one that adds nothing by default."""
     (horizon, dimensions), steps = spec.sample, spec.sampler.steps
+    main.default(ENVELOPE, np.zeros((numbers, 1), np.float32))
+    main.default(CENTER, np.zeros(1, np.float32))
     main.default(READING, np.zeros((numbers, 1), np.float32))
     main.default(OBSERVED, np.zeros((1, steps, dimensions, horizon), np.float32))
     return [
+        tensor(ENVELOPE, np.float32, [numbers, "E"]),
+        tensor(CENTER, np.float32, ["E"]),
         tensor(READING, np.float32, [numbers, "F"]),
         tensor(OBSERVED, np.float32, ["F", steps, dimensions, horizon]),
     ]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from onnx import GraphProto, TensorProto
 
+from ..core.envelope import PLAIN
 from ..core.lattice import Source
 from .graph_writer import GraphWriter, tensor
 from .plan import INT64
@@ -27,6 +28,7 @@ class ExecutedPlans:
         legalised: int64 [B]; cells of each stream that are not as they were given, or as the pruner wanted them.
         different: int8 [G, K, N]; those of ``executed``, each once.
         which: int64 [B]; number of each stream's.
+        far: int8 [G]; 1 of those whose streams have no correction. Streams of one plan that differ in this are apart.
         broken: float32 [B, 1, 1] or [1, 1, 1]; NaN for a stream whose pruner gave no numbers, and 0 otherwise.
     """
 
@@ -34,6 +36,7 @@ class ExecutedPlans:
     legalised: str
     different: str
     which: str
+    far: str
     broken: str
 
 
@@ -44,6 +47,7 @@ def write_executed_plans(
     streams: str,
     lattice: tuple[int, int],
     pruner: tuple[str, Callable[[GraphWriter], str]] | None,
+    far: str,
 ) -> ExecutedPlans:
     """Write the nodes.
 
@@ -53,6 +57,7 @@ def write_executed_plans(
         streams: B, int64 [1].
         lattice: K and N.
         pruner: bool [], whether it makes the plans, and what writes its logits [B, K, N, 4]; None without a pruner.
+        far: bool [B]; streams that execute the input ``PLAIN`` instead.
     """
     cells = w.constant(lattice)
     shape = w.op("Concat", streams, cells, axis=0)
@@ -64,6 +69,7 @@ def write_executed_plans(
         branches = _of_pruner(head, logits(head)), _as_given(given, plan, shape)
         wanted, broken = w.ops("If", [used], 2, then_branch=branches[0], else_branch=branches[1])
 
+    wanted = w.op("Where", w.op("Reshape", far, w.constant([-1, 1, 1])), PLAIN, wanted)
     after_first = np.ones((lattice[0], 1), np.int64)
     after_first[0] = Source.COMPUTE.value
     source = w.op("Mul", w.op("Cast", wanted, to=INT64), w.constant(after_first))
@@ -72,12 +78,15 @@ def write_executed_plans(
     executed = w.op("Cast", w.op("Where", missing, w.constant(Source.TIMESTEP.value), source), to=INT8)
     changed = w.op("Cast", w.op("Not", w.op("Equal", executed, wanted)), to=INT64)
     flat = w.op("Reshape", executed, w.constant([-1, lattice[0] * lattice[1]]))
-    once, _, which = w.ops("Unique", [flat], 3, axis=0, sorted=0)
+    flat = w.op("Concat", flat, w.op("Reshape", w.op("Cast", far, to=INT8), w.constant([-1, 1])), axis=1)
+    both, _, which = w.ops("Unique", [flat], 3, axis=0, sorted=0)
+    once, flag = (w.op("Slice", both, *(w.constant([n]) for n in (*ends, 1))) for ends in ((0, -1), (-1, 2**31 - 1)))
     return ExecutedPlans(
         executed=executed,
         legalised=w.op("ReduceSum", changed, w.constant([1, 2]), keepdims=0),
         different=w.op("Reshape", once, w.constant([-1, *lattice])),
         which=which,
+        far=w.op("Reshape", flag, w.constant([-1])),
         broken=broken,
     )
 

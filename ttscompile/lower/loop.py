@@ -73,6 +73,7 @@ class LoopInputs:
         initial: sample at step 0, [B, T, D].
         offset: of the sampler's updates, [K, D, B, T].
         update: matrices of the sampler's updates, [K, G, R, (1 + S) T].
+        plain: the same without a correction, [K, 1, R, (1 + S) T].
         anchors: bool [K]; after these steps sample and prediction enter the history.
         history: before step 0, [D, B, 4 T].
         memory: of the sampler, before step 0: [D, B, S T]; None if it has none.
@@ -85,6 +86,7 @@ class LoopInputs:
     initial: str
     offset: str
     update: str
+    plain: str
     anchors: str
     history: str
     memory: str | None

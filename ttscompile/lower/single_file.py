@@ -24,6 +24,9 @@ K steps and N blocks the inputs are, with the shapes of the policy:
                                             as they were at the time of ``convert``: not calibrated, which is dense
 ======================= =================== ==========================================================================
 
+The observation of a corrected plan is held against what was recorded: inputs ``envelope [N,E]``, ``envelope_center``
+``[E]`` and ``plain_plan`` int8 ``[K,N]``, which takes the place of the plan far outside (``core.envelope``).
+
 A plan that has a correction wants it as further inputs, which ``Correction.inputs`` gives: ``correction``,
 ``correction_bias`` and ``correction_anchors``, if it reads the observation ``correction_reading`` and
 ``correction_observed``, and if it has jumps ``correction_jumps``, ``correction_inner``, ``correction_middle`` and
@@ -37,6 +40,7 @@ The outputs are
 ``executed_plan``       int8 [B,K,N]        the plan with a dense step 0, and with TIMESTEP for every ROLLOUT of what
                                             the cache does not have: ``legalize`` in ONNX
 ``legalised``           int64 [B]           how many cells that has changed
+``outside``             float32 [B]         ``CallReport.outside``; zeros where nothing was recorded
 ``rollout_rows_next``   float32 [R',...]    the next call's ``rollout_rows``
 ``rollout_index_next``  int64 [B,K,N]       the next call's ``rollout_index``
 ======================= =================== ==========================================================================
@@ -63,6 +67,7 @@ from ..core.correction import (
     READING,
     may_jump,
 )
+from ..core.envelope import CENTER, ENVELOPE, FAR
 from ..core.lattice import Source
 from ..core.spec import ORIGINAL, PolicySpec
 from ..core.update import columns, diagonals, rows
@@ -108,12 +113,11 @@ def lower_single_file(
     lattice, pruner = (spec.sampler.steps, len(program.blocks)), None
     if program.pieces.pruner is not None:
         pruner = USE_PRUNER, contexts.logits
-    plans = write_executed_plans(main, "plan", "rollout_index", streams, lattice, pruner)
-    update, offset = _update(main, spec, streams)
-    condition = None
-    if condition_numbers(program):
-        condition = contexts.condition()
-        offset = main.op("Add", offset, _observed(main, spec, condition))
+    condition = contexts.condition() if condition_numbers(program) else None
+    far = _far(main, condition, streams)
+    plans = write_executed_plans(main, "plan", "rollout_index", streams, lattice, pruner, far)
+    update, plain = _update(main, spec)
+    offset = _offset(main, spec, streams, condition, far)
     jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition) if may_jump(spec.sample) else None
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
@@ -124,6 +128,7 @@ def lower_single_file(
         initial="initial_noise",
         offset=offset,
         update=update,
+        plain=plain,
         anchors=ANCHORS,
         history=history,
         memory=memory,
@@ -157,9 +162,37 @@ def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
     return main.op("Add", scaled, main.constant(each.normalizer.offset, np.float32))
 
 
-def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str]:
-    """``ttscompile.core.update`` in ONNX: matrices of all steps, and offsets of all steps."""
+def _far(main: GraphWriter, condition: str | None, streams: str) -> str:
+    """``core.envelope`` in ONNX: bool [B]; writes the output ``outside``."""
+    if condition is None:
+        outside = main.op("Expand", main.constant(0, np.float32), streams)
+    else:
+        away = main.op("Sub", main.op("MatMul", condition, ENVELOPE), CENTER)
+        outside = main.op("ReduceL2", away, main.constant([1]), keepdims=0)
+    far = main.op("Greater", outside, main.constant(FAR, np.float32))
+    main.rename(outside, "outside")
+    return far
+
+
+def _offset(main: GraphWriter, spec: PolicySpec, streams: str, condition: str | None, far: str) -> str:
+    """What all steps add to the sample, ``[K, D, B, T]``; without a correction where a stream is far outside."""
     (horizon, dimensions), sampler = spec.sample, spec.sampler
+    sizes = main.constant([sampler.steps, dimensions]), streams, main.constant([horizon])
+    offset = main.op("Expand", CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
+    if condition is not None:
+        offset = main.op("Add", offset, _observed(main, spec, condition))
+    of_stream = main.op("Reshape", far, main.constant([-1, 1]))
+    offset = main.op("Where", of_stream, main.constant(0, np.float32), offset)
+    if sampler.stochastic:
+        noise = main.op("Transpose", "step_noise", perm=[0, 3, 1, 2])
+        scale = main.constant(sampler.noise_to_next[:, None, None, None], np.float32)
+        offset = main.op("Add", main.op("Mul", noise, scale), offset)
+    return offset
+
+
+def _update(main: GraphWriter, spec: PolicySpec) -> tuple[str, str]:
+    """``ttscompile.core.update`` in ONNX: matrices of all steps, with the correction and without."""
+    horizon, sampler = spec.sample[0], spec.sampler
     high, wide = rows(sampler, horizon), columns(sampler, horizon)
     places = np.zeros((sampler.steps, 1, high // horizon, 1, wide // horizon, 1), np.float32)
     for (read, written), column in diagonals(sampler).items():
@@ -168,14 +201,7 @@ def _update(main: GraphWriter, spec: PolicySpec, streams: str) -> tuple[str, str
     own = main.op("Mul", main.constant(places, np.float32), each)
     own = main.op("Reshape", own, main.constant([sampler.steps, 1, high, wide]))
     pads = [0, 0, 0, 0, 0, 0, high - FEATURES * horizon, wide - horizon]  # the correction's weights are at the top left
-    update = main.op("Add", main.op("Pad", CORRECTION, main.constant(pads)), own)
-    sizes = main.constant([sampler.steps, dimensions]), streams, main.constant([horizon])
-    offset = main.op("Expand", CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
-    if sampler.stochastic:
-        noise = main.op("Transpose", "step_noise", perm=[0, 3, 1, 2])
-        scale = main.constant(sampler.noise_to_next[:, None, None, None], np.float32)
-        offset = main.op("Add", main.op("Mul", noise, scale), offset)
-    return update, offset
+    return main.op("Add", main.op("Pad", CORRECTION, main.constant(pads)), own), own
 
 
 def _observed(main: GraphWriter, spec: PolicySpec, condition: str) -> str:

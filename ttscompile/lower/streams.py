@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from onnx import GraphProto, ModelProto
+from onnx import GraphProto, ModelProto, TensorProto
 
 from ..ir.program import Program
 from .contexts import Contexts, StreamContexts
@@ -79,7 +79,8 @@ def _of_one_plan(
     members = w.op("Reshape", w.op("NonZero", w.op("Equal", plans.which, i)), w.constant([-1]))
     plan = lower_plan(w, w.op("Gather", plans.different, i), groups, steps, GROUP)
     loop = DenoisingLoop(w, program, models, weights, StreamContexts(w, contexts, members))
-    sample, residuals = loop.write(plan, _of_members(w, inputs, members))
+    far = w.op("Cast", w.op("Gather", plans.far, i), to=TensorProto.BOOL)
+    sample, residuals = loop.write(plan, _of_members(w, _uncorrected(w, inputs, far), members))
     every = w.op("ScatterND", samples, w.op("Unsqueeze", members, w.constant([1])), sample)
 
     computed, kept = (w.op("Reshape", flags, w.constant([-1])) for flags in (plan.computed, keep))
@@ -107,6 +108,14 @@ def _of_one_plan(
             sequence(cells, np.int64),
         ],
     )
+
+
+def _uncorrected(w: GraphWriter, inputs: LoopInputs, far: str) -> LoopInputs:
+    """Without the matrices and jumps of a correction where streams are far outside; offsets are without already."""
+    jumps = inputs.jumps
+    if jumps is not None:
+        jumps = replace(jumps, which=w.op("Where", far, w.constant(-1), jumps.which))
+    return replace(inputs, update=w.op("Where", far, inputs.plain, inputs.update), jumps=jumps)
 
 
 def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..artifact.ceiling import few_steps
+from ..artifact.ceiling import BOUND, few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
@@ -238,7 +238,7 @@ def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
 
 def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What the figures of a calibration mean, in words."""
-    return (*chosen(record), *other_noise(record), *learned(record), *left_out(record))
+    return (*(chosen(record) or verdict(record)), *other_noise(record), *learned(record), *left_out(record))
 
 
 def chosen(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -250,6 +250,16 @@ def chosen(record: Mapping[str, Any]) -> tuple[str, ...]:
     told = f"{row['told']}: {row['distance']:.2g} of what other noise changes, {max(row['interval']):.2g} at worst"
     times = f"{ms(row['milliseconds'])} ms a call on the machine that built it, {ms(row['worst'])} at worst"
     return (f"Chosen among {len(record['frontier'])} plans: {told}; {times}. Evaluate it before a robot moves.",)
+
+
+def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Whether the default plan is near enough to the original, as far as a calibration can say."""
+    name = record.get("default_plan")
+    score = scores(record).get(str(name), {})
+    if not isinstance(distance := score.get("distance"), int | float):
+        return ()
+    where = "within" if distance <= BOUND else "above"
+    return (f"Plan {name!r} is {distance:.2f} from the original, {where} a quarter of what other noise changes.",)
 
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:

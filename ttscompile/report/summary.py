@@ -8,6 +8,7 @@ from typing import Any
 from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
 from ..artifact.view import view_of
+from ..core.envelope import FAR
 from ..ir.flops import graph_flops
 from ..ir.pieces import frame_name
 from ..runtimes.liveness import rollout_needs
@@ -29,7 +30,10 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "sampler": {name: getattr(spec.sampler, name) for name in ("name", "steps", "stochastic", "clip")},
         "sample": list(spec.sample),
         "left_out": spec.left_out,
-        "observations": {k: {"shape": list(o.shape), "dtype": o.dtype} for k, o in spec.observations.items()},
+        "observations": {
+            key: {"shape": list(one.shape), "dtype": one.dtype, "any_size": one.fit is not None}
+            for key, one in spec.observations.items()
+        },
         "chunk": {"action_dim": spec.chunk.action_dim, "start": spec.chunk.start, "stop": spec.chunk.stop},
         "blocks": [
             {"index": i, "kind": b.kind, "type": str(b.type), "group": b.group, "flops": b.flops, "reason": b.reason}
@@ -53,6 +57,7 @@ def document(artifact: Artifact) -> dict[str, Any]:
         "uses": [asdict(use) for use in uses(artifact)],
         "rollout_cache": asdict(rollout_needs(view_of(artifact))),
         "default_plan": manifest.default_plan,
+        "envelope": None if artifact.envelope is None else {"components": len(artifact.envelope.center), "far": FAR},
         "calibration": None if manifest.calibration is None else dict(manifest.calibration),
     }
 

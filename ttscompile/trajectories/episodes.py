@@ -139,7 +139,7 @@ def _npz(path: Path) -> tuple[Frames, bool]:
     arrays = read_npz(path)
     frames = _meta(path, arrays.pop(META, None))
     if ENDS not in arrays:
-        told = f"{path}: has no array {ENDS!r}; it has {few(sorted(arrays))}"
+        told = f"{path}: has no array {ENDS!r}; it has {few(sorted(arrays)) or 'no arrays at all'}"
         raise TrajectoryError(f"{told}. Add {ENDS} [E]: {_ENDS_ARE}.")
     ends = arrays.pop(ENDS)
     return Frames(sorted(arrays), arrays.__getitem__, ends), frames
@@ -157,7 +157,12 @@ def read_npz(path: Path) -> dict[str, Array]:
             f"{path}: expected an .npz, a zarr replay buffer of Diffusion Policy, an HDF5 file of robomimic or a"
             " LeRobot data set; found a directory that is none of these."
         )
-    hint = f": no such file, truncated, or with Python objects in it, which are never loaded. Record it again. {_SAVEZ}"
+    hint = f": truncated, or with Python objects in it, which are never loaded. Record it again. {_SAVEZ}"
+    with path.open("rb") as handle:
+        head = handle.read(6)
+    if not head.startswith((b"PK", b"\x93NUMPY")):
+        found = f"one that begins with {head!r}" if head else "an empty one"
+        raise TrajectoryError(f"{path}: expected an .npz, a zip archive of arrays; found {found}. {_SAVEZ}.")
     # numpy parses headers as Python text, and raises whatever its parts raise; it leaves open what is no archive.
     with one_error(f"{path}: cannot be read as .npz", hint), path.open("rb") as handle:
         if zipfile.is_zipfile(handle):

@@ -83,7 +83,8 @@ def check_plans_precision(
             wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
         elif not errors[name] <= tolerance:
             wrong[name] = f"the samples of {name!r} by {errors[name]:.2g}"
-    told = f"{', '.join(errors)}: two calls with {precision.told} against what calibration stored of fp32"
+    each = ", ".join(f"{name} {error:.2g}" for name, error in errors.items())
+    told = f"samples, normalised, differ by {each}: two calls with {precision.told} against those in fp32"
     status, remedy = PASSED, ""
     if wrong:
         told = f"with {precision.told} plans are not what calibration stored of fp32: "

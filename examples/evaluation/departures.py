@@ -1,0 +1,174 @@
+"""How far from the original are plans where an observation is unlike all that was recorded?
+
+    python examples/evaluation/departures.py DIR --trajectories calls.npz
+
+Every departure changes recorded observations, and the plans of an artifact answer what comes of them. Each is compared
+with the plan that computes every cell, with the same noise, in units of what other noise changes in what was recorded.
+Beside a plan stands what it would be if nobody looked how far outside a call is, and even steps without a correction.
+Images and instructions stay as they are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import numpy.typing as npt
+from rich.table import Table
+from variants import full_plan, json_option, results_console, run
+
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.core.envelope import FAR, plain_cells
+from ttscompile.core.plan import Plan
+from ttscompile.core.spec import FloatArray, Noise, ObservationSpec
+from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.trajectories import load_trajectories
+
+BATCH = 32
+"""Calls that are computed together."""
+
+Observation = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Of one plan under one departure, in units of other noise.
+
+    Attributes:
+        departure: what was changed.
+        plan: name of the plan.
+        outside: share of the calls that are so far outside that they have no correction.
+        distance: mean over the calls.
+        unbounded: the same if nobody looked how far outside a call is.
+        even: of as many steps, evenly spaced, without a correction.
+    """
+
+    departure: str
+    plan: str
+    outside: float
+    distance: float
+    unbounded: float
+    even: float
+
+
+def departures(values: FloatArray, rng: np.random.Generator) -> Iterator[tuple[str, FloatArray]]:
+    """Changed observations ``[n, ..., Do]`` by what was done to them."""
+    axes = tuple(range(values.ndim - 1))
+    low, high = values.min(axes), values.max(axes)
+    middle, width = (low + high) / 2, high - low
+    yield "as recorded", values
+    yield "noise of 1 % of the range", values + 0.01 * width * rng.standard_normal(values.shape)
+    for times in (1.2, 3, 4, 6, 10, 30):
+        yield f"{times:g} times the range", middle + times * (values - middle)
+    for number in range(0, values.shape[-1], max(1, values.shape[-1] // 3)):
+        changed = values.copy()
+        changed[..., number] = 2 * middle[number] - changed[..., number]
+        yield f"number {number} mirrored", changed
+    for name, constant in (("lowest", low), ("highest", high), ("zeros", 0 * low)):
+        yield f"constant: {name}", np.broadcast_to(constant, values.shape)
+    yield "random in the range", rng.uniform(low, high, values.shape)
+    yield "columns reversed", values[..., ::-1]
+    yield "times 100", 100 * values
+
+
+class Calls:
+    """The same calls of several plans.
+
+    Args:
+        artifact: whose plans they are.
+        count: of calls.
+        seed: of their noise.
+    """
+
+    def __init__(self, artifact: Artifact, count: int, seed: int) -> None:
+        self._spec = artifact.manifest.spec
+        rng, shape = np.random.default_rng(seed), (count, *self._spec.sample)
+        self._initial = rng.standard_normal(shape, dtype=np.float32)
+        self._seed = seed
+
+    def answers(self, runtime: Runtime, plan: Plan, observation: Observation) -> tuple[FloatArray, list[float]]:
+        """Executed actions, normalised, ``[n, A]``, and how far outside each call is."""
+        made, outside = [], list[float]()
+        for start in range(0, len(self._initial), BATCH):
+            part, rng = slice(start, start + BATCH), np.random.default_rng((self._seed, start))
+            initial = self._initial[part]
+            sampler = runtime.view(plan).manifest.spec.sampler
+            steps = rng.standard_normal((sampler.steps, *initial.shape), dtype=np.float32)
+            noise = Noise(initial, steps if sampler.stochastic else None)
+            runtime.reset()
+            given = {key: self._spec.observations[key].normalized(value[part]) for key, value in observation.items()}
+            sample, report = runtime.predict(given, noise, plan)
+            chunk = self._spec.chunk
+            made.append(sample[:, chunk.start : chunk.stop, : chunk.action_dim].reshape(len(initial), -1))
+            outside += report.outside
+        return np.concatenate(made), outside
+
+
+def apart(one: FloatArray, other: FloatArray) -> float:
+    """Root mean square difference, mean over the calls."""
+    return float(np.sqrt(np.square(one - other, dtype=np.float64).mean(1)).mean())
+
+
+def measured(artifact: Artifact, names: Sequence[str], recorded: Observation, count: int) -> Iterator[Distances]:
+    """Distances of plans from the one that computes everything."""
+    full = artifact.plan(full_plan(artifact.path))
+    runtime, unbounded = (open_runtime(one, plan=full) for one in (artifact, replace(artifact, envelope=None)))
+    calls, rng = Calls(artifact, count, 0), np.random.default_rng(0)
+    other = apart(*(one.answers(runtime, full, recorded)[0] for one in (calls, Calls(artifact, count, 1))))
+    blocks = len(artifact.manifest.groups)
+    changing = {
+        key: departures(recorded[key], rng) for key in recorded if vector(artifact.manifest.spec.observations[key])
+    }
+    for changed in zip(*changing.values(), strict=False):
+        observation = recorded | {
+            key: np.ascontiguousarray(value, np.float32) for key, (_, value) in zip(changing, changed, strict=True)
+        }
+        exact, _ = calls.answers(runtime, full, observation)
+        for name in names:
+            plan = artifact.plan(name)
+            assert plan.correction is not None
+            even = replace(plan, cells=plain_cells(plan.correction, blocks), correction=None)
+            own, outside = calls.answers(runtime, plan, observation)
+            others = (calls.answers(unbounded, one, observation)[0] for one in (plan, even))
+            far = float(np.mean(np.array(outside) > FAR)) if outside else 0.0
+            yield Distances(changed[0][0], name, far, *(apart(each, exact) / other for each in (own, *others)))
+
+
+def vector(spec: ObservationSpec) -> bool:
+    """Whether it is a vector of floats, which can stray."""
+    return np.dtype(spec.dtype).kind == "f" and not spec.image
+
+
+@click.command()
+@click.argument("directory", type=click.Path(path_type=Path))
+@click.option("-t", "--trajectories", multiple=True, required=True, type=click.Path(path_type=Path))
+@click.option("--plan", "names", multiple=True, help="Plans; without it all that have a correction.")
+@click.option("--calls", default=64, show_default=True, help="Recorded calls.")
+@json_option
+def main(directory: Path, trajectories: tuple[Path, ...], names: tuple[str, ...], calls: int, as_json: bool) -> None:
+    """Compare plans of the artifact DIRECTORY with the original where nothing was recorded."""
+    artifact = load_artifact(directory)
+    spec = artifact.manifest.spec
+    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start)
+    every = {key: np.concatenate([one.observations[key] for one in episodes]) for key in spec.observations}
+    chosen = np.random.default_rng(0).permutation(len(next(iter(every.values()))))[:calls]
+    recorded = {key: value[chosen] for key, value in every.items()}
+    corrected = [name for name, plan in artifact.plans.items() if plan.correction is not None]
+    found = list(measured(artifact, names or corrected, recorded, len(chosen)))
+    if as_json:
+        print(json.dumps([asdict(one) for one in found]))
+        return
+    table = Table("departure", "plan", "without correction", "distance", "if nobody looked", "even steps", box=None)
+    for one in found:
+        figures = (f"{each:.2f}" for each in (one.distance, one.unbounded, one.even))
+        table.add_row(one.departure, one.plan, f"{one.outside:.0%}", *figures)
+    results_console().print(table)
+
+
+if __name__ == "__main__":
+    run(main)
