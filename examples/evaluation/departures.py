@@ -71,7 +71,7 @@ def departures(values: FloatArray, rng: np.random.Generator) -> Iterator[tuple[s
         yield f"number {number} mirrored", changed
     for name, constant in (("lowest", low), ("highest", high), ("zeros", 0 * low)):
         yield f"constant: {name}", np.broadcast_to(constant, values.shape)
-    yield "random in the range", rng.uniform(low, high, values.shape)
+    yield "random in the range", rng.uniform(low, high, values.shape).astype(np.float32)
     yield "columns reversed", values[..., ::-1]
     yield "times 100", 100 * values
 

@@ -18,7 +18,7 @@ def test_far_outside_a_plan_is_what_even_steps_are(tmp_path: Path) -> None:
     artifact = written_artifact(toy_program(), tmp_path / "artifact")
     numbers, cells = artifact.manifest.condition_numbers, (artifact.manifest.steps, len(artifact.manifest.groups))
     correction, rng = random_correction(artifact, np.random.default_rng(0)), np.random.default_rng(1)
-    envelope = Envelope(np.eye(numbers, dtype=np.float32) / 4, np.zeros(numbers, np.float32))
+    envelope = Envelope((np.eye(numbers) / 4).astype(np.float32), np.zeros(numbers, np.float32))
     corrections, plan = {"fast": correction}, {"fast": uniform_plan(*cells, 2)}
     store_schedules(artifact.path, None, plan, "fast", {}, corrections=corrections, envelope=envelope)
     np.savez(tmp_path / "calls.npz", obs=rng.standard_normal((40, 2)).astype(np.float32), episode_ends=[20, 40])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec
@@ -14,13 +15,13 @@ from ttscompile.trajectories.ranges import check_ranges
 
 from ..calibration import policies
 
-RANGES = np.array([[0, 512], [0, 512], [-3, 3], [0.2, 0.4]], np.float32)
+RANGES: npt.NDArray[np.float32] = np.array([[0, 512], [0, 512], [-3, 3], [0.2, 0.4]], np.float32)
 """Of four numbers in the training data: two of a position, an angle and a width."""
 
 
 def policy(ranged: bool = True) -> PolicySpec:
     like, width = policies.spec(), RANGES[:, 1] - RANGES[:, 0]
-    normalizer = Affine(2 / width, -(RANGES[:, 1] + RANGES[:, 0]) / width)
+    normalizer = Affine((2 / width).astype(np.float32), -(RANGES[:, 1] + RANGES[:, 0]) / width)
     chunk = ChunkSpec(2, 1, 5, None, ranged=ranged)
     return PolicySpec((8, 2), {"obs": ObservationSpec((2, 4), normalizer)}, like.sampler, chunk)
 

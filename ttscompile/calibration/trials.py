@@ -77,7 +77,7 @@ class Sample:
     @property
     def draws(self) -> int:
         """R."""
-        return self.answers.shape[1]
+        return int(self.answers.shape[1])
 
     @property
     def episodes(self) -> IntArray:
@@ -124,6 +124,7 @@ class Trials:
     draws: int = DRAWS
     until: float = SHARE
     _calls: dict[int, Calls] = field(default_factory=dict)
+    _loops: dict[str, tuple[Plan, Executor, dict[int, Calls]]] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
 
     @classmethod
@@ -145,11 +146,13 @@ class Trials:
 
     def of_loop(self, loop: str) -> Trials:
         """The same episodes, noise and answers of the original; to learn from are calls of a loop."""
-        if loop == self.base.loop:
-            return self
-        manifest = self.artifact.manifest
-        base = replace(self.base, loop=loop, cells=dense_plan(manifest.steps_of(loop), len(manifest.blocks)))
-        return replace(self, base=base, executor=Executor(view_of(self.artifact, base.exact), self.device), _calls={})
+        self._loops.setdefault(self.base.loop, (self.base, self.executor, self._calls))
+        if loop not in self._loops:
+            manifest = self.artifact.manifest
+            base = replace(self.base, loop=loop, cells=dense_plan(manifest.steps_of(loop), len(manifest.blocks)))
+            self._loops[loop] = base, Executor(view_of(self.artifact, base.exact), self.device), {}
+        base, executor, calls = self._loops[loop]
+        return replace(self, base=base, executor=executor, _calls=calls)
 
     @property
     def calls(self) -> Calls:
