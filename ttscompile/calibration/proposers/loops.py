@@ -131,10 +131,9 @@ class Loops:
             if quick is not None and quick.error > HOPELESS * self._bound * apart and count != counts[-1]:
                 continue
             yield (*self._searched(own, task, loop, count), count)
-            if further or (self._near and self._deadline is None):
-                if further:
-                    break
-                further = True
+            if further:
+                break
+            further = self._near and self._deadline is None  # with a deadline as many as keep it
 
     def _searched(self, own: Trials, task: Task, loop: str, count: int) -> tuple[str, Plan, Mapping[str, object]]:
         """The best schedule of so many steps that there is time for."""
