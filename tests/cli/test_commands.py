@@ -61,7 +61,7 @@ def test_help_has_a_whole_line_for_each_command_in_the_order_of_use(
     listed = [line.split(maxsplit=1) for line in told.partition("Commands:\n")[2].partition("\n\n")[0].splitlines()]
     assert {name for name, _ in listed} == set(main.commands)
     assert all(what.endswith((".", "?")) and not what.endswith("...") for _, what in listed), "cut off"
-    assert [name for name, _ in listed][:4] == ["doctor", "convert", "calibrate", "inspect"]
+    assert [name for name, _ in listed][:4] == ["doctor", "build", "convert", "calibrate"]
 
 
 def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None:

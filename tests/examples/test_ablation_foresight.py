@@ -76,7 +76,11 @@ def test_what_cannot_be_measured_is_refused(compiled: Path, recording: Path) -> 
 
 def test_two_episodes_are_too_few(compiled: Path, tmp_path: Path) -> None:
     few = tmp_path / "few.npz"
-    np.savez(few, obs=np.zeros((4, 2, 3), np.float32) + np.arange(4)[:, None, None], episode_ends=np.array([2, 4]))
+    np.savez(
+        few,
+        obs=np.zeros((4, 2, 3), np.float32) + np.float32(0.1) * np.arange(4)[:, None, None].astype(np.float32),
+        episode_ends=np.array([2, 4]),
+    )
     with pytest.raises(CalibrationError, match="hold 2 episodes; expected three at least"):
         oracle(compiled, [few], 3)
 
