@@ -98,7 +98,7 @@ class Pusher(nn.Module):
         return made
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_both_commands(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = PolicySpec((8, 2), {"obs": ObservationSpec((2, 20))}, flow_matching_table(4), ChunkSpec(2, 1, 8))
     source = once.folder("pusher", lambda folder: ttscompile.compile_denoiser(Pusher().eval(), spec, folder / "it"))

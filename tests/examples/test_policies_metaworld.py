@@ -26,7 +26,7 @@ def windows() -> np.ndarray:
     return obs
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_checkpoint_compiles_and_dense_is_the_eager_policy(tmp_path: Path) -> None:
     ttscompile.convert(CHECKPOINT, tmp_path / "compiled")
     eager = EagerPolicy(CHECKPOINT, threads=1)

@@ -20,7 +20,7 @@ def told(directory: Path) -> list[str]:
     return [note.split(",")[0] for note in said["ReuseTokens"]]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_of_paligemma(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What pi0 and pi05 see with is one module."""
     monkeypatch.setattr(pis, "SIZES", ((112, 112), pis.SIZES[1]))

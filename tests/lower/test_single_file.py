@@ -251,7 +251,7 @@ def test_two_gigabytes_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.soak] * (n == "U-Net")) for n in MODULES])
 def test_the_compiler_writes_it(name: str, compiled_module: Callable[[str], tuple[nn.Module, Path]]) -> None:
     """Of modules that nobody prepared."""
     _, folder = compiled_module(name)
