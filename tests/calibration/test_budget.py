@@ -160,7 +160,7 @@ def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recordi
 @pytest.mark.slow
 def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _timed(monkeypatch, 1.0)
-    with killed(saves=2):  # of the latency, and of some targets
+    with killed(saves=5):  # of the original's answers, of the latency, and of some targets
         quick(artifact, recording, latency_ms=3.9)
     monkeypatch.setattr(schedule, "measure_budget", lambda *_: pytest.fail("measured again"))
     result = quick(artifact, recording, latency_ms=3.9, resume=True)

@@ -221,7 +221,7 @@ def executed(samples: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 def test_of_single_calls_nothing_begins_with_the_chunk_before(flowing: Path, tmp_path: Path) -> None:
     path = tmp_path / "short.npz"
-    np.savez(path, obs=np.arange(18, dtype=np.float32).reshape(3, 2, 3), episode_ends=[1, 2, 3])
+    np.savez(path, obs=np.linspace(-0.1, 0.1, 18, dtype=np.float32).reshape(3, 2, 3), episode_ends=[1, 2, 3])
     trials = trials_of(flowing, path, tmp_path)
     proposal = warm(trials, 3)
     with pytest.raises(CalibrationError, match="is judged on episodes of two calls at least"):

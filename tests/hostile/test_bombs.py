@@ -70,6 +70,7 @@ for _key in (b"\x12", b"\x0a", b"\x12", b"\x5a", b"\x3a"):  # shape, tensor type
 MODELS["sizes of an input"] = _DIMENSIONS
 
 
+@pytest.mark.slow  # measured for coverage it would take several times as long
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_of_millions_of_fields(written: Path, name: str) -> None:
     (written / "stem.onnx").write_bytes(MODELS[name])

@@ -385,7 +385,7 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     rollout = dict.fromkeys(np.flatnonzero(lowered.rollout).tolist(), entry)
     read, _ = advance.of_condition(network.condition())
     assert advance.jumps
-    made = denoise(network, lowered, np.ones((5, 5), np.bool_), advance, initial, offset, rollout, read)
+    made = denoise(network, lowered, range(25), advance, initial, offset, rollout, read)
     results = [made.sample, network.logits(), network.condition(), *made.residuals.values()]
     assert len(results) == 3 + np.count_nonzero(plan == Source.COMPUTE)
     assert {each.device.type for each in results} == {"meta"}
