@@ -31,6 +31,7 @@ from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
+from ttscompile.calibration.trials import SHARE
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
@@ -132,11 +133,13 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
     state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)
     clock.now = 51.0
     with Bar(shown=False) as bar:
-        few = with_targets(executor, "calibration", calls, 3, state, clock, bar)
+        few = with_targets(executor, "calibration", calls, 3, state, clock.until(SHARE), bar)
         assert few.count == min(max(4, 2 * torch.get_num_threads()), 16)  # whole rounds, a worker's part is two calls
         clock.now = 0.0
-        again = with_targets(executor, "calibration", calls, 3, state, clock, bar)  # as after an interruption
-        whole = with_targets(executor, "calibration", calls, 3, fresh, clock, bar)
+        again = with_targets(
+            executor, "calibration", calls, 3, state, clock.until(SHARE), bar
+        )  # as after an interruption
+        whole = with_targets(executor, "calibration", calls, 3, fresh, clock.until(SHARE), bar)
     assert (again.count, whole.count) == (few.count, calls.count)
     assert few.path is not None
     assert whole.path is not None

@@ -111,7 +111,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     tried = tuple(
         Tried(
             name=named.get(name, name),
-            told=told_plan(entered[name]),
+            told=entered[name].in_words(),
             distance=scores[name].distance,
             interval=scores[name].interval,
             milliseconds=times[name].median,
@@ -140,20 +140,3 @@ def _chosen(close: Sequence[str], scores: Mapping[str, Score], times: Mapping[st
             f"{'s' * (request.threads > 1)}. Allow more threads, a larger error, or a slower loop."
         )
     return min(in_time, key=lambda name: scores[name].distance)
-
-
-def told_plan(plan: Plan) -> str:
-    """What a plan does, in words: "3 of 16 steps of dpmsolver++-16, int8 in blocks and condition"."""
-    cells = plan.cells
-    if cells is None:
-        told = [f"the pruner's steps of {plan.loop}"]
-    else:
-        computed = int((cells == 0).any(axis=-1).sum())
-        told = [f"{computed} of {len(cells)} steps of {plan.loop}"]
-    by_precision: dict[str, list[str]] = {}
-    for part, one in plan.precision.items():
-        by_precision.setdefault(one, []).append(part)
-    told += [f"{one} in {' and '.join(sorted(parts))}" for one, parts in by_precision.items()]
-    told += ["trained weights"] * (plan.weights != "original") + ["some image tokens"] * (plan.tokens is not None)
-    told += ["begins with the chunk before"] * (plan.otherwise is not None)
-    return ", ".join(told)

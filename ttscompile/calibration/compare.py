@@ -81,7 +81,7 @@ def compare(
         sparsities: shares of the cells to reuse.
         observation: see ``ttscompile.calibrate``.
         others: artifacts of the same policy, for instance with other samplers; their plans take part.
-        calls: held-out calls, at most.
+        calls: held-out calls, at most; half as many where the artifact has further loops (``trials.MANY_DRAWS``).
         learned: calls that strategies learn from, at most.
         seed: the seed of the split, the calls, the noise and the searches.
         intervals: of a search, at most; None for the strategy's own number.

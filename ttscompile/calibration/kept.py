@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..artifact.block_weights import BlockWeights
 from ..artifact.manifest import StartRecord
-from ..core.plan import DENSE, FULL, ORIGINAL, Plan
+from ..core.plan import DENSE, FULL, Plan
 from .held import holding
 from .judge import Score, further, judge
 from .proposer import Proposal
@@ -74,7 +74,7 @@ class Kept:
             self._share(proposal)
         if not proposal.beside:
             self.default, self.learned = proposal.name, True
-        if self.plan.loop in (ORIGINAL, *trials.artifact.manifest.spec.loops):
+        if self.plan.loop in trials.artifact.manifest.spec.all_loops:
             trials = trials.of_loop(self.plan.loop)  # so that who trains weights learns from its calls
         self.trials = replace(trials, name=self.default)
         return True

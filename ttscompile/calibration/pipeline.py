@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, Strategy, strategy_of
 from .targets import REPEATS
-from .trials import MANY_DRAWS, OBSERVATIONS, Trials, base_of
+from .trials import Trials, base_of
 
 UNHEARD = 0.9
 """Of what another observation changes, above which other noise changes suspiciously much. On Push-T it is a tenth, and
@@ -190,10 +189,7 @@ def calibrate(
         before = float(state.progress.get("seconds", 0.0)) + begun.elapsed()
         clock = Clock(60 * max_minutes, before, elsewhere)
         with Bar(progress) as bar:
-            opened: dict[str, Any] = {"clock": clock, "bar": bar, "pool": pool, "device": there}
-            if chooses:
-                opened |= {"observations": OBSERVATIONS // 2, "draws": MANY_DRAWS}
-            opened["limits"] = fewest, limit
+            opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": (fewest, limit)}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             _warn(trials, rows, chosen, corrects)
             kept, told = Kept(trials, anew), dict[str, str]()

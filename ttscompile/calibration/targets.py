@@ -22,9 +22,6 @@ from .state import StateFile
 REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
 
-SHARE = 0.5
-"""Share of the time limit after which no more targets are made than there have to be."""
-
 TARGETS_AT_ONCE = 16
 """Dense calls that go through the loop together, on one core; after a round of these the state is saved."""
 
@@ -39,7 +36,7 @@ def with_targets(
     bar: Bar,
     pool: Pool | None = None,
 ) -> Calls:
-    """The calls with what the dense policy answers to them; the first of them where the time does not do for all.
+    """The calls with what the dense policy answers to them; the first of them where the clock's time ends before.
 
     ``least`` of them are needed whatever the time; ``name`` is what they are called in the state.
     """
@@ -53,7 +50,7 @@ def with_targets(
     rounds, key = dense_rounds(executor, calls, len(path), pool), f"{name} targets"
     # A calibration that was interrupted later goes on with as many as it had then.
     count = min(calls.count, int(state.progress.get(key, calls.count)))
-    while len(path) < count and (len(path) < least or clock.elapsed() < SHARE * clock.limit):
+    while len(path) < count and (len(path) < least or clock.left() > 0):
         path = torch.cat([path, next(rounds)])
         state.put("targets", {**state.get("targets"), name: path.numpy()})
         state.progress["seconds"] = clock.elapsed()
@@ -89,7 +86,11 @@ def where(executor: Executor) -> tuple[str, str, str]:
 
 
 def executor_elsewhere(path: str, identity: str, loop: str) -> Executor:
-    """The same executor in another process, which may be on another machine."""
+    """The same executor in another process, which may be on another machine.
+
+    Raises:
+        CalibrationError: there is another artifact, or none.
+    """
     return Executor(view_of(artifact_elsewhere(path, identity), Plan(loop)))
 
 

@@ -33,14 +33,15 @@ from .execute import Executor
 from .progress import Bar
 from .regression import envelope_of
 from .state import StateFile
-from .targets import SHARE, dense_rounds, draw_calls, with_targets
+from .targets import dense_rounds, draw_calls, with_targets
 
-DRAWS = 4
-"""Of noise for each observation."""
+SHARE = 0.5
+"""Share of the time limit after which no more calls to learn from are answered than there have to be."""
 
-MANY_DRAWS = 16
-"""The same where plans of other samplers are judged, whose noise cannot be paired. Where two plans answer alike the
-error of an energy distance falls as the number of draws, and only as the root of that of observations."""
+DRAWS, MANY_DRAWS = 4, 16
+"""Of noise for each observation; the second where the artifact has further loops, with half as many observations. Noise
+cannot be paired between samplers. Where two plans answer alike the error of an energy distance falls as the number of
+draws, and only as the root of that of observations."""
 
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
@@ -139,6 +140,8 @@ class Trials:
         **others: Any,
     ) -> Trials:
         """Divide the episodes, and open the policy; ``others`` are further fields."""
+        if artifact.manifest.spec.loops:
+            others |= {"observations": max(others.get("observations", OBSERVATIONS) // 2, 1), "draws": MANY_DRAWS}
         base = base_of(artifact)
         executor = Executor(view_of(artifact, base.exact), others.get("device"))
         split = split_episodes(len(episodes), fraction, seed)
@@ -179,7 +182,7 @@ class Trials:
             calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
             loop = self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
-            clock = self.clock.until(self.until / SHARE)
+            clock = self.clock.until(self.until)
             self._calls[window] = with_targets(
                 self.executor, name, calls, fewest, self.state, clock, self.bar, self.pool
             )

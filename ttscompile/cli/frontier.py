@@ -11,6 +11,7 @@ from ttscompile.cli.output import print_identity, say, table
 from ttscompile.core.plan import DENSE
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms
+from ttscompile.report.facts import chosen
 
 
 def print_frontier(artifact: Artifact, directory: Path, output: Console, threads: int) -> None:
@@ -32,15 +33,12 @@ def print_frontier(artifact: Artifact, directory: Path, output: Console, threads
         )
     made.columns[1].justify = "left"
     output.print(made)
-    chosen = next(row for row in rows if row["name"] == default)
     say(
         output,
         "Times faster: than the same policy with every step computed, compiled too. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
         f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
-        f"Chosen: {chosen['told']}: {chosen['distance']:.2g} of other noise ({chosen['interval'][1]:.2g} at worst),"
-        f" {ms(chosen['milliseconds'])} ms a call, {ms(chosen['worst'])} at worst. It has not driven anything yet:"
-        " evaluate it on your task before a robot moves.",
+        *chosen(record),
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
         "    policy.reset()  # a new episode",

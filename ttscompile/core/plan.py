@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 from ..errors import IllegalPlanError
 from .correction import Correction
-from .lattice import PlanArray
+from .lattice import PlanArray, Source
 from .rules import NotNegative, Positive
 from .spec import ORIGINAL as ORIGINAL
 
@@ -92,6 +92,20 @@ class Plan:
     def variant(self) -> Variant:
         """What has to be opened for it."""
         return Variant(self.loop, self.weights, tuple(sorted(self.precision.items())), self.tokens)
+
+    def in_words(self) -> str:
+        """What it does: ``3 of 16 steps of dpmsolver++-16, int8 in blocks and condition``."""
+        if self.cells is None:
+            told = [f"the steps of {self.loop} that the pruner chooses"]
+        else:
+            steps = (self.cells == Source.COMPUTE).any(axis=-1).sum(axis=-1).max()
+            told = [f"{steps} of {self.cells.shape[-2]} steps of {self.loop}"]
+        for one in sorted(set(self.precision.values())):
+            told.append(f"{one} in {' and '.join(part for part, own in self.precision.items() if own == one)}")
+        told += [f"weights {self.weights!r}"] * (self.weights != ORIGINAL)
+        told += ["some tokens of each new frame"] * (self.tokens is not None)
+        told += ["from the chunk of the call before"] * (self.otherwise is not None)
+        return ", ".join(told)
 
     @property
     def exact(self) -> Plan:

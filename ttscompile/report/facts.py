@@ -12,7 +12,7 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
 from ..core.lattice import dense_plan
-from ..core.plan import DENSE, ORIGINAL
+from ..core.plan import DENSE
 from ..core.spec import SamplerTable
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
@@ -89,21 +89,6 @@ def tokens(manifest: Manifest) -> list[tuple[str, str]]:
     ]
     told = "; ".join(reusing) or "every plan computes all of them"
     return [(f"tokens of {name}", f"{one.tokens} a frame; {told}") for name, one in manifest.tokens.items()]
-
-
-def told_plan(manifest: Manifest, name: str) -> str:
-    """What a plan computes, in words: its loop, its precision, its weights, its tokens, what it begins with."""
-    plan, steps = plans_of(manifest)[name], manifest.steps_of(plans_of(manifest)[name].loop)
-    told = [f"{steps} steps of loop {plan.loop!r}"]
-    if plan.precision:
-        parts: dict[str, list[str]] = {}
-        for part, one in plan.precision.items():
-            parts.setdefault(one, []).append(part)
-        told += [f"{one} in {' and '.join(those)}" for one, those in parts.items()]
-    told += [f"weights {plan.weights!r}"] * (plan.weights != ORIGINAL)
-    told += ["some tokens of each new frame"] * (plan.tokens is not None)
-    told += [f"begins with the chunk of the call before, else {plan.otherwise!r}"] * (plan.otherwise is not None)
-    return "; ".join(told)
 
 
 def precision(manifest: Manifest) -> str:
@@ -206,7 +191,7 @@ def plan_table(artifact: Artifact) -> Table:
     rows = []
     for name, own in plans_of(manifest).items():
         told = f"{name} (default)" if name == manifest.default_plan else marked(name)
-        saved = (told_plan(manifest, name), own.kind, share(own.sparsity), share(own.flops_sparsity))
+        saved = (artifact.plans[name].in_words(), own.kind, share(own.sparsity), share(own.flops_sparsity))
         cost = plan_flops(artifact, name)
         costs = ("", "") if cost is None else (flops(cost), share(cost / manifest.flops.dense))
         rows.append((told, *saved, *costs))

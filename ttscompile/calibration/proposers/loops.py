@@ -8,7 +8,7 @@ cheapest call takes longer than the best plan so far.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -68,24 +68,22 @@ class Loops:
         self._request, self._bound = request, request.bound
         self.told = ""
         self._left_out: list[str] = []
-        self._nearest: tuple[str, Score] | None = None
-        self._near = False
+        self._scores: dict[str, Score] = {}
+        self._best: Proposal | None = None
+        self._fastest = float("inf")  # ms of the best one, by ``Cost``
 
     def applies(self, artifact: Artifact) -> str | None:
         """See ``Proposer``."""
-        if max(artifact.manifest.steps_of(loop) for loop in _loops(artifact)) > 1:
+        if max(loop.steps for loop in artifact.manifest.spec.all_loops.values()) > 1:
             return None
         return "no loop of the policy has a second step: nothing can be reused"
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``."""
-        artifact, fastest = trials.artifact, float("inf")
-        best: Proposal | None = None
-        costs = {loop: self._cost(trials, loop, clock) for loop in _loops(artifact)}
+        costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
         order = sorted(costs, key=lambda loop: costs[loop].one)
         for number, loop in enumerate(order):
-            cost = costs[loop]
-            if (reason := self._too_slow(cost, fastest)) is not None:
+            if (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
             if number and clock.left() <= 0:
@@ -97,32 +95,23 @@ class Loops:
             if loop != ORIGINAL and (reason := self._too_far(_full(own, loop), own)) is not None:
                 self._left_out.append(f"{loop} {reason} with every step computed")
                 continue
-            self._near = False
             ends = clock.until(min(1.0, (clock.elapsed() + share) / clock.limit))
-            for name, one, notes, count in self._of_loop(own, loop, ends, cost, fastest):
-                found: list[Score] = []
-                proposal = Proposal(name, one, notes, beside=True, refusal=self._refusal(name, found))
-                yield proposal
-                self._near = near(found[0], self._bound)
-                if self._near and cost.of(count) < fastest:
-                    best, fastest = replace(proposal, beside=False, margin=float("inf")), cost.of(count)
-        if best is None:
+            yield from self._of_loop(own, loop, ends, costs[loop])
+        if self._best is None:
             raise CalibrationFailedError(self._none())
-        yield best
+        yield self._best
         left = f"; left out: {', '.join(self._left_out)}" if self._left_out else ""
-        self.told = f"{best.name} is the fastest that is near enough{left}"
+        self.told = f"{self._best.name} is the fastest that is near enough{left}"
 
-    def _of_loop(
-        self, own: Trials, loop: str, clock: Clock, cost: Cost, fastest: float
-    ) -> Iterator[tuple[str, Plan, Mapping[str, object], int]]:
+    def _of_loop(self, own: Trials, loop: str, clock: Clock, cost: Cost) -> Proposals:
         """Plans of more and more computed steps of a loop, until one is near enough, and one more."""
-        model, further = own.executor.model, False
+        fastest, further = self._fastest, False  # of the loops before
         task = replace(Task.of(own.executor, own.calls, 0, own.seed, own.pool), clock=clock)
         crowded = SpacedSchedules(task.whole, own.state, clock, own.bar, f"crowded, {loop}")
+        counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
         apart = other_noise(own)
-        counts = [n for n in COUNTS if n <= max(1, model.steps // 2)]
         for number, count in enumerate(counts):
-            if number and (clock.left() <= 0 or self._too_slow(replace(cost, one=cost.of(count)), fastest)):
+            if number and (clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
                 break
             quick = crowded.best(count, f"{loop}, {count} steps", TRIED)
             if quick is None and number:
@@ -130,17 +119,21 @@ class Loops:
                 break
             if quick is not None and quick.error > HOPELESS * self._bound * apart and count != counts[-1]:
                 continue
-            yield (*self._searched(own, task, loop, count), count)
+            proposal = self._searched(own, task, loop, count)
+            yield proposal
+            close = near(self._scores[proposal.name], self._bound)
+            if close and cost.of(count) < self._fastest:
+                self._best, self._fastest = replace(proposal, beside=False, margin=float("inf")), cost.of(count)
             if further:
                 break
-            further = self._near and self._deadline is None  # with a deadline as many as keep it
+            further = close and self._deadline is None  # with a deadline as many as keep it
 
-    def _searched(self, own: Trials, task: Task, loop: str, count: int) -> tuple[str, Plan, Mapping[str, object]]:
+    def _searched(self, own: Trials, task: Task, loop: str, count: int) -> Proposal:
         """The best schedule of so many steps that there is time for."""
         search = open_search("tts", replace(task, budget=count * own.executor.model.blocks))
         found: Found = searched(own, search, task.clock, None, f"search, {loop}, {count} steps")[0]
-        made = Plan(loop, found.schedule, found.correction, repair=True)
-        return f"{loop.replace('+', '')}.{count}", made, found.notes
+        name, made = f"{loop.replace('+', '')}.{count}", Plan(loop, found.schedule, found.correction, repair=True)
+        return Proposal(name, made, found.notes, beside=True, refusal=partial(self._refusal, name))
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
         """Trials of a loop, that has so many seconds."""
@@ -155,13 +148,12 @@ class Loops:
     def _deadline(self) -> float | None:
         return self._request.deadline_ms
 
-    def _too_slow(self, cost: Cost, fastest: float) -> str | None:
-        """Why calls that take at least so long cannot be what is looked for."""
+    def _too_slow(self, least: float, fastest: float) -> str | None:
+        """Why calls that take at least so many milliseconds cannot be what is looked for."""
         if self._deadline is not None:
-            most = self._deadline
-            return f"takes {cost.one:.3g} ms and {most:.3g} are allowed" if cost.one > most else None
-        slower = cost.one > CLEARLY * fastest
-        return f"takes {cost.one:.3g} ms at least, and the best {fastest:.3g}" if slower else None
+            slow = least > self._deadline
+            return f"takes {least:.3g} ms and {self._deadline:.3g} are allowed" if slow else None
+        return f"takes {least:.3g} ms at least, and the best {fastest:.3g}" if least > CLEARLY * fastest else None
 
     def _too_far(self, plan: Plan, own: Trials) -> str | None:
         """Why no plan of a loop can be near enough."""
@@ -170,26 +162,20 @@ class Loops:
             return None
         return f"is {score.distance:.3g} from the original"
 
-    def _refusal(self, name: str, found: list[Score]) -> Callable[[Score, Mapping[str, Score]], str | None]:
-        """Says why a plan is too far from the original for all purposes; keeps its score."""
-
-        def refusal(score: Score, _: Mapping[str, Score]) -> str | None:
-            found.append(score)
-            if self._nearest is None or score.interval[1] < self._nearest[1].interval[1]:
-                self._nearest = name, score
-            if score.distance <= self._bound:
-                return None
-            return f"is {score.distance:.3g} from the original; {self._bound:g} is allowed"
-
-        return refusal
+    def _refusal(self, name: str, score: Score, _: Mapping[str, Score]) -> str | None:
+        """Why a plan is too far from the original for all purposes."""
+        self._scores[name] = score
+        if score.distance <= self._bound:
+            return None
+        return f"is {score.distance:.3g} from the original; {self._bound:g} is allowed"
 
     def _none(self) -> str:
         """Why there is nothing to propose."""
-        if self._nearest is None:
+        if not self._scores:
             left = "; ".join(self._left_out) or "the time ended the search"
             return f"no plan could be tried: {left}. Allow more time."
-        name, score = self._nearest
-        return too_far(name, score, self._bound)
+        nearest = min(self._scores, key=lambda name: self._scores[name].interval[1])
+        return too_far(nearest, self._scores[nearest], self._bound)
 
     def _cost(self, trials: Trials, loop: str, clock: Clock) -> Cost:
         """What calls of a loop take on this machine, in the faster precision; measured once."""
@@ -230,11 +216,6 @@ def _call(runtime: Runtime, obs: Observation, noise: Noise, plan: Plan) -> None:
     """A call that computes all of its frames."""
     runtime.reset()
     runtime.predict(obs, noise, plan)
-
-
-def _loops(artifact: Artifact) -> tuple[str, ...]:
-    """That begin with noise."""
-    return (ORIGINAL, *artifact.manifest.spec.loops)
 
 
 def _full(own: Trials, loop: str) -> Plan:
