@@ -50,6 +50,10 @@ class MaskedUpdates:
 
     One copy serves prefixes of every length: from call to call columns are put back, or made zeros.
 
+    Args:
+        updates: float32 ``[K, G, R, (1 + S) T]``, as they are without a prefix; G is 1 or D.
+        chunk: of the policy.
+
     Attributes:
         updates: the same for the prefix of the moment.
     """

@@ -17,7 +17,15 @@ TASK = "task"
 
 
 class Instruct:
-    """Puts the tokens of a task into an observation."""
+    """Puts the tokens of a task into an observation.
+
+    Args:
+        spec: of the policy.
+        path: of ``tokenizer.json``, or of the folder that has it.
+
+    Raises:
+        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
+    """
 
     def __init__(self, spec: PolicySpec, path: str | os.PathLike[str]) -> None:
         if spec.instruction is None:

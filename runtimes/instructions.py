@@ -75,6 +75,10 @@ class Instructions:
 def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
     """What executes the plan of one stream.
 
+    Args:
+        plan: int8 ``[K, blocks]``.
+        groups: FORWARD group of each block.
+
     Raises:
         IllegalPlanError: it reads a residual that was never computed; ROLLOUT reads are taken to be written.
     """

@@ -18,6 +18,10 @@ Lowered = TypeVar("Lowered")
 def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tuple[int, ...]]:
     """The plan of every stream without illegal reads.
 
+    Args:
+        plan: ``[K, blocks]`` or ``[B, K, blocks]``.
+        written: bool ``[B, K, blocks]``; rollout entries that exist.
+
     Returns:
         A legal plan, int8 ``[B, K, blocks]``, and the number of replaced cells of each stream.
 
@@ -44,7 +48,12 @@ def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
 
 
 class LoweringCache(Generic[Lowered]):
-    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change."""
+    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change.
+
+    Args:
+        lower: what a backend makes of a plan ``[K, blocks]``.
+        capacity: plans to keep.
+    """
 
     def __init__(self, lower: Callable[[PlanArray], Lowered], capacity: int = 64) -> None:
         self._lower, self._capacity = lower, capacity

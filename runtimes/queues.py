@@ -38,6 +38,9 @@ class Queues:
         A call that fails after this, and is made again, must not push its frame twice: ``keep`` what it used when it
         succeeded.
 
+        Args:
+            frame: by key ``[B, ...]``, from ``read_observation``: of a window's key one frame.
+
         Raises:
             ObservationError: an array does not fit.
         """

@@ -83,6 +83,10 @@ class TokenTower:
     def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
         """What the tower gives for a new frame, and for how many tokens it was computed.
 
+        Args:
+            lane: of the frame. What is kept of it is gone if this fails.
+            row: ``[1, ...]``, by the input of the frame piece.
+
         Raises:
             ArtifactError: the manifest cuts the picture into other patches than there are tokens.
         """

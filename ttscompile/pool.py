@@ -171,7 +171,11 @@ def opened_pool(address: str | None) -> Iterator[Pool]:
 
 
 def artifact_elsewhere(path: str, identity: str) -> Artifact:
-    """The artifact in another process, which may be on another machine."""
+    """The artifact in another process, which may be on another machine.
+
+    Raises:
+        CalibrationError: there is another one, or none.
+    """
     try:
         artifact = load_artifact(Path(path))
     except TtscompileError as error:

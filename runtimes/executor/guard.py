@@ -78,7 +78,15 @@ class Guard:
         return None
 
     def refuse_motion(self, played: FloatArray, scheduled: FloatArray) -> str | None:
-        """Why ``scheduled [M, Da]`` must not follow what was ``played [N, Da]``, of which three count; or None."""
+        """Why a schedule must not follow what was played.
+
+        Args:
+            played: the last actions that were given out, ``[N, Da]``, oldest first; at most three count.
+            scheduled: ``[M, Da]``, what would follow.
+
+        Returns:
+            The reason, or None.
+        """
         if self._max_step is None and self._max_jerk is None:
             return None
         for name, limit, order in (("step", self._max_step, 1), ("jerk", self._max_jerk, 3)):

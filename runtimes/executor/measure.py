@@ -107,7 +107,13 @@ class Jitter:
 
 
 def measure_jitter(hz: float, seconds: float, work: Callable[[], object] = lambda: None) -> Jitter:
-    """Run a loop in real time, sleeping between ticks, and measure how late it wakes."""
+    """Run a loop in real time, sleeping between ticks, and measure how late it wakes.
+
+    Args:
+        hz: rate of the loop.
+        seconds: how long it runs.
+        work: called in every tick.
+    """
     ticks = max(int(seconds * hz), 1)
     late, took = np.empty(ticks), np.empty(ticks)
     start = time.perf_counter()

@@ -16,7 +16,12 @@ from .workspace import Workspace
 
 
 def decode_first(work: Workspace, keep: BoolArray) -> None:
-    """Step 0, which is dense in every plan, so that it need not wait for one; ``keep`` is of the rollout cache."""
+    """Step 0, which is dense in every plan, so that it need not wait for one.
+
+    Args:
+        work: observation and noise taken in.
+        keep: bool ``[K, blocks]``; computed residuals that go into the rollout cache.
+    """
     work.begin()
     _run_dense(work, 0, keep)
 

@@ -26,6 +26,13 @@ WORTH = 3
 class IdleSteps:
     """Arrays for B streams.
 
+    Args:
+        session: of the piece ``idle``.
+        sampler: of the policy.
+        sample: ``(T, D)``.
+        streams: B.
+        stream: shape of the residual stream of all streams.
+
     Attributes:
         total: what the steps add to the stream, of its shape; read by ``prepare``.
         history: of the correction, ``[D, B, 4 T]``, as it is after the last step that was run.

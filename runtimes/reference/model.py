@@ -133,7 +133,14 @@ class ReferenceModel:
         return {} if pruner is None else {n: self.weights[n] for n in pruner.constants if n.startswith("pruner.")}
 
     def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
-        """Everything that the observation decides before the loop starts."""
+        """Everything that the observation decides before the loop starts.
+
+        Args:
+            obs: normalised observations by key, ``[B, ...]`` each.
+
+        Returns:
+            Tensors of the device.
+        """
         graph = self._pieces.condition
         there = {key: value.to(self.device) for key, value in obs.items()}
         there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
@@ -226,7 +233,11 @@ class ReferenceModel:
         """The denoising loop, whatever the blocks do: what is carried after each step.
 
         Args:
+            contexts: from ``prologue``.
+            initial: the sample at step 0, ``[B, T, D]``.
             noise: the draw used at each step, ``[K, B, T, D]``; None if the sampler is deterministic.
+            blocks: asked once a step, in order.
+            correction: of the sampler's steps; None for none.
             known: what a prefix makes known of the samples; None for nothing.
             since: a step to begin with, and what is carried to it; None for the whole loop.
         """

@@ -48,7 +48,16 @@ class TorchSampler:
         correction: Correction | None = None,
         condition: Tensor | None = None,
     ) -> Carried:
-        """What is carried to step k + 1 (``SamplerTable`` has the formula); a correction reads ``condition [B, N]``."""
+        """What is carried to step k + 1 (``core.spec.SamplerTable`` has the formula).
+
+        Args:
+            carried: to step k.
+            prediction: the network's output at step k, ``[B, T, D]``.
+            noise: the draw used at step k, ``[B, T, D]``; None if the sampler is deterministic.
+            k: step.
+            correction: of the sampler's steps; None for none.
+            condition: what the correction reads of the observation, ``[B, N]``; None if it reads nothing.
+        """
         table, (sample, memory, history) = self._table, carried
         row = {name: float(getattr(table, name)[k]) for name in table.COLUMNS}
         clean = row["sample_to_x0"] * sample + row["out_to_x0"] * prediction
@@ -87,7 +96,13 @@ def features(carried: Carried, prediction: Tensor) -> Tensor:
 
 
 def jump(layers: Sequence[Tensor], read: Tensor, history: Tensor) -> Tensor:
-    """What a jump adds to the sample, ``[D, B, T]``: see ``core.correction``."""
+    """What a jump adds to the sample, ``[D, B, T]``: see ``core.correction``.
+
+    Args:
+        layers: inner, middle and outer, each with the row that is added last.
+        read: of the condition, ``[B, F]``.
+        history: after the jump's anchor, ``[B, 4 T, D]``.
+    """
     streams, width, dimensions = history.shape
     added = through(layers, torch.cat([read, history.transpose(1, 2).reshape(streams, -1)], 1))
     return added.reshape(streams, dimensions, width // HISTORY).transpose(0, 1)
@@ -106,8 +121,12 @@ def correct(
     """What is carried to step k + 1 with the correction of step k.
 
     Args:
+        carried: to step k.
+        prediction: the network's output at step k, ``[B, T, D]``.
+        following: what is carried to step k + 1 without a correction.
         weights: of the correction at step k, ``[G, 6 T, T]``.
         bias: of the correction at step k, ``[D, 1, T]``, or ``[D, B, T]`` with what it reads of the observation.
+        anchor: whether step k enters the history.
     """
     added = (features(carried, prediction) @ weights + bias).permute(1, 2, 0)
     history = carried.history

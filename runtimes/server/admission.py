@@ -48,7 +48,12 @@ class Connection:
 
 
 class Admission:
-    """Counts and limits; used by the server's event loop alone."""
+    """Counts and limits; used by the server's event loop alone.
+
+    Args:
+        limits: what clients may do.
+        clock: seconds that never go back.
+    """
 
     def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits
@@ -183,7 +188,9 @@ class AdmittedSocket(socket.socket):
 class Pace:
     """How long a client's next request has to wait, so that it has no more than its share of a second.
 
-    After a quiet second as many may come at once.
+    Args:
+        per_second: requests; as many may come at once after a quiet second.
+        now: seconds of any clock.
     """
 
     def __init__(self, per_second: float, now: float) -> None:

@@ -58,8 +58,18 @@ class TorchBackends:
 class TorchBackend:
     """A ``Backend`` on torch.
 
+    Args:
+        view: of an artifact; its blocks have their products in fp32, bf16 or fp16.
+        placed: constants of the artifact, where to compute.
+        threads: see ``TorchBackends``.
+        capture: see ``TorchBackends``.
+
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
+        workspace: of the batch size under way.
+
+    Raises:
+        RuntimeUnavailableError: the device does not have the precision.
     """
 
     def __init__(self, view: View, placed: Placed, threads: int = 1, capture: Capture | None = None) -> None:

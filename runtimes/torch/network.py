@@ -61,6 +61,11 @@ class Parts:
 class StreamsNetwork:
     """The pieces for B streams, and the contexts that they read, which stay where they are.
 
+    Args:
+        parts: of the artifact.
+        obs: what the prologue reads: observations by key, ``[B, ...]`` each.
+        streams: B.
+
     Attributes:
         idle: see ``loop.Network``.
         values: contexts by name; those that differ from step to step ``[K, ...]``.

@@ -20,7 +20,21 @@ Tensors = Mapping[str, Tensor]
 
 
 class PlainNetwork:
-    """``loop.Network`` of one call; the prologue is computed when it is made."""
+    """``loop.Network`` of one call; the prologue is computed when it is made.
+
+    Args:
+        pieces: of the artifact.
+        evaluators: of all pieces, from ``evaluators_of``.
+        weights: value of every constant.
+        first: the same at step 0.
+        tables: ``[K, ...]`` by name.
+        obs: normalised, by key.
+        streams: B.
+        idle: see ``loop.Network``.
+
+    Attributes:
+        stream_type: of the residual stream.
+    """
 
     def __init__(
         self,

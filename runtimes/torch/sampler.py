@@ -89,14 +89,24 @@ class Advance:
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     def of_condition(self, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``."""
+        """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``.
+
+        Args:
+            condition: ``[B, N]``.
+        """
         assert self.reading is not None and self.observed is not None
         read = condition @ self.reading
         added = (read @ self.observed).reshape(len(condition), self.steps, -1, self.horizon)
         return read, added.permute(1, 2, 0, 3)
 
     def jump(self, layers: Sequence[Tensor], read: Tensor | None, history: Tensor) -> Tensor:
-        """What a jump adds, ``[D, B, T]``, of ``read [B, F]``, if there is any, and ``history [D, B, 4 T]``."""
+        """What a jump adds, ``[D, B, T]``.
+
+        Args:
+            layers: its own of ``layers``.
+            read: of the condition, ``[B, F]``; None if nothing is.
+            history: after its anchor, ``[D, B, 4 T]``.
+        """
         dimensions, streams, _ = history.shape
         value = history.permute(1, 0, 2).reshape(streams, -1)
         value = value if read is None else torch.cat([read, value], 1)

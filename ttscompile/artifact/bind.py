@@ -69,7 +69,13 @@ def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: b
     """The bytes of a model whose empty initializers have their values.
 
     Args:
+        model: from ``lower``; initializers that are constants of the program hold no data.
+        places: by name of the constant.
+        piece: name of the model, for messages.
         again: the model is bound already; the constants in ``places`` get new values.
+
+    Raises:
+        ArtifactError: an empty initializer that is no constant of the program, or is one of another type.
     """
     from onnx import ModelProto
 
@@ -97,7 +103,17 @@ def interface(model: ModelProto) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def store_pieces(
     folder: Path, lowered: LoweredPieces, pieces: Mapping[str, PieceRecord], places: Mapping[str, Place]
 ) -> PrecisionRecord:
-    """Write pieces beside those in fp32, with which the reference computes, into the folder of a new artifact."""
+    """Write pieces beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
+
+    Args:
+        folder: of the artifact.
+        lowered: what to write.
+        pieces: of the artifact.
+        places: of the program's constants, which these models read too.
+
+    Raises:
+        ArtifactError: a model that does not fit its piece, or a constant that has the name of another.
+    """
     where = f"precision {lowered.name!r}"
     if taken := sorted(set(lowered.weights) & set(places)):
         raise ArtifactError(f"{where}: expected constants of new names; found {taken[0]!r}. {REPORT}")

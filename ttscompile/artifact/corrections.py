@@ -59,7 +59,16 @@ def read_envelope(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, wh
 
 
 def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:
-    """The corrections among some arrays, by the name of the plan; arrays of other names are left alone."""
+    """The corrections among some arrays, by the name of the plan.
+
+    Args:
+        stored: arrays; those of other names are left alone.
+        manifest: of the artifact.
+        where: for messages.
+
+    Raises:
+        ArtifactError: a correction of no plan, with too few or too many fields, or that does not fit the policy.
+    """
     parts = {name.removeprefix(PREFIX): array for name, array in stored.items() if name.startswith(PREFIX)}
     wanted = dict[str, tuple[str, ...]]()
     for name in sorted({name.rpartition("/")[0] for name in parts}):

@@ -39,7 +39,11 @@ _AGAIN = "Copy the artifact again, or convert the checkpoint again."
 
 @contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """A file to read from. Anything else is refused unread: a pipe or a device may never end."""
+    """A file to read from. Anything else is refused unread: a pipe or a device may never end.
+
+    Raises:
+        ArtifactError: missing, something else than a file, or it cannot be read, now or within the block.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else a pipe waits for somebody who writes into it
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -54,7 +58,11 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """The content of a file of at most so many bytes; of a larger one these, and one that is too many."""
+    """The content of a file of at most so many bytes; of a larger one no more is read, and the last byte is too many.
+
+    Raises:
+        ArtifactError: see ``opened``.
+    """
     with opened(path) as file:
         return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)  # Python allocates what is asked for
 

@@ -217,7 +217,11 @@ def _wanted_of(
 
 
 def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:
-    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none."""
+    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none.
+
+    Raises:
+        ArtifactError: records that do not fit.
+    """
     manifest = artifact.manifest
     if manifest.stores.golden_plans is None:
         return {}

@@ -160,7 +160,11 @@ class Artifact:
 
     @cached_property
     def graphs(self) -> Mapping[str, Graph]:
-        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``."""
+        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``.
+
+        Raises:
+            ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
+        """
         graphs, own = {}, {of_loop(PRUNER, loop): one for loop, one in self.loop_pruners.items()}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)
@@ -230,7 +234,11 @@ def require_artifact_path(path: Path) -> None:
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Read ``manifest.json`` of a directory, and nothing else."""
+    """Read ``manifest.json`` of a directory, and nothing else.
+
+    Raises:
+        ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
+    """
     path = directory / MANIFEST
     require_artifact_path(directory)
     if not os.path.lexists(path):

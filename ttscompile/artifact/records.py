@@ -42,7 +42,11 @@ PRUNER_PREFIX = "pruner."
 
 
 def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.NDArray[Any]]:
-    """Values of the constants of these graphs, by name."""
+    """Values of the constants of these graphs, by name.
+
+    Raises:
+        ArtifactError: a constant without a value, or with a value of another type.
+    """
     found: dict[str, npt.NDArray[Any]] = {}
     for piece, graph in graphs.items():
         for name, kind in graph.constants.items():
@@ -55,7 +59,11 @@ def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.ND
 
 
 def block_records(program: Program) -> tuple[BlockRecord, ...]:
-    """The block table; FLOPs are those of the pieces, which is what is left after hoisting."""
+    """The block table; FLOPs are those of the pieces, which is what is left after hoisting.
+
+    Raises:
+        ArtifactError: table and pieces differ in number.
+    """
     graphs = [piece.graph for piece in program.pieces.blocks]
     if len(graphs) != len(program.blocks):
         raise ArtifactError(f"the program has {len(program.blocks)} blocks and {len(graphs)} block graphs. {REPORT}")
@@ -98,7 +106,11 @@ def tokens_records(program: Program) -> dict[str, TokensRecord]:
 
 
 def context_records(program: Program) -> dict[str, ContextRecord]:
-    """Binding and type of every context, in order of first use."""
+    """Binding and type of every context, in order of first use.
+
+    Raises:
+        ArtifactError: a context without binding, value or table, or of two types.
+    """
     pieces = program.pieces
     readers = {name: piece.contexts for name, piece in pieces.loop.items()}
     computed = {Binding.TABLE: set(pieces.tables), Binding.CONDITION: set(pieces.condition.outputs)}
@@ -133,8 +145,13 @@ def piece_records(
     """One record an ONNX model.
 
     Args:
+        program: in its pieces.
         models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
             ``dense_step``, and perhaps ``idle`` and ``layers``.
+        files: file name of each model.
+
+    Raises:
+        ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
     optional = {names.IDLE, *(names.of_loop(names.ADVANCE, loop) for loop in program.spec.loops)}
     expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}

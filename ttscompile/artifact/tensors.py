@@ -131,6 +131,9 @@ def read(path: Path) -> Mapping[str, Array]:
 
     Returns:
         Read-only arrays, views of the file: nothing is read before it is used.
+
+    Raises:
+        ArtifactError: see ``read_header``.
     """
     with opened(path) as file:
         entries = _header(file, path)
@@ -161,12 +164,20 @@ def check_arrays(
 
 
 def serialize(arrays: Mapping[str, Array]) -> bytes:
-    """The bytes of a safetensors file, the same whatever the order of the arrays."""
+    """The bytes of a safetensors file, the same whatever the order of the arrays.
+
+    Raises:
+        ArtifactError: an array of a dtype that the format or the reader lacks.
+    """
     return b"".join(_chunks(arrays))
 
 
 def write(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write a new safetensors file, one array after the other: all of them together may be half of the memory."""
+    """Write a new safetensors file, one array after the other: all of them together may be half of the memory.
+
+    Raises:
+        ArtifactError: see ``serialize``.
+    """
     write_synced(path, _chunks(arrays))
 
 

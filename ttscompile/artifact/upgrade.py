@@ -20,8 +20,15 @@ def upgraded(document: Mapping[str, Any], where: str) -> dict[str, Any]:
     artifact's precision, and reused tokens in one way; and beside them stood how many steps a warm start takes, and
     what the precision does to actions.
 
+    Args:
+        document: the manifest of schema 10, without its checksum, which was right.
+        where: for messages.
+
     Returns:
         A manifest of schema 11, whose identities are those of before, and not those of what it describes.
+
+    Raises:
+        ArtifactError: it is no manifest of schema 10.
     """
     try:
         return _upgraded(document)

@@ -88,7 +88,11 @@ def goal_of(
     *,
     usual: float = TYPICAL_SPARSITY,
 ) -> Goal:
-    """The one thing that was asked for; the sparsity ``usual`` if nothing was."""
+    """The one thing that was asked for; the sparsity ``usual`` if nothing was.
+
+    Raises:
+        CalibrationError: more than one, or a value that nothing can have.
+    """
     asked = {SPARSITY: target_sparsity, FLOPS: target_flops, LATENCY: latency_ms, ERROR: max_action_error}
     given = {kind: value for kind, value in asked.items() if value is not None}
     if len(given) > 1:
@@ -108,7 +112,16 @@ def goal_of(
 
 
 def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
-    """Computed cells of a goal that can be worked out: ``target_sparsity`` or ``target_flops``."""
+    """Computed cells of a goal that can be worked out: ``target_sparsity`` or ``target_flops``.
+
+    Args:
+        goal: one of the two.
+        manifest: the manifest of the artifact.
+        pruned: whether the pruner may run.
+
+    Raises:
+        CalibrationError: no plan, or only the dense one, is what was asked for.
+    """
     steps, blocks, flops = manifest.steps, len(manifest.blocks), manifest.flops
     step = sum(flops.blocks)
     fixed = flops.call(dense_plan(steps, blocks), pruned) - steps * step  # a call without its blocks
@@ -142,6 +155,9 @@ def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> 
     Bisection over the number of steps; each candidate is the median of some calls on one stream. Where the pruner may
     run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``; ``base`` is a plan of the
     loop, in the precision that calls will have.
+
+    Raises:
+        CalibrationError: not even a call of one computed step fits, or a dense one does.
     """
     assert goal.kind == LATENCY
     manifest = view_of(artifact, base).manifest

@@ -238,7 +238,16 @@ class Actions:
         return part.reshape(*part.shape[:-2], self.size)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:
-        """Mean absolute difference of the executed actions of each call, ``[..., N]``; at most ``LARGEST``."""
+        """Mean absolute difference of the executed actions of each call; at most ``LARGEST``, also where they are NaN.
+
+        Args:
+            samples: ``[..., N, T, D]``.
+            targets: ``[N, T, D]``.
+            units: in the units of the actions, rather than normalised.
+
+        Returns:
+            ``[..., N]``.
+        """
         difference = (self.executed(samples) - self.executed(targets)).abs()
         if units:
             difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)

@@ -220,6 +220,10 @@ class State:
 def rollout_reads(column: PlanArray, window: int) -> tuple[IntArray, IntArray]:
     """Which calls read ROLLOUT in a cell, and from which call each: from the last before it that computed the cell.
 
+    Args:
+        column: ``[N]``, the cell of each call's plan; or ``[1]`` for all calls, of which none then reads another.
+        window: consecutive calls.
+
     Returns:
         Numbers of calls, twice ``[n]``. A call whose cell no earlier one of its window computed is not among them.
     """

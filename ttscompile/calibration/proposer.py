@@ -193,7 +193,11 @@ NAMES = tuple(row.name for row in PROPOSERS)
 
 
 def rows_of(learn: tuple[str, ...]) -> tuple[Row, ...]:
-    """The rows of these names, in the order of ``PROPOSERS``."""
+    """The rows of these names, in the order of ``PROPOSERS``.
+
+    Raises:
+        CalibrationError: none is of a name, or there is no name.
+    """
     unknown = [name for name in learn if name not in NAMES]
     if unknown or not learn:
         found = repr(unknown[0]) if unknown else "none"

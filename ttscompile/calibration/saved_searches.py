@@ -17,7 +17,15 @@ _FIELDS = tuple(field.name for field in fields(Correction))
 
 
 class Searches:
-    """What is known before a search begins, and what it finds."""
+    """What is known before a search begins, and what it finds.
+
+    Args:
+        state: of the comparison.
+        shape: K and number of blocks.
+
+    Raises:
+        CalibrationError: what is there is damaged.
+    """
 
     def __init__(self, state: StateFile, shape: tuple[int, int]) -> None:
         self._state, self._shape = state, shape

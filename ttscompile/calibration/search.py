@@ -16,7 +16,11 @@ of search lowers the error by 3 to 30 %, the switches by a few."""
 
 
 def open_search(name: str, task: Task) -> Search:
-    """The search of the strategy of this name, ready to begin."""
+    """The search of the strategy of this name, ready to begin.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it cannot keep the budget.
+    """
     strategy, model = strategy_of(name), task.executor.model
     strategy.require_reach(model.steps, model.blocks, task.budget)
     return strategy.make()(task)
@@ -26,12 +30,17 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
     """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
 
     Args:
+        name: the name of the strategy.
         task: see ``Task``; its clock is not used.
         intervals: how many at most; None for the strategy's own number.
         seconds: after which nothing more is begun that can be left out.
 
     Returns:
         What was found, and whether the time cut the search short.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it cannot keep the budget.
+        CalibrationFailedError: the time was up before there was a plan within the budget.
     """
     clock = Clock(seconds)
     found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
@@ -48,11 +57,17 @@ def search_plan(
     """Intervals until the search is done, or the time is up; one at least.
 
     Args:
+        search: after its first ``first`` intervals.
+        clock: with the limit of the search.
         most: intervals; None for the strategy's own number.
+        first: the interval to begin with.
         after: told after each interval how many are done, and how many seconds the longest took.
 
     Returns:
         What was found, after how many intervals, and why it stopped: ``finished`` or ``time limit``.
+
+    Raises:
+        CalibrationFailedError: the time was up before there was a plan within the budget.
     """
     count = search.intervals if most is None else min(most, search.intervals)
     number, longest = first, 0.0

@@ -56,6 +56,9 @@ class StateFile:
 
         Returns:
             Whether there was anything.
+
+        Raises:
+            CalibrationError: it is damaged, or belongs to a run with other settings.
         """
         if self.warning or not self._path.exists():
             return False
@@ -112,7 +115,11 @@ class StateFile:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Within the block an error is one of the state: it has everything that was written, and yet does not fit."""
+        """Within the block an error is one of the state: it has everything that was written, and yet does not fit.
+
+        Raises:
+            CalibrationError: it does not.
+        """
         try:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:

@@ -15,7 +15,15 @@ BATCHES = (5, 7)
 
 
 def unify_batch(left: Graph, right: Graph) -> Graph:
-    """One graph for every batch size."""
+    """One graph for every batch size.
+
+    Args:
+        left: captured with a batch of ``BATCHES[0]``.
+        right: the same module captured with a batch of ``BATCHES[1]``.
+
+    Raises:
+        CaptureError: they differ in more than the batch size; names the first node that does.
+    """
     inputs = {name: _type(name, type_, right.inputs[name]) for name, type_ in left.inputs.items()}
     if left.constants != right.constants:
         raise CaptureError(f"the module makes constants that depend on the batch size.{REMEDY}")

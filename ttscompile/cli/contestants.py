@@ -98,7 +98,18 @@ def _goes_on(artifact: Artifact, plan: Plan) -> bool:
 
 
 def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
-    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another."""
+    """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
+
+    Args:
+        checkpoint: as ``convert`` took it.
+        encoders: the folder that ``convert`` was given with it, if it was.
+        threads: of PyTorch.
+        artifact: that was made from it.
+
+    Raises:
+        RuntimeUnavailableError: there is no torch.
+        SpecError: the checkpoint is of another policy.
+    """
     try:
         import torch
 
@@ -127,7 +138,16 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
 
 
 def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = None) -> tuple[nn.Module, PolicySpec]:
-    """The network of the checkpoint that an artifact was made from, and what that says about it; needs torch."""
+    """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
+
+    Args:
+        checkpoint: as ``convert`` took it.
+        spec: specification of the policy in the artifact.
+        encoders: see ``originals``.
+
+    Raises:
+        SpecError: the checkpoint is of another policy.
+    """
     from ttscompile.frontends import load_checkpoint_policy
     from ttscompile.frontends.families import as_converted
 

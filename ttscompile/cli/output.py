@@ -110,7 +110,11 @@ def counted_parts() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def manifest_of(path: Path) -> Manifest:
-    """Manifest of an artifact; in a directory nothing else is read and checked."""
+    """Manifest of an artifact; in a directory nothing else is read and checked.
+
+    Raises:
+        ArtifactError: there is no artifact.
+    """
     require_artifact_path(path)
     return read_manifest(path) if path.is_dir() else load_artifact(path).manifest
 

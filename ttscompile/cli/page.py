@@ -16,7 +16,12 @@ from ttscompile.runtimes.policy import CompiledPolicy
 
 
 def require_page(path: Path) -> None:
-    """See, before minutes of work, whether a page can be made there."""
+    """See, before minutes of work, whether a page can be made there.
+
+    Raises:
+        OutputError: there is no such folder, or the name is of no page.
+        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
+    """
     if not path.absolute().parent.is_dir():
         raise OutputError(f"{path}: the page cannot be written: no such folder. Give one that exists.")
     if path.suffix not in (".html", ".htm"):
@@ -27,7 +32,21 @@ def require_page(path: Path) -> None:
 def write_page(
     path: Path, artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None]
 ) -> str:
-    """Write the page; it replaces another one only when it is whole. Says what was written."""
+    """Write the page; it replaces another one only when it is whole.
+
+    Args:
+        path: see ``require_page``.
+        artifact: loaded.
+        policy: the same, with a seed; its calls are timed now.
+        given: what the page shows beside the artifact.
+        progress: told what is under way.
+
+    Returns:
+        What was written, for people.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     page = render(build(artifact, policy, given, progress))
     try:
         replace_file(path, page.encode())
@@ -44,7 +63,11 @@ def checked(
     threads: int,
     progress: Callable[[str], None],
 ) -> tuple[bool, Section]:
-    """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says."""
+    """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
+
+    Raises:
+        ArtifactChangedError: another one is there by now.
+    """
     try:
         found = ttscompile.verify(
             directory,

@@ -21,7 +21,19 @@ Errors: TypeAlias = type[TtscompileError]
 
 
 def integer(value: Any, what: str, error: Errors, least: int = 0, most: int | None = None, more: str = "") -> int:
-    """A whole number, whatever says that it is one: of Python, numpy or torch, an array of no axes; not a bool."""
+    """A whole number, whatever says that it is one: of Python, numpy or torch, an array of no axes; not a bool.
+
+    Args:
+        value: what the caller gave.
+        what: the name of the argument.
+        error: class of the error.
+        least: the smallest that is taken.
+        most: the largest; None for no limit.
+        more: what else is taken, for the message.
+
+    Raises:
+        TtscompileError: of the class ``error``: not a whole number, or outside the limits.
+    """
     try:
         boolean = isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")
         number = None if boolean else operator.index(value)
@@ -40,7 +52,18 @@ def is_tensor(value: object) -> bool:
 
 
 def plain(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array:
-    """The numpy array of an array or a tensor, of numpy's own class; no copy if it can be helped."""
+    """The numpy array of an array or a tensor, of numpy's own class; no copy if it can be helped.
+
+    Args:
+        value: what the caller gave.
+        what: for the message, ``observation 'obs'``.
+        error: class of the error.
+        dtype: that is expected in the end, for the message; it is not checked.
+
+    Raises:
+        TtscompileError: of the class ``error``: neither an array nor a tensor; a masked array, or one that computes in
+            its own way; or a tensor whose numbers numpy cannot have.
+    """
     if type(value) is np.ndarray:
         return value
     if isinstance(value, np.ndarray):
@@ -68,7 +91,11 @@ def listed(value: Any, what: str, error: Errors, dtype: str) -> Array:
 
 
 def numbers(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array:
-    """The same as numbers of a dtype; what that cannot hold becomes infinite."""
+    """The same as numbers of a dtype; what that cannot hold becomes infinite.
+
+    Raises:
+        TtscompileError: of the class ``error``: no array, or not of numbers.
+    """
     array = listed(value, what, error, dtype)
     if array.dtype.kind not in "biuf":
         raise error(f"{what} has dtype {array.dtype!s:.80}; expected numbers, {dtype}.")

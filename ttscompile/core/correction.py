@@ -189,13 +189,23 @@ class Correction:
         return np.asarray(condition @ self.reading, np.float32)
 
     def from_condition(self, read: FloatArray) -> FloatArray:
-        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``."""
+        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``.
+
+        Args:
+            read: of the condition, float32 ``[B, F]``.
+        """
         count, *shape = self.observed.shape
         added = read @ self.observed.reshape(count, -1)
         return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
 
     def jump(self, j: int, read: FloatArray, history: FloatArray) -> FloatArray:
-        """What jump number j adds to the sample, float32 ``[D, B, T]``."""
+        """What jump number j adds to the sample, float32 ``[D, B, T]``.
+
+        Args:
+            j: of the jumps.
+            read: of the condition, float32 ``[B, F]``.
+            history: after the jump's anchor, ``[D, B, 4 T]``.
+        """
         dimensions, streams, width = history.shape
         value = np.concatenate([read, history.transpose(1, 0, 2).reshape(streams, -1)], 1)
         for layer in (self.inner[j], self.middle[j]):

@@ -17,6 +17,15 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
     """An image of another size as the specification has it; anything else as it is.
 
     What openpi and LeRobot do: bilinear, without smoothing what becomes smaller.
+
+    Args:
+        array: ``[..., C, h, w]``.
+        spec: of the observation, of a window or of a frame.
+        what: for the message, ``observation 'obs'``.
+        error: class of the error.
+
+    Raises:
+        TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.
     """
     if spec.fit is None or array.dtype != np.float32 or array.ndim < 3 or not array.size:
         return array

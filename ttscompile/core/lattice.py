@@ -57,6 +57,9 @@ def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> Pl
 
     Returns:
         int8 ``[B, K, blocks]``, contiguous.
+
+    Raises:
+        IllegalPlanError: wrong dtype, shape or values.
     """
     array = given = _sources(plan)
     if array.ndim == 2:
@@ -82,6 +85,10 @@ def _sources(plan: npt.ArrayLike) -> npt.NDArray[Any]:
 
 def origins(plan: PlanArray, groups: Sequence[int]) -> Origins:
     """Resolve every cell of one stream's plan to the computed residual that it adds.
+
+    Args:
+        plan: int8 ``[K, blocks]``.
+        groups: for each block the number of its FORWARD group (one kind and one shape).
 
     Returns:
         The origins; cells that read nothing have ``UNWRITTEN``. Rollout cells are resolved to their own index
@@ -115,7 +122,16 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
-    """Raise IllegalPlanError if any stream's plan is illegal."""
+    """Raise if any stream's plan is illegal.
+
+    Args:
+        plans: int8 ``[B, K, blocks]``.
+        groups: FORWARD group of each block.
+        written: bool ``[B, K, blocks]``.
+
+    Raises:
+        IllegalPlanError: names the first cell, and how many there are.
+    """
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
         if len(bad):
@@ -135,6 +151,8 @@ def legalize(plan: PlanArray, groups: Sequence[int], written: BoolArray) -> tupl
     Pure: neither argument is changed. Works on one plan or on one a stream.
 
     Args:
+        plan: int8 ``[K, blocks]`` or ``[B, K, blocks]``.
+        groups: FORWARD group of each block.
         written: bool, of the plan's shape; the rollout entries that exist.
 
     Returns:

@@ -14,7 +14,15 @@ _MOST_BYTES = 64 * 2**20
 
 
 class Tokenizer:
-    """What ``tokenizer.json`` describes."""
+    """What ``tokenizer.json`` describes.
+
+    Args:
+        path: of the file, or of the folder that has it.
+        error: class of the errors.
+
+    Raises:
+        TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
+    """
 
     def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
         own = Path(path)

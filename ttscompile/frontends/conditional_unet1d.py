@@ -179,7 +179,17 @@ class ConditionalUnet1D(nn.Module):
         global_cond: torch.Tensor | None = None,
         local_cond: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Evaluate the denoiser once, of a sample ``[B, T, input_dim]`` with T divisible by ``config.divisor``."""
+        """Evaluate the denoiser once.
+
+        Args:
+            sample: float32 ``[B, T, input_dim]``, T divisible by ``config.divisor``.
+            timestep: int64 ``[B]``.
+            global_cond: float32 ``[B, global_cond_dim]``; None without one.
+            local_cond: float32 ``[B, T, local_cond_dim]``; None without one.
+
+        Returns:
+            float32 ``[B, T, input_dim]``.
+        """
         condition = self.diffusion_step_encoder(timestep)
         if global_cond is not None:
             condition = torch.cat((condition, global_cond), dim=-1)

@@ -114,7 +114,17 @@ def behind_encoder(
     network: Mapping[str, Any],
     known: Collection[str],
 ) -> Rebuilt:
-    """A U-Net on what an encoder makes of the observed steps."""
+    """A U-Net on what an encoder makes of the observed steps.
+
+    Args:
+        saved: the policy.
+        encoder: observations by key to ``[B, To, width]``.
+        width: of a step's features.
+        observed: what it takes.
+        action_dim: Da.
+        network: settings of the U-Net, but for its channels.
+        known: settings of ``cfg.policy`` that were read for encoder and network.
+    """
     as_global = saved.settings.flag("obs_as_global_cond", True)
     (n_obs_steps,) = saved.sizes("n_obs_steps")
     config = UNetConfig(

@@ -124,7 +124,14 @@ class Layer(nn.Module):
 
 
 def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:
-    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is in no graph."""
+    """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is not part of a graph.
+
+    Args:
+        layers: of the language model.
+        x: the tokens, embedded, ``[B, T, width]``.
+        turns: of their positions.
+        mask: added to the scores, ``[B, 1, T, T]``.
+    """
     found = []
     for layer in layers:
         x, keys, values = layer(x, turns, mask)

@@ -146,6 +146,8 @@ class Prefix(nn.Module):
 
         Args:
             images: of each camera ``[B, 3, H, W]``, in -1..1.
+            tokens: int64 ``[B, L]``.
+            mask: bool ``[B, L]``.
             state: padded ``[B, Ds]``; None in pi0.5.
         """
         seen = self.projector(self.vision_model(torch.stack(images, 1).flatten(0, 1)))

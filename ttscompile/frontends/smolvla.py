@@ -165,6 +165,8 @@ class Prefix(nn.Module):
 
         Args:
             images: of each camera ``[B, 3, H, W]``, in -1..1.
+            tokens: int64 ``[B, L]``.
+            mask: bool ``[B, L]``.
             state: padded ``[B, Ds]``.
         """
         scale = math.sqrt(self.width)

@@ -146,7 +146,16 @@ class TransformerForDiffusion(nn.Module):
         self.head = nn.Linear(width, config.output_dim)
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, cond: torch.Tensor | None = None) -> torch.Tensor:
-        """Evaluate the denoiser once, of a sample ``[B, T, input_dim]`` with T at most the horizon."""
+        """Evaluate the denoiser once.
+
+        Args:
+            sample: float32 ``[B, T, input_dim]``, T at most the horizon.
+            timestep: int64 ``[B]``.
+            cond: float32 ``[B, To, cond_dim]``; None without observation tokens.
+
+        Returns:
+            float32 ``[B, T, output_dim]``.
+        """
         time = self.time_emb(timestep).unsqueeze(1)
         tokens = self.input_emb(sample)
         if self.decoder is None:

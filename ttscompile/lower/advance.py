@@ -55,12 +55,20 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
     The update is that of ``core.update``, with what belongs to the step as inputs. A term of the denoised sample
     whose column of the sampler's table is zero at every step is left out.
 
+    Args:
+        tail: residual stream and contexts -> prediction ``[B, T, D]``.
+        stem: sample ``[B, T, D]`` and contexts -> residual stream.
+        spec: gives the shape of the sample, the clip and the columns.
+
     Returns:
         A graph with the inputs ``stream``, ``sample`` and ``offset`` ``[D, B, T]``, ``history`` ``[D, B, 4 T]``,
         ``update`` ``[G, R, (1 + S) T]``, ``sample_to_x0`` and ``out_to_x0`` ``[1]``, where the sampler has S > 0
         memories ``memory`` ``[D, B, S T]``, the tail's contexts as ``tail.NAME`` (of this step) and the stem's as
         ``stem.NAME`` (of the next); outputs ``sample_next``, ``stream_next``, ``prediction`` and with memories
         ``memory_next``. Samples and prediction are ``[D, B, T]``.
+
+    Raises:
+        LoweringError: a constant of the program has the name of one of these inputs.
     """
     inputs = {STREAM: tail.type, **_update_types(spec)}
     for name, piece in ((TAIL, tail), (STEM, stem)):

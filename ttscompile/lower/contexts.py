@@ -93,7 +93,13 @@ class Contexts:
 
 
 class StreamContexts:
-    """Hands out the value of a context at a step, of some of the streams."""
+    """Hands out the value of a context at a step, of some of the streams.
+
+    Args:
+        w: of a graph inside of the main one; what does not change from step to step is written there.
+        contexts: of all streams.
+        members: numbers of the streams, int64 ``[S]``.
+    """
 
     def __init__(self, w: GraphWriter, contexts: Contexts, members: str) -> None:
         self._w, self._contexts, self._members = w, contexts, members

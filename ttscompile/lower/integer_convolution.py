@@ -98,7 +98,15 @@ def convolution_of(
 def integer_convolution(
     node: NodeProto, of: Convolution, integers: str, scales: str, keep: Callable[[str, Array], str]
 ) -> list[NodeProto]:
-    """The nodes that take the place of ``node``."""
+    """The nodes that take the place of ``node``.
+
+    Args:
+        node: the convolution.
+        of: what it convolves.
+        integers: name of the constant int8 ``[kernel * C, O]``.
+        scales: name of the constant float32 ``[O]``.
+        keep: stores a small constant under a name, and gives the name.
+    """
     axes, own = len(of.sizes), f"{node.name}."
     kernel = len(of.matrix)
     u8, scale, zero = (own + name for name in ("u8", "scale", "zero"))

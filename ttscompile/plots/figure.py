@@ -26,7 +26,16 @@ _CHARACTER = 0.012
 
 
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
-    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system."""
+    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
+
+    Args:
+        width: in inches.
+        height: in inches.
+        told: what it will show, and ``--json`` says too; for the error.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib is not installed.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -73,7 +82,15 @@ def require_picture_name(path: Path) -> None:
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:
-    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them."""
+    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them.
+
+    Args:
+        figure: drawn.
+        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+
+    Raises:
+        OutputError: it cannot be written; a file that was there is as it was.
+    """
     place, content = Path(path), BytesIO()
     require_picture_name(place)
     suffix = place.suffix.lower()

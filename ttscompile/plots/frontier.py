@@ -25,6 +25,13 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
 
     Args:
         points: of all series; those at no distance (the dense policy) are told in the title: the axis is logarithmic.
+        efficient: points that no other beats, fastest first.
+        path: see ``write_picture``.
+        title: over the picture.
+
+    Raises:
+        OutputError: the picture cannot be written.
+        RuntimeUnavailableError: matplotlib is not installed.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()

@@ -27,7 +27,19 @@ _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward
 
 
 def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: str = "") -> None:
-    """Draw one plan and write the picture."""
+    """Draw one plan and write the picture.
+
+    Args:
+        plan: int8 ``[K, blocks]`` of ``Source``.
+        kinds: kind of each block, in order of execution.
+        path: see ``write_picture``.
+        title: over the picture; the sparsity is added to it.
+
+    Raises:
+        IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
+        RuntimeUnavailableError: matplotlib is not installed.
+        OutputError: the picture cannot be written.
+    """
     if plan.ndim != 2 or plan.shape[1] != len(kinds) or not np.isin(plan, list(Source)).all():
         raise IllegalPlanError(
             f"cannot draw a plan of shape {plan.shape} with values {np.unique(plan).tolist()}; expected"
@@ -66,8 +78,17 @@ def plot_errors(
 
     Args:
         errors: ``[A, blocks]``.
+        steps: number of each of the A steps.
+        kinds: kind of each block, in order of execution.
         tolerance: errors above it are framed.
+        path: see ``write_picture``.
+        title: over the picture.
         cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
+        plan: its name.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib is not installed.
+        OutputError: the picture cannot be written.
     """
     count, blocks = errors.shape
     figure, axes = _map(6.5 + 0.03 * count, 2.2 + 0.17 * blocks, kinds, "the errors")

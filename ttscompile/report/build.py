@@ -45,7 +45,17 @@ class Given:
 def build(
     artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None] = lambda what: None
 ) -> Page:
-    """Measure what has to be measured, draw, and put the page together."""
+    """Measure what has to be measured, draw, and put the page together.
+
+    Args:
+        artifact: loaded.
+        policy: the same, with its default runtime and a seed.
+        given: what the report shows beside the artifact.
+        progress: told what is under way.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
+    """
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")

@@ -23,8 +23,14 @@ COUNTS = (1, 2, 4, 8, 16, 32)
 class Adaptation:
     """Intervals after the search: all but the last linearise, the last one fits.
 
+    Args:
+        task: see ``Task``.
+        schedule: ``[K, blocks]``, settled.
+
     Attributes:
+        done: whether nothing is left to do.
         pruner: constants of the pruner; None before the last interval, or if no switch helps.
+        switches: how many switches the pruner has.
     """
 
     INTERVALS = 5

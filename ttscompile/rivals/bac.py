@@ -68,7 +68,12 @@ class Schedule:
 
 
 def best_schedules(similarity: Scores, most: int) -> list[Schedule]:
-    """The schedules with the highest scores with 1, 2, ... ``most`` computations, the first at step 0."""
+    """The schedules with the highest scores with 1, 2, ... ``most`` computations, the first at step 0.
+
+    Args:
+        similarity: ``[K, K]``, ``S[a, t]`` of one block.
+        most: computations at most.
+    """
     steps = len(similarity)
     sums = np.concatenate([np.zeros((steps, 1)), np.cumsum(similarity, 1)], 1)
     segment = sums - np.diagonal(sums)[:, None]  # [a, e]: a's residual is added at a..e-1
@@ -99,6 +104,10 @@ def bubbling(change: Scores, kinds: Sequence[str]) -> dict[int, list[int]]:
     """The blocks that change most -> the feed-forward blocks at or after each, whose updates it takes over.
 
     In a policy of unknown structure no block is called feed-forward; then any block counts as one.
+
+    Args:
+        change: ``[blocks]``, mean absolute difference of a block's residual between two steps.
+        kinds: the kind of each block.
     """
     followed = [b for b, kind in enumerate(kinds) if kind == FEED_FORWARD] or list(range(len(kinds)))
     sources = np.argsort(-change, kind="stable")[:BUBBLING]

@@ -121,7 +121,14 @@ def mutate(computed: BoolArray, draw: np.random.Generator) -> BoolArray:
 
 
 def repair(computed: BoolArray, budget: int, least: int, draw: np.random.Generator) -> BoolArray:
-    """The plan with step 0 dense, at least ``least`` cells a block, and exactly ``budget`` cells; changed at random."""
+    """The plan with step 0 dense, at least ``least`` cells a block, and exactly ``budget`` cells; changed at random.
+
+    Args:
+        computed: bool ``[K, blocks]``.
+        budget: at least ``least`` for each block, at most all cells.
+        least: at least 1, at most K.
+        draw: the source of random numbers.
+    """
     fixed = computed.copy()
     fixed[0] = True
     for b in np.flatnonzero(fixed.sum(0) < least):

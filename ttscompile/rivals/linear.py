@@ -71,6 +71,13 @@ def linearise(executor: Executor, actions: Actions, plan: PlanArray, calls: Call
 
     Errors are weighted by the inverse of their size in this plan, so that the sum of squares is the sum of absolute
     values near it, and projected on random directions for each call.
+
+    Args:
+        executor: runs the policy.
+        actions: which part of the sample counts.
+        plan: ``[K, blocks]``.
+        calls: calls whose targets are known.
+        seed: the seed of the directions.
     """
     generator = torch.Generator().manual_seed(seed)
     difference = actions.executed(executor.run(plan, calls)) - actions.executed(calls.targets)

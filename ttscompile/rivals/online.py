@@ -104,6 +104,10 @@ class Decisions:
     def decide(self, k: int, feature: FloatArray) -> PlanArray:
         """The row of the plan at step k; to be asked for every step, in order.
 
+        Args:
+            k: the number of the step.
+            feature: ``[B, ...]``, see ``Criterion.always``.
+
         Returns:
             int8 ``[B, blocks]`` of COMPUTE and TIMESTEP; the first ``always`` blocks are COMPUTE.
         """

@@ -183,6 +183,12 @@ def head_weights(
     A linear function ``a`` passes the hidden layer exactly as ``gelu(a) - gelu(-a)``. The code of switch r is +1 or -1,
     nearly always; ``step[:, r]`` and ``block[r]`` carry it to the COMPUTE logits of its two cells, whose base is on the
     edge. All other cells have a margin that no sum of switches reaches.
+
+    Args:
+        constants: the pruner's constants as they are.
+        schedule: ``[K, blocks]``.
+        switches: the switches to express, at most ``capacity`` of them.
+        features: ``[N, F]``, for the scale of the switches' functions.
     """
     new = {name: np.array(value) for name, value in constants.items()}
     for name in NAMES:

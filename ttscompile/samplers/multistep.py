@@ -89,7 +89,17 @@ def set_timesteps(scheduler: Any, steps: int) -> None:
 
 
 def multistep_table(scheduler: Any, steps: int, name: str, step_arguments: Mapping[str, Any]) -> SamplerTable:
-    """Measure the denoising loop of a multistep scheduler."""
+    """Measure the denoising loop of a multistep scheduler.
+
+    Args:
+        scheduler: a configured ``DPMSolverMultistepScheduler`` after ``set_timesteps``, which is called again.
+        steps: K.
+        name: of the table.
+        step_arguments: further keyword arguments of ``step``.
+
+    Raises:
+        SpecError: noise levels that repeat, or a step that has not the form of ``SamplerTable``.
+    """
     timesteps = torch.as_tensor(scheduler.timesteps)
     distinct = len(set(torch.as_tensor(scheduler.sigmas[:-1]).tolist()))
     if distinct != steps:

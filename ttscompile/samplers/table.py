@@ -158,8 +158,15 @@ def sampler_table(
 
     Args:
         scheduler: a diffusers scheduler, configured; ``set_timesteps`` is called on it.
+        steps: K, number of denoising steps.
         name: of the table, for people; the scheduler's class otherwise.
         step_arguments: further keyword arguments of ``step`` (``eta`` of DDIM).
+
+    Returns:
+        The table, K rows in order of execution.
+
+    Raises:
+        SpecError: the scheduler refuses the settings, or its step is not of the form of ``SamplerTable``.
     """
     steps = integer(steps, "steps", SpecError, 1)
     probe = _Probe(scheduler, step_arguments or {})

@@ -150,7 +150,11 @@ _SAVEZ = "Use np.savez with plain arrays"
 
 
 def read_npz(path: Path) -> dict[str, Array]:
-    """All arrays of an ``.npz``, without unpickling anything."""
+    """All arrays of an ``.npz``, without unpickling anything.
+
+    Raises:
+        TrajectoryError: it is missing, truncated, of another format, or holds Python objects.
+    """
     require_path(path, TrajectoryError, "Give the .npz file of a recording.")
     if not path.is_file():
         raise TrajectoryError(

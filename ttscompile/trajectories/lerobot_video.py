@@ -29,7 +29,20 @@ _PLACE = ("chunk_index", "file_index", "from_timestamp")
 def video_frames(
     path: Path, name: str, info: Mapping[str, Any], episodes: Array, times: Array, column: Column
 ) -> Iterator[Array]:
-    """The frames of one camera, uint8 ``[1, H, W, 3]`` each, in the order of the rows."""
+    """The frames of one camera, uint8 ``[1, H, W, 3]`` each, in the order of the rows.
+
+    Args:
+        path: of the data set.
+        name: of the camera.
+        info: ``meta/info.json``.
+        episodes: ``[F]`` the episode of each row.
+        times: ``[F]`` seconds since its episode began, of each row.
+        column: reads tables.
+
+    Raises:
+        TrajectoryError: PyAV is not installed; a video is missing or damaged, of another codec, or lacks a frame; a
+            time is not finite.
+    """
     try:
         import av  # noqa: F401
     except ModuleNotFoundError as error:

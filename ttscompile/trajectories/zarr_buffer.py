@@ -27,7 +27,11 @@ CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "
 
 
 def zarr_recording(path: Path) -> Recording:
-    """Open a replay buffer, a directory or zipped."""
+    """Open a replay buffer, a directory or zipped.
+
+    Raises:
+        TrajectoryError: not one, damaged, or in an encoding that is not read.
+    """
     try:
         import zarr
     except ModuleNotFoundError as error:

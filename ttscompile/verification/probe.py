@@ -27,7 +27,12 @@ Array = npt.NDArray[Any]
 
 
 class Probe:
-    """The pieces on one observation."""
+    """The pieces on one observation.
+
+    Args:
+        view: of an artifact.
+        obs: normalised observations by key, ``[B, ...]``.
+    """
 
     def __init__(self, view: View, obs: Mapping[str, Array]) -> None:
         self._view, self._manifest, self._pool = view, view.manifest, Sessions(1)
@@ -91,7 +96,12 @@ class Probe:
         return run_named(self._sessions[ADVANCE], [PREDICTION], feed)[PREDICTION].transpose(1, 2, 0)
 
     def trace(self, noise: Noise, plan: PlanArray, correction: Correction | None) -> tuple[FloatArray, FloatArray]:
-        """One call without ROLLOUT, the first of its episode, by the definitions in ``docs/design.md`` section 2.
+        """One call, the first of its episode, by the definitions in ``docs/design.md`` section 2.
+
+        Args:
+            noise: of the call.
+            plan: int8 ``[B, K, blocks]``, without ROLLOUT.
+            correction: of the plan.
 
         Returns:
             The sample after every step, and the prediction at every step, ``[K, B, T, D]`` each.

@@ -53,7 +53,11 @@ SMALLEST = 2
 
 
 def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
-    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads.
+
+    Raises:
+        CalibrationError: there are none for so large a rank.
+    """
     pieces = artifact.pieces
     others = {
         name for key, graph in artifact.graphs.items() if not key.startswith("block_") for name in graph.constants
