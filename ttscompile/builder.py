@@ -63,8 +63,8 @@ def build(
             plan is then the nearest of those whose longest call keeps up.
         policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
         latency_ms: that the longest call may take, in place of ``control_hz``.
-        max_distance: how far from the original the default may be, with 95 % confidence, in units of what other noise
-            changes; None for a quarter, ``artifact.ceiling.BOUND``.
+        max_distance: from the original, that the default may have (``calibration.proposer.near``), in units of what
+            other noise changes; None for a quarter, ``artifact.ceiling.BOUND``.
         threads: that calls have.
         max_minutes: for all but the conversion.
         seed: of everything random.

@@ -94,8 +94,8 @@ def calibrate(
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
             the sparsest that was found below it. Only with a strategy that fits corrections.
         max_distance: by how much further from the original a plan may be that costs less than the one it was made from;
-            None for what its proposer allows. Where loops are learned: how far from the original the default may be,
-            with 95 % confidence.
+            None for what its proposer allows. Where loops are learned: the distance from the original that the
+            default may have, see ``proposer.near``.
         threads: how many threads the calls have that are timed for ``latency_ms``.
         max_minutes: of work: those in which all of torch's threads compute. The best plan so far is taken in time to be
             finished by then, as far as what was done before lets it be known; what has to be done at least is done.

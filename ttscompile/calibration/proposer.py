@@ -81,7 +81,7 @@ class Request:
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
         margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
-        bound: how far from the original a plan may be, with 95 % confidence; for who chooses among loops.
+        bound: distance from the original that a plan may have, see ``near``; for who chooses among loops.
         deadline_ms: of a call, for the same; None for the fastest that is near enough.
         threads: of calls that are timed.
     """

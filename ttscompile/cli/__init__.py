@@ -36,7 +36,7 @@ def main() -> None:
 # In the order in which they are used; a line each, short enough for a terminal of 80 columns.
 for _command, _what in (
     (doctor, "What stands in the way on this machine."),
-    (build, "Checkpoint to fastest safe policy: convert, learn, choose."),
+    (build, "From a checkpoint to a fast policy, in one command."),
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (inspect, "What is in an artifact: tables, a picture, a page."),

@@ -28,7 +28,8 @@ from ttscompile.report.summary import document
 @number_option(
     "--control-hz",
     RATE,
-    "Choose the nearest plan that keeps up with a control loop of this rate in Hz, in place of the fastest one.",
+    "Choose, of the plans that keep up with a control loop of this rate in Hz, the one that is nearest to the original."
+    " Without a deadline the fastest is chosen.",
 )
 @number_option(
     "--policy-hz",
@@ -39,12 +40,13 @@ from ttscompile.report.summary import document
 @number_option(
     "--latency-ms",
     MILLISECONDS,
-    "Choose the nearest plan whose longest call takes no longer, in place of --control-hz.",
+    "Choose among the plans whose longest call takes no more than so many milliseconds, in place of --control-hz.",
 )
 @number_option(
     "--error",
     ERROR,
-    "Let the default plan be so far from the original, with 95 % confidence, in units of what other noise changes.",
+    "Largest distance from the original that the default plan may have, in units of what other noise changes; with 95 %"
+    " confidence it is at most twice that. Without this option it is 0.25.",
 )
 @threads_option("Threads that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)

@@ -63,7 +63,8 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     "--max-distance",
     ERROR,
     "Take a cheaper plan if it is no further than this from the original than a dearer one, in units of what other"
-    " noise changes; without this option it is what each that learns allows.",
+    " noise changes; without this option it is what each that learns allows. With --learn loops: distance from the"
+    " original that the default plan may have.",
 )
 @threads_option("Threads of the calls that --latency-ms is about.")
 @click.option(
