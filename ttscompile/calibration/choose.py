@@ -12,13 +12,10 @@ from ..measure.points import Point, efficient
 from ..measure.timer import Times
 from .judge import Score, judge, timed
 from .kept import Kept
-from .proposer import Request, near
+from .proposer import SAFER, Request, near
 from .proposers.loops import too_far
 from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
-
-SAFER = 0.7
-"""Of the default's distance: at most so much has the plan ``safe``."""
 
 
 @dataclass(frozen=True)

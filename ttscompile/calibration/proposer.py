@@ -31,6 +31,9 @@ SURE = 2.0
 """The upper limit of the distance, with 95 % confidence over episodes, may be so many times as far. Of a plan of
 another sampler four episodes tell no less: the root of an energy distance near 0 has wide limits."""
 
+SAFER = 0.7
+"""Of the default's distance: at most so much has the plan ``safe`` where the default is chosen among many."""
+
 
 def near(score: Score, bound: float) -> bool:
     """Whether a plan of this score may become the default."""

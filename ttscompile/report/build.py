@@ -65,7 +65,10 @@ def build(
         progress("running an episode")
         course = run_episode(policy, given.episode)
     progress("drawing")
+    frontier = _frontier(artifact, measured, given.comparison)
+    chosen = facts.chosen(manifest.calibration or {})  # of a build, whose page begins with what it tried
     sections = (
+        *[frontier] * bool(chosen),
         facts.provenance(artifact),
         facts.policy(manifest),
         facts.hoisting(artifact),
@@ -73,15 +76,16 @@ def build(
         _plans(artifact, course),
         *(() if course is None else (_episode(course),)),
         _latency(measured, given, manifest.default_plan),
-        _frontier(artifact, measured, given.comparison),
+        *[frontier] * (not chosen),
         _calibration(manifest.calibration),
         given.verification,
         facts.limits(artifact),
     )
     machine = fingerprint()
+    source = ", ".join(f"{value}" for value in manifest.spec.source.values()) or "A policy of the user's own network"
     return Page(
         title=f"Report on artifact {manifest.short_identity}",
-        lead=", ".join(f"{value}" for value in manifest.spec.source.values()) or "A policy of the user's own network",
+        lead=" ".join((f"{source}.", *chosen)),
         figures=_figures(artifact, measured),
         sections=sections,
         foot=f"Made by ttscompile {machine.get('ttscompile', '')} from identity {manifest.identity}. Times: medians of"
@@ -164,6 +168,12 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement], compared: tup
     if compared is not None:
         points = compared
         text = "As ttscompile bench measured it, on the machine and the calls that its document names."
+    elif tried := (manifest.calibration or {}).get("frontier", ()):
+        points = tuple(
+            Point("near enough" if row["near"] else "too far", row["name"], _distance(row), row["milliseconds"])
+            for row in tried
+        )
+        text = "All plans that the build tried, as it judged and timed them on the machine where it ran."
     else:
         judged = facts.scores(manifest.calibration, ("distance",))
         known = [one for one in measured if one.plan in judged]
@@ -180,6 +190,11 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement], compared: tup
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "distance", "ms a call", "on the frontier")
     return Section("Comparison", (text,), (Table(head, rows),), (drawn,))
+
+
+def _distance(row: Mapping[str, Any]) -> float:
+    """The distance of a plan that a build tried; of the original it is 0 but for rounding."""
+    return 0.0 if row["name"] == DENSE else max(float(row["distance"]), 0.0)
 
 
 def _calibration(record: Mapping[str, Any] | None) -> Section:

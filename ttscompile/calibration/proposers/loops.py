@@ -4,6 +4,10 @@ Loops are tried from the one on whose cheapest call this machine spends least. I
 steps are proposed, with corrections, until one is near enough (``proposer.near``). One more follows, for what is
 learned after it to trade. A loop is left out that is too far from the original when all is computed, and one whose
 cheapest call takes longer than the best plan so far.
+
+The original's own loop comes last. Another one is somewhere else even where it computes every step, so its plans come
+near only so far. Where the fastest of them uses more than half of the bound, the original's loop is searched for a plan
+that is a good deal nearer, however long a call of it takes: for tasks that forgive less than the bound does.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from ..arguments import calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise
-from ..proposer import SURE, Proposal, Proposals, Request, near
+from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
 from ..schedule import searched
 from ..search import open_search
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
@@ -81,9 +85,10 @@ class Loops:
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``."""
         costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
-        order = sorted(costs, key=lambda loop: costs[loop].one)
+        order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop].one))
         for number, loop in enumerate(order):
-            if (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
+            wanted = self._wanted(loop)
+            if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
             if number and clock.left() <= 0:
@@ -96,16 +101,24 @@ class Loops:
                 self._left_out.append(f"{loop} {reason} with every step computed")
                 continue
             ends = clock.until(min(1.0, (clock.elapsed() + share) / clock.limit))
-            yield from self._of_loop(own, loop, ends, costs[loop])
+            yield from self._of_loop(own, loop, ends, costs[loop], wanted)
         if self._best is None:
             raise CalibrationFailedError(self._none())
         yield self._best
         left = f"; left out: {', '.join(self._left_out)}" if self._left_out else ""
         self.told = f"{self._best.name} is the fastest that is near enough{left}"
 
-    def _of_loop(self, own: Trials, loop: str, clock: Clock, cost: Cost) -> Proposals:
-        """Plans of more and more computed steps of a loop, until one is near enough, and one more."""
-        fastest, further = self._fastest, False  # of the loops before
+    def _wanted(self, loop: str) -> float:
+        """How near a plan of a loop has to be for the search to end there."""
+        if loop != ORIGINAL or self._best is None or self._deadline is not None:
+            return self._bound
+        found = self._scores[self._best.name].distance
+        return SAFER * found if found > self._bound / 2 else self._bound
+
+    def _of_loop(self, own: Trials, loop: str, clock: Clock, cost: Cost, wanted: float) -> Proposals:
+        """Plans of more and more computed steps of a loop, until one is as near as is wanted, and one more."""
+        further, safer = False, wanted < self._bound
+        fastest = float("inf") if safer else self._fastest  # of the loops before
         task = replace(Task.of(own.executor, own.calls, 0, own.seed, own.pool), clock=clock)
         crowded = SpacedSchedules(task.whole, own.state, clock, own.bar, f"crowded, {loop}")
         counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
@@ -117,16 +130,17 @@ class Loops:
             if quick is None and number:
                 clock.cut = True
                 break
-            if quick is not None and quick.error > HOPELESS * self._bound * apart and count != counts[-1]:
+            if quick is not None and quick.error > HOPELESS * wanted * apart and count != counts[-1]:
                 continue
             proposal = self._searched(own, task, loop, count)
             yield proposal
-            close = near(self._scores[proposal.name], self._bound)
-            if close and cost.of(count) < self._fastest:
+            name = proposal.name
+            if near(self._scores[name], self._bound) and cost.of(count) < self._fastest:
                 self._best, self._fastest = replace(proposal, beside=False, margin=float("inf")), cost.of(count)
-            if further:
+            reached = near(self._scores[name], wanted) and self._deadline is None  # with a deadline as many as keep it
+            if further or (reached and safer):
                 break
-            further = close and self._deadline is None  # with a deadline as many as keep it
+            further = reached
 
     def _searched(self, own: Trials, task: Task, loop: str, count: int) -> Proposal:
         """The best schedule of so many steps that there is time for."""
