@@ -6,16 +6,19 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import ttscompile
 from tests.calibration import policies
+from tests.calibration.killed import killed
 from tests.once import Once
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.choose import choose
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
@@ -150,6 +153,35 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     assert {row[1]: row[2] for row in table.rows} == {
         name: "0" if name == DENSE else f"{max(row['distance'], 0):.4g}" for name, row in rows.items()
     }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [4, pytest.param(20, marks=pytest.mark.soak)])
+def test_killed_at_random_moments_and_resumed_it_ends_the_same(
+    directory: Path, recording: Path, timed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """One calibration that is killed again and again, each time after some further saves of its state."""
+    milliseconds = {loop: Times((one,)) for loop, (one, _) in COSTS.items()}
+    monkeypatch.setattr(Clock, "elapsed", lambda self: 0.0)
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.timed", lambda entrants, threads: [milliseconds[p.loop] for _, p in entrants]
+    )
+    own = shutil.copytree(directory, tmp_path / "own")
+    how: dict[str, Any] = {"learn": ("loops",), "max_distance": 0.4, "progress": False}
+    calibrate(own, [recording], **how)
+    draw = np.random.default_rng(0)
+    kills = 0
+    while kills < most:
+        try:
+            with killed(int(draw.integers(1, 8 if most < 20 else 4))):
+                calibrate(directory, [recording], resume=kills > 0, **how)
+        except pytest.fail.Exception:  # it came to its end
+            break
+        kills += 1
+    else:
+        calibrate(directory, [recording], resume=True, **how)
+    assert kills == most
+    assert {p.name: p.read_bytes() for p in directory.iterdir()} == {p.name: p.read_bytes() for p in own.iterdir()}
 
 
 def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> None:
