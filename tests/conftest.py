@@ -6,6 +6,7 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from ttscompile.ir.program import Program
 from ttscompile.measure.machine import has_integer_dot_product
 
 from .once import Once
+from .untraced import untraced
 
 if TYPE_CHECKING:
     from _pytest.terminal import TerminalReporter
@@ -46,12 +48,14 @@ def pytest_configure(config: pytest.Config) -> None:
         torch.set_warn_always(True)  # a warning that is given once is an error of whichever test comes first
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time."""
-    if config.getoption("cov_source", default=None):
-        for item in items:
-            if item.get_closest_marker("slow"):
-                item.add_marker("no_cover")
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time.
+
+    ``no_cover`` of pytest-cov says this, too, but does nothing in the processes of pytest-xdist.
+    """
+    with untraced() if item.get_closest_marker("slow") else nullcontext():
+        return (yield)
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:

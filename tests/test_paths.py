@@ -101,7 +101,6 @@ def test_functions_that_take_a_path(endless: Path, artifact: Path, tmp_path: Pat
         ["convert", "PATH", "-o", "OUTPUT"],
         ["convert", "ARTIFACT", "-o", "PATH"],
         ["inspect", "PATH", "-o", "OUTPUT.html"],
-        ["inspect", "ARTIFACT", "-o", "OUTPUT.html", "--comparison", "PATH"],
         ["inspect", "ARTIFACT", "-o", "OUTPUT.html", "--trajectories", "PATH"],
     ],
 )

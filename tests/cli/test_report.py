@@ -34,7 +34,7 @@ from ttscompile.verification.rung import ErrorMap
 
 HOSTILE = """<script>alert(1)</script>"><img src=x onerror=alert(2)>'{{ 7 * 7 }}$\\frac{"""
 VOID = {"meta", "img", "link", "br", "hr", "input"}
-SCORE = {"error": 1.5, "error_p90": 2.5, "sparsity": 0.6, "flops_saved": 0.5}
+SCORE = {"distance": 0.2, "error": 1.5, "error_p90": 2.5, "sparsity": 0.6, "flops_saved": 0.5}
 
 
 class Reader(HTMLParser):
@@ -99,11 +99,7 @@ def pictures_of(reader: Reader) -> list[np.ndarray]:
 @pytest.fixture(scope="module")
 def page(calibrated: Path, calls: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     output = tmp_path_factory.mktemp("page") / "report.html"
-    point = {"series": HOSTILE, "name": "0.9", "distance": 2.0, "latency_ms": 12.5}
-    comparison = calls.with_name("comparison.json")
-    comparison.write_text(json.dumps({"comparison": {"points": [point]}}))
-    options = ("--verify", "--comparison", comparison)
-    result = run(calibrated, "-o", output, "--trajectories", calls, *options)
+    result = run(calibrated, "-o", output, "--trajectories", calls, "--verify")
     assert result.exit_code == 0, result.stderr
     assert load_artifact(calibrated).manifest.short_identity in result.stdout
     assert [path.name for path in output.parent.iterdir()] == ["report.html"], "nothing is left beside it"
@@ -149,7 +145,6 @@ def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
         "4 consecutive calls of calls.npz[0]",
         "ms a call",
         "on the frontier",
-        "12.5",
         "Could not be run",
         "K = 5 denoising steps",
         "at most 80.0% of the cells",
@@ -183,6 +178,8 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     blocks = tuple(replace(block, kind=HOSTILE, reason=HOSTILE) for block in manifest.blocks)
     record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE}, "skipped": {HOSTILE: HOSTILE}}
     record |= {"told": {HOSTILE: HOSTILE}, "learned": [HOSTILE, HOSTILE]}
+    tried = {"name": HOSTILE, "told": HOSTILE, "distance": 0.1, "interval": [0.0, 0.2], "milliseconds": 1.0}
+    record |= {"frontier": [{**tried, "worst": 2.0, "near": True}], "default_plan": HOSTILE}
     plans = {HOSTILE: manifest.plans["schedule"]}
     manifest = replace(manifest, spec=spec, blocks=blocks, plans=plans, default_plan=HOSTILE, calibration=record)
     artifact = replace(
@@ -193,7 +190,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
     errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5)
     found = Verification(HOSTILE, None, None, (rung,), 1.0, errors)
-    given = Given(Episode(HOSTILE, obs), None, verified(found), calls=1)
+    given = Given(Episode(HOSTILE, obs), verified(found), calls=1)
     page = render(build(artifact, policy, given))
     reader = Reader(page)
     assert "script" not in {tag for tag, _ in reader.tags}
@@ -249,28 +246,6 @@ def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) 
     assert "Not run for this page" in text
     assert "Not calibrated: every call is dense" in text
     assert "calibrate the artifact first" in text
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "nothing",
-        "[1]",
-        '{"comparison": {"points": [{"error": "x"}]}}',
-        '{"comparison": {"points": [{"error": NaN, "latency_ms": 1}]}}',
-        '{"points": [{"error": 1, "latency_ms": 1}]}',
-        '{"comparison": null}',
-        "{}",
-    ],
-)
-def test_what_is_no_comparison_is_refused_and_nothing_is_written(
-    content: str, calibrated: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "c.json").write_text(content)
-    result = run(calibrated, "-o", tmp_path / "r.html", "--comparison", tmp_path / "c.json")
-    assert result.exit_code == 2
-    assert "Give what 'ttscompile bench DIRECTORY -t FILE... --json' printed" in result.stderr
-    assert not (tmp_path / "r.html").exists()
 
 
 def test_a_report_replaces_another_only_when_it_is_whole(

@@ -11,9 +11,10 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.frontier import print_frontier
-from ttscompile.cli.options import json_option, number_option, threads_option
+from ttscompile.cli.options import json_option, lerobot_options, number_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results
-from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
+from ttscompile.cli.sections import LEROBOT, SectionedCommand
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.errors import CheckpointError
@@ -21,7 +22,7 @@ from ttscompile.frontends.families import FAMILIES
 from ttscompile.report.summary import document
 
 
-@click.command(cls=FilesCommand)
+@click.command(cls=SectionedCommand, sections=(LEROBOT,))
 @click.argument("checkpoint", type=PATH_OR_HUB)
 @trajectories_options()
 @click.option("-o", "--output", "directory", required=True, type=PATH, help="Write the artifact into this folder.")
@@ -51,6 +52,7 @@ from ttscompile.report.summary import document
 @threads_option("Threads that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)
 @click.option("--resume", is_flag=True, help="Go on where the same build was interrupted.")
+@lerobot_options
 @json_option
 def build(
     checkpoint: Path | str,

@@ -11,11 +11,11 @@ import ttscompile
 from ttscompile.artifact.ceiling import few_steps, many_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
-from ttscompile.cli.options import count_option, json_option
+from ttscompile.cli.options import count_option, json_option, lerobot_options
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
-from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.sections import LEROBOT, Section, SectionedCommand
 from ttscompile.cli.summary import print_summary
-from ttscompile.cli.types import ANY_TEXT, FOLDER, NEW_FILE, PATH, PATH_OR_HUB
+from ttscompile.cli.types import ANY_TEXT, NEW_FILE, PATH, PATH_OR_HUB
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
@@ -26,7 +26,7 @@ from ttscompile.report.summary import document
 SECTIONS = (
     Section("Another denoising loop", ("sampler", "steps", "spacing")),
     Section("Precision", ("precision", "keep_fp32")),
-    Section("Policies of LeRobot", ("task", "encoders", "without_cameras")),
+    LEROBOT,
 )
 
 
@@ -61,25 +61,7 @@ SECTIONS = (
     " bound on the sample. Without this option dpmsolver++ in place of another sampler takes trailing, and ddim"
     " leading.",
 )
-@click.option(
-    "--task",
-    type=ANY_TEXT,
-    help="Compile this instruction in; without it, its tokens are an observation.",
-)
-@click.option(
-    "--encoders",
-    type=FOLDER,
-    help="Find config.json of CLIP or of the language model (and tokenizer.json, for --task) in this folder, if they"
-    " are not in or beside CHECKPOINT. Nothing is downloaded.",
-)
-@click.option(
-    "--without-camera",
-    "without_cameras",
-    type=ANY_TEXT,
-    multiple=True,
-    callback=lambda context, option, given: given or None,
-    help="Leave out a camera of a vision-language-action model that the robot lacks; may be repeated.",
-)
+@lerobot_options
 @count_option(
     "--prediction-horizon",
     "Predict only the first so many steps of the policy's horizon, at least those that it executes: less to"

@@ -13,12 +13,11 @@ from ttscompile.cli.page import checked, require_page, write_page
 from ttscompile.cli.recordings import Sources, trajectories_options
 from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.summary import print_summary
-from ttscompile.cli.types import FILE, NEW_FILE, PICTURE, TEXT
+from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError
 from ttscompile.plots.maps import plot_plan
 from ttscompile.report import Given
-from ttscompile.report.comparison import read_comparison
 from ttscompile.report.measure import run_episode
 from ttscompile.report.summary import document
 from ttscompile.report.verified import NOT_RUN
@@ -31,7 +30,7 @@ SCHEDULE = "schedule"
 SECTIONS = (
     Section("What a page or a picture shows of an episode", ("trajectories", "sources"), ("output", "picture")),
     Section("What a picture shows", ("name",), ("picture",)),
-    Section("What a page shows", ("verifies", "comparison", "threads", "runtime", "device"), ("output",)),
+    Section("What a page shows", ("verifies", "threads", "runtime", "device"), ("output",)),
 )
 
 
@@ -50,11 +49,6 @@ SECTIONS = (
     "--plan", "name", type=TEXT, help="Draw this plan. Without this option it is the default plan of the artifact."
 )
 @click.option("--verify", "verifies", is_flag=True, help="Run the checks of 'ttscompile verify', which take minutes.")
-@click.option(
-    "--comparison",
-    type=FILE,
-    help="Draw the points that 'ttscompile bench DIRECTORY -t FILE... --json' printed into this file.",
-)
 @threads_option("Threads that the timed calls compute with.")
 @runtime_options
 @json_option
@@ -68,7 +62,6 @@ def inspect(
     sources: Sources,
     name: str | None,
     verifies: bool,
-    comparison: Path | None,
     threads: int,
     runtime: str,
     device: str | None,
@@ -85,14 +78,13 @@ def inspect(
     episode = _first_episode(artifact, trajectories, sources) if trajectories else None
     passed, section = True, NOT_RUN
     if output is not None:
-        compared = None if comparison is None else read_comparison(comparison)
         with only_results_on_stdout(), console.status("loading") as status:
             if verifies:
                 passed, section = checked(
                     directory, artifact.manifest.identity, trajectories, sources, threads, status.update
                 )
             policy = open_policy(artifact, runtime, threads, seed=0, device=device)
-            told = write_page(output, artifact, policy, Given(episode, compared, section, threads), status.update)
+            told = write_page(output, artifact, policy, Given(episode, section, threads), status.update)
         say(console, told)
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)

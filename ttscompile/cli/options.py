@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ttscompile.cli.types import ANY_TEXT, PATH, RATE, TEXT, NumberOption
+from ttscompile.cli.types import ANY_TEXT, FOLDER, PATH, RATE, TEXT, NumberOption
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -61,6 +61,27 @@ def together(*options: Decorator) -> Decorator:
 
     return with_options
 
+
+lerobot_options = together(
+    click.option(
+        "--task", type=ANY_TEXT, help="Compile this instruction in; without it, its tokens are an observation."
+    ),
+    click.option(
+        "--encoders",
+        type=FOLDER,
+        help="Find config.json of CLIP or of the language model (and tokenizer.json, for --task) in this folder, if"
+        " they are not in or beside CHECKPOINT. Nothing is downloaded.",
+    ),
+    click.option(
+        "--without-camera",
+        "without_cameras",
+        type=ANY_TEXT,
+        multiple=True,
+        callback=lambda context, option, given: given or None,
+        help="Leave out a camera of a vision-language-action model that the robot lacks; may be repeated.",
+    ),
+)
+"""Of commands that read a checkpoint, for policies of LeRobot."""
 
 runtime_options = together(
     click.option(

@@ -25,6 +25,10 @@ class Section:
     needs: tuple[str, ...] = ()
 
 
+LEROBOT = Section("Policies of LeRobot", ("task", "encoders", "without_cameras"))
+"""Of commands that read a checkpoint."""
+
+
 class SectionedCommand(FilesCommand):
     """Shows the options of each section under its title, and refuses those whose section was not asked for."""
 

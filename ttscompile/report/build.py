@@ -31,12 +31,10 @@ class Given:
 
     Attributes:
         episode: recorded observations; None for none.
-        comparison: points of one; None for none.
         verification: what was found; see ``verified``.
     """
 
     episode: Episode | None = None
-    comparison: tuple[Point, ...] | None = None
     verification: Section = NOT_RUN
     threads: int = 1
     calls: int = 10
@@ -65,7 +63,7 @@ def build(
         progress("running an episode")
         course = run_episode(policy, given.episode)
     progress("drawing")
-    frontier = _frontier(artifact, measured, given.comparison)
+    frontier = _frontier(artifact, measured)
     chosen = facts.chosen(manifest.calibration or {})  # of a build, whose page begins with what it tried
     sections = (
         *[frontier] * bool(chosen),
@@ -163,12 +161,9 @@ def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Sec
     return Section("Latency", text, (timing_table(measured, default),), (drawn,))
 
 
-def _frontier(artifact: Artifact, measured: Sequence[Measurement], compared: tuple[Point, ...] | None) -> Section:
+def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     manifest = artifact.manifest
-    if compared is not None:
-        points = compared
-        text = "As ttscompile bench measured it, on the machine and the calls that its document names."
-    elif tried := (manifest.calibration or {}).get("frontier", ()):
+    if tried := (manifest.calibration or {}).get("frontier", ()):
         points = tuple(
             Point("near enough" if row["near"] else "too far", row["name"], _distance(row), row["milliseconds"])
             for row in tried
