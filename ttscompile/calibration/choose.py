@@ -17,6 +17,10 @@ from .proposers.loops import too_far
 from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
 
+ALIKE = 1.1
+"""Calls are as fast if one takes at most so many times as long as another: the nearest of such plans is chosen. Where
+little is left to compute, a further step costs less than timing is off, and makes a plan several times as near."""
+
 
 @dataclass(frozen=True)
 class Tried:
@@ -69,9 +73,10 @@ class Frontier:
 def choose(kept: Kept, request: Request) -> Frontier:
     """Judge and time every plan, in each precision that it can have, and choose.
 
-    Without a deadline the fastest plan that is near enough is the default. With one it is the nearest of those whose
-    longest call keeps it. ``schedule`` is the name of the default, ``safe`` that of the fastest plan that is a good
-    deal nearer, and ``fast`` that of the next faster one, whose distance is within the bound and its limit is not.
+    Without a deadline the fastest plan that is near enough is the default, or the nearest of those that are as fast
+    (``ALIKE``). With one it is the nearest of those whose longest call keeps it. ``schedule`` is the name of the
+    default, ``safe`` that of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next
+    faster one, whose distance is within the bound, if not its limit.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -98,7 +103,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
     chosen = _chosen(close, scores, times, request)
     named = {chosen: SCHEDULE}
     others = [name for name in best if name not in (DENSE, chosen)]
-    if nearer := [name for name in others if scores[name].distance <= SAFER * scores[chosen].distance]:
+    wanted = SAFER * scores[chosen].distance
+    if nearer := [name for name in others if name in close and scores[name].distance <= wanted]:
         named[min(nearer, key=lambda name: times[name].median)] = SAFE
     faster = [name for name in others if times[name].median < times[chosen].median]
     if within := [name for name in faster if scores[name].distance <= request.bound]:
@@ -127,7 +133,9 @@ def _chosen(close: Sequence[str], scores: Mapping[str, Score], times: Mapping[st
         name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
         raise CalibrationFailedError(too_far(name, scores[name], request.bound))
     if request.deadline_ms is None:
-        return min(close, key=lambda name: times[name].median)
+        most = ALIKE * min(times[name].median for name in close)
+        alike = [name for name in close if times[name].median <= most]
+        return min(alike, key=lambda name: scores[name].distance)
     in_time = [name for name in close if max(times[name].ms) <= request.deadline_ms]
     if not in_time:
         name = min(close, key=lambda name: max(times[name].ms))

@@ -66,6 +66,8 @@ def build(
 ) -> None:
     """Compile CHECKPOINT, and choose the fastest plan that is near enough to the original.
 
+    Of plans that are as fast within a tenth it is the nearest.
+
     Denoising loops, computed steps, corrections, eight bits and image tokens are tried; all are judged on recorded
     episodes that nothing was learned from, and timed on this machine. Exit status 1: no plan is near enough, or none of
     those keeps the deadline.
