@@ -59,7 +59,7 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("latency of a call, ms (median)")
-    axes.set_ylabel("distance from the original on held-out calls (1: about what other noise changes)")
+    axes.set_ylabel("distance from the original on held-out calls\n(1: about what other noise changes)")
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)

@@ -164,10 +164,7 @@ def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Sec
 def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     manifest = artifact.manifest
     if tried := (manifest.calibration or {}).get("frontier", ()):
-        points = tuple(
-            Point("near enough" if row["near"] else "too far", row["name"], _distance(row), row["milliseconds"])
-            for row in tried
-        )
+        points = tuple(Point(_nearness(row), row["name"], _distance(row), row["milliseconds"]) for row in tried)
         text = "All plans that the build tried, as it judged and timed them on the machine where it ran."
     else:
         judged = facts.scores(manifest.calibration, ("distance",))
@@ -185,6 +182,12 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "distance", "ms a call", "on the frontier")
     return Section("Comparison", (text,), (Table(head, rows),), (drawn,))
+
+
+def _nearness(row: Mapping[str, Any]) -> str:
+    if row["name"] == DENSE:
+        return "the original"
+    return "near enough" if row["near"] else "too far"
 
 
 def _distance(row: Mapping[str, Any]) -> float:
