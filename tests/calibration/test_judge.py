@@ -15,11 +15,12 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.calls import load_episodes
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score, _Answers, further, judge, timed
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
-from ttscompile.calibration.trials import DRAWS, HELD_OUT, LEARNED, STRETCH, Trials
+from ttscompile.calibration.trials import DRAWS, FEWEST_OBSERVATIONS, HELD_OUT, LEARNED, STRETCH, Trials
 from ttscompile.core.lattice import dense_plan, uniform_plan, whole_steps_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError
@@ -170,6 +171,26 @@ def test_answers_are_kept_and_go_on(compiled: Path, recording: Path, tmp_path: P
     forged.state.put(f"{HELD_OUT} answers", {**kept, "samples": np.zeros((1, 3), np.float32)})
     with pytest.raises(CalibrationError, match="does not fit this calibration"):
         _ = forged.held_out
+
+
+def test_a_slow_original_answers_fewer_observations_evenly_spread(
+    compiled: Path, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("all", "slow", "least"):
+        (tmp_path / name).mkdir()
+    everything = trials_of(compiled, recording, tmp_path / "all").held_out
+    seconds = iter(np.arange(0.0, 1e6, 10.0))  # ten seconds for whatever is done
+    monkeypatch.setattr(Clock, "elapsed", lambda self: float(next(seconds)))
+    slow = trials_of(compiled, recording, tmp_path / "slow")
+    slow = replace(slow, clock=Clock(limit=1000.0))
+    count = len(slow.held_out.calls)
+    assert FEWEST_OBSERVATIONS <= count < len(everything.calls)
+    assert slow.held_out.calls[0].tolist() == everything.calls[0].tolist()
+    assert slow.held_out.calls[-1].tolist() == everything.calls[-1].tolist()
+    rows = [everything.calls.tolist().index(one) for one in slow.held_out.calls.tolist()]
+    np.testing.assert_allclose(slow.held_out.answers, everything.answers[rows], atol=1e-5)
+    fastest = replace(trials_of(compiled, recording, tmp_path / "least"), clock=Clock(limit=1.0))
+    assert len(fastest.held_out.calls) == min(FEWEST_OBSERVATIONS, len(everything.calls))
 
 
 @pytest.fixture(scope="session")

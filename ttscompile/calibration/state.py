@@ -164,7 +164,7 @@ def _check_progress(progress: Value) -> None:
     for name in {"seconds", "training began"} & set(members):
         if members[name].number() < 0:
             members[name].fail("a time that is not negative")
-    counts = ("calls", "updates", "intervals", "targets")
+    counts = ("calls", "updates", "intervals", "targets", "observations")
     for name in (name for name in members if name.endswith(counts)):
         members[name].integer()
     if "latency" in members:

@@ -46,6 +46,12 @@ draws, and only as the root of that of observations."""
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
 
+FEWEST_OBSERVATIONS = 4
+"""That it answers whatever the time."""
+
+ANSWERING = 0.15
+"""Share of the time limit for the answers of either part: of a policy that takes seconds there are fewer."""
+
 EPISODES = 16
 """That these are of, at most."""
 
@@ -218,6 +224,7 @@ class Trials:
         if part not in self._samples:
             numbers = self.split.calibration if part == LEARNED else self.split.validation
             stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), self.observations)
+            calls = self._in_time(part, stretches, calls)
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls))
         return self._samples[part]
 
@@ -249,6 +256,24 @@ class Trials:
         """See ``noise``."""
         return _NUMBERS[part], stretch, row, draw
 
+    def _in_time(self, part: str, stretches: IntArray, calls: IntArray) -> IntArray:
+        """As many of these calls as the original answers in their share of the time, evenly spread."""
+        key, begun = f"{part} observations", self.clock.elapsed()
+        if self.state.get(f"{part} answers"):
+            self.state.progress.setdefault(key, len(calls))
+        if key not in self.state.progress:
+            self._answers(part, stretches, calls[:1])
+            took = max(self.clock.elapsed() - begun, 1e-9)
+            found = min(ANSWERING * self.clock.limit / took, len(calls))
+            self.state.progress[key] = max(int(found), min(FEWEST_OBSERVATIONS, len(calls)))
+            if self.state.progress[key] < len(calls):
+                self.bar.warn(
+                    f"the original answers {self.state.progress[key]} of {len(calls)} {part} observations: it takes"
+                    f" {took:.3g} s for each. Limits of a distance are wider so; allow more time."
+                )
+        count = min(int(self.state.progress[key]), len(calls))
+        return calls[np.linspace(0, len(calls) - 1, count).round().astype(np.int64)]
+
     def _answers(self, part: str, stretches: IntArray, calls: IntArray) -> FloatArray:
         """What the original answers; what is in the state already is not asked for again."""
         view = view_of(self.artifact, DENSE)
@@ -258,7 +283,7 @@ class Trials:
         places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
         key = f"{part} answers"
         kept = self.state.get(key)
-        if not np.array_equal(kept.get("calls", 0), calls):  # of another number of them
+        if not np.array_equal(before := kept.get("calls", np.zeros((1, 2))), calls[: len(before)]):  # of others
             kept = {}
         known = kept.get("samples", np.zeros((0, *spec.sample), np.float32))
         with self.state.reading():
