@@ -74,7 +74,7 @@ def build(
         progress: see ``calibrate``.
         ray: see ``calibrate``.
         explain: see ``convert``.
-        of_checkpoint: ``format``, ``task``, ``encoders`` and ``without_cameras`` of ``convert``.
+        of_checkpoint: ``format``, ``task``, ``encoders``, ``without_cameras`` and ``base`` of ``convert``.
 
     Returns:
         What was tried and chosen.

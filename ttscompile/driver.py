@@ -77,6 +77,7 @@ def convert(
     task: str | None = None,
     encoders: str | os.PathLike[str] | None = None,
     without_cameras: Sequence[str] | None = None,
+    base: str | os.PathLike[str] | None = None,
     prediction_horizon: int | Literal["needed"] | None = None,
     precision: str = FP32,
     keep_fp32: Collection[str] = (),
@@ -105,6 +106,7 @@ def convert(
             for ``task``), where they are neither in nor beside the checkpoint. Nothing is ever downloaded.
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
+        base: of a LoRA adapter: directory or ``hf://org/name`` of what it adapts; None for what its configuration says.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
             ``needed``: as many as a robot needs, where no action depends on those after it; all where some does.
         precision: of the weights: ``fp32`` or ``int8``; see ``compile_denoiser``.
@@ -119,15 +121,15 @@ def convert(
     """
     require_precision(precision, keep_fp32)  # before minutes of work
     require_replaceable(directory)
-    base: dict[str, str] = {}
+    origin: dict[str, str] = {}
     if on_hub(checkpoint):
         fetched = fetch_checkpoint(str(checkpoint))
-        checkpoint, base = fetched.path, {"base": fetched.origin}
+        checkpoint, origin = fetched.path, {"base": fetched.origin}
         if fetched.licence is not None:
-            base["base_licence"] = fetched.licence
-    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None)
+            origin["base_licence"] = fetched.licence
+    options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None, base)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
-    spec = replace(spec, source={**spec.source, **base})
+    spec = replace(spec, source={**spec.source, **origin})
     beside = files_beside(checkpoint, spec)
     if spec.source.get("format") == "lerobot" and not beside:
         explain("files_beside", ("none for LeRobot: the instruction holds the state",))

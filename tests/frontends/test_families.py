@@ -60,10 +60,10 @@ def test_the_narrower_family_is_asked_first(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"config\.json: not of the format lerobot; expected a directory that"):
         find_family(tmp_path / "config.json", "lerobot")
     (tmp_path / "adapter_config.json").touch()
-    with pytest.raises(CheckpointError, match=r"a PEFT adapter .*told by adapter_config\.json.*Merge it"):
-        find_family(tmp_path, "auto")
-    (tmp_path / "model.safetensors").touch()
     assert find_family(tmp_path, "auto").name == "lerobot"
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(CheckpointError, match=r"a PEFT adapter without the config\.json .*told by adapter_c.*Merge it"):
+        find_family(tmp_path, "auto")
 
 
 def test_the_rows_can_be_read_without_torch() -> None:

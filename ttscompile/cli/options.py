@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ttscompile.cli.types import ANY_TEXT, FOLDER, PATH, RATE, TEXT, NumberOption
+from ttscompile.cli.types import ANY_TEXT, FOLDER, PATH, PATH_OR_HUB, RATE, TEXT, NumberOption
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -80,6 +80,7 @@ lerobot_options = together(
         callback=lambda context, option, given: given or None,
         help="Leave out a camera of a vision-language-action model that the robot lacks; may be repeated.",
     ),
+    click.option("--base", type=PATH_OR_HUB, help="Merge the adapter into this policy, not that of its configuration."),
 )
 """Of commands that read a checkpoint, for policies of LeRobot."""
 

@@ -25,7 +25,7 @@ class Section:
     needs: tuple[str, ...] = ()
 
 
-LEROBOT = Section("Policies of LeRobot", ("task", "encoders", "without_cameras"))
+LEROBOT = Section("Policies of LeRobot", ("task", "encoders", "without_cameras", "base"))
 """Of commands that read a checkpoint."""
 
 

@@ -44,6 +44,7 @@ class LoadOptions:
     encoders: str | os.PathLike[str] | None = None
     without_cameras: Sequence[str] | None = None
     loops: Sequence[tuple[str, int]] | None = None
+    base: str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
         if self.steps is not None:
@@ -95,14 +96,9 @@ class Family:
 
 
 def _is_lerobot(path: Path) -> bool:
-    """Whether a directory is a policy that lerobot saved: a configuration with a type, and more than an adapter.
-
-    A compiled policy has such a configuration as well, and a manifest.
-    """
-    config, weights, adapter = (path / name for name in ("config.json", "model.safetensors", "adapter_config.json"))
-    if (adapter.is_file() and not weights.is_file()) or (path / "manifest.json").is_file():
-        return False
-    return config.is_file() and "type" in read_json(config)
+    """Whether a directory is a policy that lerobot saved; a compiled one has such a file as well, and a manifest."""
+    config = path / "config.json"
+    return not (path / "manifest.json").is_file() and config.is_file() and "type" in read_json(config)
 
 
 FAMILIES = (
@@ -113,7 +109,7 @@ FAMILIES = (
         kind="directory",
         detect=_is_lerobot,
         module="lerobot",
-        options=frozenset({"sampler", "steps", "spacing", "loops", "task", "encoders", "without_cameras"}),
+        options=frozenset({"sampler", "steps", "spacing", "loops", "task", "encoders", "without_cameras", "base"}),
     ),
     Family(
         name="diffusion_policy",

@@ -140,7 +140,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
                 " this policy, diffusion, is given no instruction, has no CLIP and needs all its cameras. Leave it out."
             )
     processors = read_processors(directory, config.features)
-    weights = read_weights(config, _COUNTER)
+    weights = read_weights(config, options, _COUNTER)
     try:
         # Compared before anything of the configured sizes is made, so that no more memory is taken than the file has.
         with torch.device("meta"):

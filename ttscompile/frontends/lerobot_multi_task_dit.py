@@ -16,20 +16,28 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..core.spec import ObservationSpec, PolicySpec, SamplerTable
-from ..errors import CheckpointError, SpecError
+from ..core.spec import PolicySpec, SamplerTable
+from ..errors import CheckpointError
 from ..samplers.flow import METHODS, flow_matching_table
 from .clip import NAME_FOLDER, TextConfig, VisionConfig, encoder_config, find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import Measured, diffusion_loops, policy_spec, read_weights
+from .lerobot_policy import (
+    MASK,
+    TOKENS,
+    Measured,
+    diffusion_loops,
+    integration_steps,
+    language_inputs,
+    policy_spec,
+    read_weights,
+)
 from .lerobot_processors import PREPROCESSOR, Processors, read_processors
 from .loops import Loops, loops_of
 from .multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from .saved_weights import require_weights
-from .scheduler import MOST_STEPS
 from .settings import Settings
 
 _CLIP = "openai/clip-vit-base-patch16"
@@ -41,7 +49,6 @@ _MOST_LAYERS = 512
 """Of all transformers together. Each is made twice, first without memory, which takes time."""
 
 _NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
-TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 
 
 @dataclass(frozen=True)
@@ -114,9 +121,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     config = read_config(directory, entries)
     if options.without_cameras is not None:
-        raise CheckpointError(
-            f"{directory}: multi_task_dit needs all its cameras. Leave the option without_cameras out."
-        )
+        raise CheckpointError(f"{directory}: multi_task_dit needs all its cameras. Leave out without_cameras.")
     processors = read_processors(directory, config.features)
     folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.resolve().parent]
     text = encoder_config(config.text_encoder_name, "text_config", TextConfig, folders)
@@ -134,7 +139,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
             f" {config.tokens}; expected the same number."
         )
     compiled_in = None if options.task is None else _tokens(options.task, config, processors, folders, text)
-    weights = _read_weights(config)
+    weights = _read_weights(config, options)
     try:
         # Compared before anything of the configured sizes is made, so that no more memory is taken than the file has.
         _require_network(config, vision, text, weights)
@@ -149,17 +154,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         "positions": "rotary" if config.network.use_rope else "learned",
         **({} if options.task is None else {"task": options.task}),
     }
-    language = _language(config, text) if compiled_in is None else {}
+    language = language_inputs(config.tokens, text.vocab_size) if compiled_in is None else {}
     return module.eval(), policy_spec(config, processors, _loops(config, options), source, language)
-
-
-def _language(config: MultiTaskDiTConfig, text: TextConfig) -> dict[str, ObservationSpec]:
-    """The instruction, as tokens."""
-    last = float(text.vocab_size - 1)
-    return {
-        TOKENS: ObservationSpec((config.tokens,), dtype="int64", window=False, bounds=(0.0, last)),
-        MASK: ObservationSpec((config.tokens,), dtype="bool", window=False, bounds=(0.0, 1.0)),
-    }
 
 
 def with_inputs(
@@ -193,15 +189,8 @@ def _loops(config: MultiTaskDiTConfig, options: LoadOptions) -> Loops:
 
 def _flow(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
     """The integration that is configured, or asked for in its place."""
-    settings = config.settings
-    if options.spacing is not None:
-        raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
-    method = options.sampler or settings.choice("integration_method", *METHODS)
-    count = options.steps if options.steps is not None else settings.values.get("num_integration_steps", 100)
-    if type(count) is not int or not 1 <= count <= MOST_STEPS:
-        given = f"{config.directory / CONFIG}: {count!r:.80} integration steps"
-        how = "(num_integration_steps, or steps= and --steps)"
-        raise SpecError(f"{given} {how}; expected 1 to {MOST_STEPS}.")
+    method = options.sampler or config.settings.choice("integration_method", *METHODS)
+    count = integration_steps(config.settings, options, "num_integration_steps", 100)
     return flow_matching_table(torch.linspace(0, 1, count + 1).tolist(), method)
 
 
@@ -260,10 +249,10 @@ def _tokens(
     return tokens, mask
 
 
-def _read_weights(config: MultiTaskDiTConfig) -> dict[str, torch.Tensor]:
+def _read_weights(config: MultiTaskDiTConfig, options: LoadOptions) -> dict[str, torch.Tensor]:
     """The weights of a policy as float32, under the names that transformers 5 gives."""
     found = {}
-    for name, value in read_weights(config, ".position_ids").items():
+    for name, value in read_weights(config, options, ".position_ids").items():
         # transformers 4 saves an encoder below a level of its own, which transformers 5 leaves out.
         short = name.replace(".model.vision_model.", ".model.")
         found[short.replace(".text_encoder.text_model.", ".text_encoder.")] = value

@@ -55,7 +55,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
             f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"
             " compiled in. Leave the task out: the policy takes tokens as an observation."
         )
-    weights = _weights(shared)
+    weights = _weights(shared, options)
     try:
         config = read_config(shared, weights, adaptive)
         with torch.device("meta"):
@@ -138,16 +138,14 @@ def _layers(weights: Mapping[str, Tensor], start: str) -> int:
 def _shape(weights: Mapping[str, Tensor], name: str, axes: int) -> tuple[int, ...]:
     value = weights.get(name)
     if value is None or value.ndim != axes or not value.numel():
-        raise CheckpointError(
-            f"weight {name} is missing, or has not {axes} axes; expected the weights of a pi0 or pi05."
-        )
+        raise CheckpointError(f"weight {name} is missing, or has not {axes} axes; expected weights of a pi0 or pi05.")
     return tuple(value.shape)
 
 
-def _weights(shared: LeRobotConfig) -> dict[str, Tensor]:
+def _weights(shared: LeRobotConfig, options: LoadOptions) -> dict[str, Tensor]:
     """The weights under the names of ``Pi``, whichever transformers saved them, lerobot or openpi's converter."""
     found = {}
-    for name, value in read_weights(shared, *_UNREAD).items():
+    for name, value in read_weights(shared, options, *_UNREAD).items():
         short = name.removeprefix("model.").replace(".vision_tower.vision_model.", ".vision_tower.")
         if not short.startswith(f"{_VISION}head."):
             found[short] = value

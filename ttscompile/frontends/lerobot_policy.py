@@ -8,14 +8,18 @@ import torch
 from torch import nn
 
 from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec
+from ..errors import CheckpointError, SpecError
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .lerobot_config import ACTION, CONFIG, WEIGHTS, LeRobotConfig
 from .lerobot_processors import Normalizer, Processors
 from .loops import Loops
+from .lora import find_base, merged, read_adapter
 from .saved_weights import as_float32, read_tensors, require_memory
-from .scheduler import configured_loops
+from .scheduler import MOST_STEPS, configured_loops
+from .settings import Settings
 
+TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 _SCHEDULER_SETTINGS = {
     "num_train_timesteps": 100,
     "beta_start": 0.0001,
@@ -87,6 +91,14 @@ def _observations(config: LeRobotConfig, processors: Processors) -> dict[str, Ob
     return specs
 
 
+def language_inputs(tokens: int, vocabulary: int) -> dict[str, ObservationSpec]:
+    """The instruction, as tokens."""
+    return {
+        TOKENS: ObservationSpec((tokens,), dtype="int64", window=False, bounds=(0.0, float(vocabulary - 1))),
+        MASK: ObservationSpec((tokens,), dtype="bool", window=False, bounds=(0.0, 1.0)),
+    }
+
+
 def diffusion_loops(config: LeRobotConfig, options: LoadOptions) -> Loops:
     """The denoising loops of a policy that was trained with diffusion; the defaults are lerobot's."""
     settings = config.settings.values
@@ -97,9 +109,23 @@ def diffusion_loops(config: LeRobotConfig, options: LoadOptions) -> Loops:
     return configured_loops(scheduler, settings.get("num_inference_steps"), options, where=where)
 
 
-def read_weights(config: LeRobotConfig, *without: str) -> dict[str, torch.Tensor]:
-    """The weights of a policy as float32."""
-    path = config.directory / WEIGHTS
+def integration_steps(settings: Settings, options: LoadOptions, name: str, default: int) -> int:
+    """Of flow matching: steps that the entry ``name`` says, or that are asked for in their place."""
+    if options.spacing is not None:
+        raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
+    count = options.steps if options.steps is not None else settings.values.get(name, default)
+    if type(count) is not int or not 1 <= count <= MOST_STEPS:
+        raise SpecError(f"{settings.where}{count!r:.80} integration steps ({name}, --steps); expected 1-{MOST_STEPS}.")
+    return count
+
+
+def read_weights(config: LeRobotConfig, options: LoadOptions, *without: str) -> dict[str, torch.Tensor]:
+    """The weights of a policy as float32, an adapter merged into its base; without those whose names end so."""
+    adapter, directory = read_adapter(config.directory, config.settings), config.directory
+    if adapter is None and options.base is not None:
+        raise CheckpointError(f"{directory}: the option base is for an adapter; found a whole policy. Leave it out.")
+    path = (directory if adapter is None else find_base(adapter, options.base)) / WEIGHTS
     require_memory(path, without)
     saved = {name: value for name, value in read_tensors(path).items() if not name.endswith(without)}
-    return as_float32(saved, f"{path}: ")
+    weights = as_float32(saved, f"{path}: ")
+    return weights if adapter is None else merged(directory, adapter, weights, without)

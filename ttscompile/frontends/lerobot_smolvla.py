@@ -76,7 +76,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
         found = find_encoder(tokenizer, folders, "smolvlm")
         task = torch.tensor([task_tokens(text, tokenizer, found, length, config.vocabulary)])
-    weights = {name.removeprefix("model."): value for name, value in read_weights(shared, *_UNREAD).items()}
+    weights = {name.removeprefix("model."): value for name, value in read_weights(shared, options, *_UNREAD).items()}
     try:
         with torch.device("meta"):  # compared before anything of the configured sizes takes memory
             network = SmolVLA(config)
@@ -116,10 +116,8 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     )
     if heads % language.groups or language.channels % 2:
         raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
-    expert, scale = (
-        expert_of(language, positive_number(settings, "expert_width_multiplier", 0.75)),
-        model.number("scale_factor", 2),
-    )
+    expert = expert_of(language, positive_number(settings, "expert_width_multiplier", 0.75))
+    scale = model.number("scale_factor", 2)
     if not 2 <= expert.width <= MOST or expert.width % 2:
         raise settings.refusal("expert_width_multiplier", f"a share that leaves an even width of {width}", 0.75)
     return SmolVLAConfig(
@@ -149,9 +147,7 @@ def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
 
 def _layers(settings: Settings, there: int) -> int:
     """Layers of the language model that are used, and of the expert."""
-    wanted, expert = (
-        settings.values.get(f"num_{name}_layers", default) for name, default in (("vlm", 16), ("expert", -1))
-    )
+    wanted, expert = settings.values.get("num_vlm_layers", 16), settings.values.get("num_expert_layers", -1)
     if type(wanted) is not int or type(expert) is not int:
         raise settings.refusal("num_vlm_layers", "a whole number, as num_expert_layers is")
     used = min(wanted, there) if wanted > 0 else there

@@ -19,13 +19,11 @@ from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
 from .families import LoadOptions
 from .lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import policy_spec
+from .lerobot_policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
 from .lerobot_processors import Normalizer, Processors, read_processors
 from .loops import loops_of
-from .scheduler import MOST_STEPS
 from .settings import Settings
 
-TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 _EMPTY = "observation.images.empty_camera_"
 """How lerobot calls a camera that the checkpoint knows and no robot has."""
 
@@ -81,13 +79,7 @@ def vla_spec(
         sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
             absent where it is compiled in.
     """
-    language = {}
-    if "tokens" in sizes:
-        shape, last = (sizes["tokens"],), float(sizes["vocabulary"] - 1)
-        language = {
-            TOKENS: ObservationSpec(shape, dtype="int64", window=False, bounds=(0.0, last)),
-            MASK: ObservationSpec(shape, dtype="bool", window=False, bounds=(0.0, 1.0)),
-        }
+    language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if "tokens" in sizes else {}
     source = {"policy": str(config.settings.values["type"])}
     source |= {} if options.task is None else {"task": options.task}
     source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
@@ -107,17 +99,10 @@ def vla_spec(
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     """From time 1, noise, to time 0, actions."""
     name = "num_steps" if "num_steps" in settings.values else "num_inference_steps"
-    count = options.steps if options.steps is not None else settings.values.get(name, 10)
-    if options.spacing is not None:
-        raise SpecError("spacing is of the timesteps of diffusion; this policy's objective is flow matching.")
+    count = integration_steps(settings, options, name, 10)
     if options.sampler not in (None, *METHODS):
         raise SpecError(f"sampler {options.sampler!r} is of diffusion; expected {' or '.join(METHODS)} of this policy.")
-    if type(count) is not int or not 1 <= count <= MOST_STEPS:
-        raise SpecError(
-            f"{settings.where}{count!r:.80} steps ({name}, or steps= and --steps); expected 1 to {MOST_STEPS}."
-        )
-    method = options.sampler or "euler"
-    return flow_matching_table(count, method, start=1.0, end=0.0)
+    return flow_matching_table(count, options.sampler or "euler", start=1.0, end=0.0)
 
 
 def padded_size(settings: Settings, name: str, own: int) -> int:

@@ -34,7 +34,7 @@ _NO_LOOP = (
     " use torch.compile."
 )
 _LLAMA = "There is no denoising loop to compile. llama.cpp runs such files."
-_MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
+MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _BY_NAME = (
     (r"\.onnx$", "an ONNX model", "It has no denoising loop. Convert the checkpoint that it was exported from."),
     (r"\.msgpack$", "a checkpoint of Flax", _JAX),
@@ -75,7 +75,7 @@ POLICIES = (
 
 DIRECTORIES = (
     Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
-    Refusal(r"^adapter_config\.json$", "a PEFT adapter without the weights that it adapts", _MERGE),
+    Refusal(r"^adapter_config\.json$", "a PEFT adapter without the config.json of its policy", MERGE),
     Refusal(r"^(example_batch|octo[^/]*)\.msgpack$", "an Octo model", _OCTO),
     Refusal(_JAX_FILES, "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
@@ -132,7 +132,7 @@ STATES = (
         " that all paths cross becomes one block, and where there are none the compiler says so.",
     ),
     Refusal(r"(^|\.)(down|up)_modules\.|(^|\.)unet\.", "weights of a U-Net", _WEIGHTS),
-    Refusal(r"\blora_[AB]\b", "an adapter (LoRA) without the weights that it adapts", _MERGE),
+    Refusal(r"\blora_[AB]\b", "an adapter (LoRA) without the weights that it adapts", MERGE),
     Refusal(r"", "a plain dictionary of weights", _WEIGHTS),
 )
 """By the name of a weight; the first row that matches any of them. The last matches every checkpoint."""

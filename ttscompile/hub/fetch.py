@@ -22,8 +22,12 @@ MANIFEST = "manifest.json"
 CARD = "README.md"
 _ABOUT = (CARD, "LICENSE", "LICENSE.md", "LICENSE.txt")
 _CONFIG, _WEIGHTS = "config.json", "model.safetensors"
+_POLICIES = (
+    {_CONFIG, _WEIGHTS},
+    {_CONFIG, "adapter_config.json", "adapter_model.safetensors"},
+)  # a whole one or an adapter
 _OF_LEROBOT = re.compile(
-    rf"{_CONFIG}|policy_(pre|post)processor\.json|[^/]+\.safetensors"
+    rf"(adapter_)?{_CONFIG}|policy_(pre|post)processor\.json|[^/]+\.safetensors"
     r"|[^/]+/(config|vocab|tokenizer|tokenizer_config|special_tokens_map|added_tokens)\.json|[^/]+/merges\.txt"
 )
 """What ``convert`` reads of a directory that lerobot saved, whose processors name the files of their statistics as they
@@ -105,14 +109,14 @@ def _whole(name: HubName, kept: list[str]) -> bool:
     One ``.ckpt`` does not: the repository may have others, which nobody downloaded.
     """
     inside = f"{name.inside}/" if name.inside else ""
-    return {inside + each for each in (_CONFIG, _WEIGHTS, *_PROCESSORS)} <= set(kept)
+    return any({inside + each for each in (*policy, *_PROCESSORS)} <= set(kept) for policy in _POLICIES)
 
 
 def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
     """Of the files of a repository those that a checkpoint in it is made of."""
     inside = f"{name.inside}/" if name.inside else ""
     below = [each.removeprefix(inside) for each in files if each.startswith(inside)]
-    if {_CONFIG, _WEIGHTS} <= set(below):
+    if any(policy <= set(below) for policy in _POLICIES):
         return [inside + each for each in below if _OF_LEROBOT.fullmatch(each)]
     found = [inside + each for each in below if each.endswith(_CHECKPOINT)]
     if len(found) == 1:
