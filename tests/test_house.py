@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "ir": BASE,
     "lower": BASE | {"ir"},
     "passes": BASE | {"ir"},
-    "frontends": BASE | {"samplers"},
+    "frontends": BASE | {"hub", "samplers"},
     "capture": BASE | {"frontends", "ir"},
     "artifact": BASE | {"ir"},
     "runtimes": BELOW_ARTIFACT | {"hub"},

@@ -79,11 +79,13 @@ def merged(directory: Path, settings: Settings, base: Tensors, without: tuple[st
         changes.setdefault(name, {})[part[2] if part else ""] = value
     if not changes or not all(kept.values()):
         raise where.error(f"found {len(changes)} changes and of modules_to_save {kept}; expected weights of each")
+    done = set[str]()
     for name, parts in changes.items():
         if not name.endswith(without):  # which the policy does not compute
             own = [name] if name in base else [each for each in base if _LEVELS.sub("", each) == _LEVELS.sub("", name)]
-            if len(own) != 1:
-                raise where.error(f"{name:.300} is no weight of the base; expected the adapter of this base")
+            if len(own) != 1 or own[0] in done:
+                raise where.error(f"{name:.300} is no weight of the base, or twice; expected the adapter of this base")
+            done.add(own[0])
             # A whole weight of another shape is what ``require_weights`` refuses.
             base[own[0]] = parts[""] if parts.keys() == {""} else _layer(settings, name, base[own[0]], parts)
     return base
