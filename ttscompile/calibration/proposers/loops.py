@@ -37,8 +37,9 @@ from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
 from ..trials import Trials
 
-HOPELESS = 2.5
-"""A number of steps is not searched any further if its crowded schedules are so many times as far off as may be."""
+HOPELESS = 5.0
+"""A number of steps is not searched any further if the error of its crowded schedules, as a share of what other noise
+changes, is so many times what a distance may be. A search halves that error, and a distance grows less than it."""
 
 CLEARLY = 1.2
 """Nothing is left out as slower that takes less than so many times as long: costs are medians of a few calls on a
