@@ -53,8 +53,8 @@ def build(
     """Convert a checkpoint, try what a plan can be, and make the fastest one the default that is near to the original.
 
     Tried are loops, numbers and places of computed steps with their corrections, eight bits by part, and the tokens of
-    image encoders. All are judged on held-out episodes against the original, and timed on this machine. Of plans that
-    are as fast within a tenth the nearest is chosen.
+    image encoders. All are judged on held-out episodes against the original, and timed on this machine. If
+    other plans take at most a tenth longer than the fastest, the nearest of them is chosen.
 
     Args:
         checkpoint: see ``convert``.

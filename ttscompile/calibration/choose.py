@@ -18,8 +18,8 @@ from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
 
 ALIKE = 1.1
-"""Calls are as fast if one takes at most so many times as long as another: the nearest of such plans is chosen. Where
-little is left to compute, a further step costs less than timing is off, and makes a plan several times as near."""
+"""Plans that take at most so many times as long as the fastest count as equally fast: the nearest of them is chosen.
+Where little is left to compute, a further step costs less than timing is off, and makes a plan much nearer."""
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,8 @@ OBSERVATIONS = 32
 FEWEST_OBSERVATIONS = 4
 """That it answers whatever the time."""
 
-ANSWERING = 0.15
-"""Share of the time limit for the answers of either part: of a policy that takes seconds there are fewer."""
+JUDGING = 0.15
+"""Share of the time limit for the answers of either part that plans are judged by. A slow policy gives fewer."""
 
 EPISODES = 16
 """That these are of, at most."""
@@ -264,7 +264,7 @@ class Trials:
         if key not in self.state.progress:
             self._answers(part, stretches, calls[:1])
             took = max(self.clock.elapsed() - begun, 1e-9)
-            found = min(ANSWERING * self.clock.limit / took, len(calls))
+            found = min(JUDGING * self.clock.limit / took, len(calls))
             self.state.progress[key] = max(int(found), min(FEWEST_OBSERVATIONS, len(calls)))
             if self.state.progress[key] < len(calls):
                 self.bar.warn(

@@ -165,7 +165,7 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     manifest = artifact.manifest
     if tried := (manifest.calibration or {}).get("frontier", ()):
         points = tuple(Point(_nearness(row), row["name"], _distance(row), row["milliseconds"]) for row in tried)
-        text = "All plans that the build tried, as it judged and timed them on the machine where it ran."
+        text = "The plans that the build chose among, as it judged and timed them on the machine where it ran."
     else:
         judged = facts.scores(manifest.calibration, ("distance",))
         known = [one for one in measured if one.plan in judged]

@@ -148,7 +148,7 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     page = build(artifact, policy, Given(calls=1))
     assert told in page.lead
     first = page.sections[0]
-    assert len(first.pictures) == 1 and "All plans that the build tried" in first.text[0]
+    assert len(first.pictures) == 1 and "The plans that the build chose among" in first.text[0]
     (table,) = first.tables
     assert {row[1]: row[2] for row in table.rows} == {
         name: "0" if name == DENSE else f"{max(row['distance'], 0):.4g}" for name, row in rows.items()
