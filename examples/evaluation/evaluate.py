@@ -3,7 +3,8 @@
     python examples/evaluation/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48 --jobs 4
 
 What the score of an episode is, 0 to 1, its environment says. Differences are taken episode by episode, against the
-first variant.
+first variant. A second table says of each other variant whether it is as good as the first: equivalent within the
+margins, worse, or not told by so few episodes, and how many would probably do.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from typing import Any
 
 import click
 import numpy as np
-from bootstrap import Estimate, estimate, paired_difference
+from bootstrap import Estimate, estimate, paired_difference, paired_difference_of_shares, share
 from environments import Environment, environment_class, environment_option
 from episodes import Episodes
+from equivalence import EQUIVALENT, SCORE_MARGIN, SUCCESS_MARGIN, Verdict, joined, verdict
 from jobs import Processes, fill_cache
 from rich.console import Console
 from rich.progress import Progress
@@ -137,10 +139,10 @@ def summarise(label: str, rollout: Rollout, baseline: Rollout) -> Evaluation:
     return Evaluation(
         label=label,
         score=estimate(score),
-        success=estimate(success),
+        success=share(success),
         measures={name: estimate([e.measures[name] for e in episodes]) for name in episodes[0].measures},
         score_difference=None if first else paired_difference(score, base_score),
-        success_difference=None if first else paired_difference(success, base_success),
+        success_difference=None if first else paired_difference_of_shares(success, base_success),
         sparsity=float(np.mean(rollout.sparsity)) if rollout.sparsity else None,
         flops=float(np.mean(rollout.flops)) if rollout.flops else None,
         legalised=sum(rollout.legalised),
@@ -160,6 +162,36 @@ def _by_task(label: str, rollout: Rollout, baseline: Rollout) -> dict[str, Evalu
         own, base = (Rollout(tuple(e for e in r.episodes if e.task == task), ()) for r in (rollout, baseline))
         found[task] = summarise(label, own, own if rollout is baseline else base)
     return found
+
+
+def verdicts_of(evaluations: Sequence[Evaluation], margins: tuple[float, float]) -> list[tuple[Verdict, Verdict]]:
+    """Of score and of success, for each variant but the first.
+
+    The variants share the error of 5 %. The two measures of a variant need not: it is called equivalent only if both
+    are.
+    """
+    base_score, base_success = _columns(evaluations[0].rollout)
+    comparisons, found = len(evaluations) - 1, []
+    for score, success in (_columns(each.rollout) for each in evaluations[1:]):
+        by_score = verdict(score, base_score, margins[0], comparisons=comparisons)
+        by_success = verdict(success, base_success, margins[1], shares=True, comparisons=comparisons)
+        found.append((by_score, by_success))
+    return found
+
+
+def verdict_table(evaluations: Sequence[Evaluation], verdicts: Sequence[tuple[Verdict, Verdict]]) -> Table:
+    """Whether the others are as good as the first, in a word each."""
+    score, success = verdicts[0]
+    title = f"as good as {evaluations[0].label}? {score.episodes} paired episodes"
+    allowed = f"{EQUIVALENT}: less than {score.margin:g} of the score and {success.margin:.0%} of success is lost"
+    level = f"all {len(verdicts)} rows hold with 95 %" if len(verdicts) > 1 else "with 95 % confidence"
+    table = Table(title=title, caption=f"{allowed}, {level}")
+    table.add_column("variant", overflow="fold")
+    for column in ("verdict", "score", "success"):
+        table.add_column(column, overflow="fold")
+    for e, pair in zip(evaluations[1:], verdicts, strict=True):
+        table.add_row(e.label, joined(pair), *(str(each) for each in pair))
+    return table
 
 
 def evaluation_table(
@@ -203,6 +235,33 @@ def task_table(evaluations: Sequence[Evaluation]) -> Table:
     return table
 
 
+def print_tables(
+    title: str,
+    evaluations: Sequence[Evaluation],
+    seeds: Sequence[int],
+    timed: Sequence[Timed],
+    verdicts: Sequence[tuple[Verdict, Verdict]],
+) -> None:
+    """All that is known of the variants; tables that have nothing to say are left out."""
+    console = results_console()
+    console.print(evaluation_table(title, evaluations, seeds, timed))
+    if evaluations[0].tasks:
+        console.print(task_table(evaluations))
+    if verdicts:
+        console.print(verdict_table(evaluations, verdicts))
+
+
+margins_option = click.option(
+    "--margins",
+    nargs=2,
+    type=click.FloatRange(0, 1, min_open=True),
+    default=(SCORE_MARGIN, SUCCESS_MARGIN),
+    show_default=True,
+    metavar="SCORE SUCCESS",
+    help="What a variant may lose and still be called equivalent to the first.",
+)
+
+
 @click.command()
 @click.argument("variants", nargs=-1, required=True, metavar="DIR[:PLAN]...")
 @environment_option
@@ -215,6 +274,7 @@ def task_table(evaluations: Sequence[Evaluation]) -> Table:
 @click.option("--no-cache", is_flag=True, help="Run all episodes, and keep none.")
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes that run episodes.")
 @ray_option
+@margins_option
 @click.option(
     "--plot",
     "picture",
@@ -234,6 +294,7 @@ def main(  # noqa: C901  # checks each option in turn
     no_cache: bool,
     jobs: int,
     ray: str | None,
+    margins: tuple[float, float],
     picture: Path | None,
     as_json: bool,
 ) -> None:
@@ -262,6 +323,7 @@ def main(  # noqa: C901  # checks each option in turn
             with RayPool(ray) as pool:
                 fill_cache(environment, variants, seeds, batch, runtime, cache, pool, finished)
         evaluations = evaluate(make, opened, seeds, batch, finished, caches)
+    verdicts = verdicts_of(evaluations, margins)
     timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows, TIMED_CALLS)
     machine = fingerprint()
     identities = [one.policy.info.identity for one in opened]
@@ -273,13 +335,13 @@ def main(  # noqa: C901  # checks each option in turn
         figures = [{"identity": one, **e.to_json()} for one, e in zip(identities, evaluations, strict=True)]
         for each, time in zip(figures, timed, strict=False):
             each["latency_ms"] = dataclasses.asdict(time)
+        for each, (score, success) in zip(figures[1:], verdicts, strict=True):
+            by = {"score": dataclasses.asdict(score), "success": dataclasses.asdict(success)}
+            each["verdict"] = {"word": joined((score, success)), **by}
         document = {"environment": environment, "machine": machine, "threads": threads, "variants": figures}
         click.echo(json.dumps(document, indent=2))
     else:
-        console = results_console()
-        console.print(evaluation_table(make.title, evaluations, seeds, timed))
-        if evaluations[0].tasks:
-            console.print(task_table(evaluations))
+        print_tables(make.title, evaluations, seeds, timed, verdicts)
         for text, identity in zip(variants, identities, strict=True):
             click.echo(f"{text}: identity {abbreviated(identity)}")
     for e in evaluations:

@@ -1,47 +1,71 @@
-"""From a trained checkpoint to a compiled policy that drives Push-T: convert, record, calibrate, evaluate, time.
+"""From a trained checkpoint to a compiled policy that is as good as the original: record, build, time, drive.
 
     python examples/pusht/demo.py
 
-The demo compiles the policy with another sampler (DPM-Solver++, 16 steps where the original takes 100), predicts only
-12 of the 16 actions, and calibrates for 6 computed steps of these 16. It then compares the result with the original on
-episodes that it has not seen. That takes about twelve minutes on 2 cores; everything it makes is in ``build/pusht``.
+The policy pushes a T-shaped block onto its goal; LeRobot's own code trained it, by flow matching, as vision-language-
+action models are. The demo records 16 episodes, has ``ttscompile build`` find the fastest plan, times it beside
+PyTorch, and drives a thousand paired episodes with each. It ends with a verdict: equivalent to the original within a
+margin, or not. That takes about ten minutes on 2 cores; everything it makes is in ``build/pusht``.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import click
-from benchmark import CHECKPOINT, Measurement, speed_table, time_calls
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 import ttscompile
-from ttscompile.calibration.result import CalibrationResult
-from ttscompile.core.plan import DENSE, FULL
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.contestants import Way, contestants, originals
+from ttscompile.cli.frontier import print_frontier
+from ttscompile.core.plan import DENSE
+from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.plots.maps import plot_plan
+from ttscompile.report.timing import measure
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
 from animate import save_animation
-from bootstrap import Estimate, paired_difference
 from environments.pusht import PushT
 from episodes import Episodes
-from evaluate import Evaluation, evaluate, evaluation_table
+from equivalence import EQUIVALENT, SCORE_MARGIN, SUCCESS_MARGIN, Verdict, joined
+from evaluate import Evaluation, evaluate, evaluation_table, verdict_table, verdicts_of
 from jobs import Processes, fill_cache
 from record import save_trajectories
 from rollout import run_episodes
-from variants import Variant, first_seed_option, open_variant, results_console, run, threads_option
+from variants import first_seed_option, open_variant, results_console, run, threads_option
 
-BUILD = Path(__file__).resolve().parents[2] / "build" / "pusht"
-SAMPLER, STEPS, HORIZON = "dpmsolver++", 16, 12
-ORIGINAL, ALL_COMPUTED, COMPILED = "original", "16 steps, all computed", "compiled"
-"""The three ways to run the policy, as the last table calls them."""
+EXAMPLES = Path(__file__).resolve().parents[1]
+BUILD = EXAMPLES.parent / "build" / "pusht"
+POLICIES: Mapping[str, tuple[Path, Mapping[str, str]]] = {
+    "flow": (EXAMPLES / "policies" / "flow" / "policy", {"task": "push the T onto its place"}),
+    "transformer": (EXAMPLES / "pusht" / "pusht_dpt_ema_fp16.ckpt", {}),
+    "unet": (EXAMPLES / "policies" / "unet" / "pusht_unet_ema_fp16.ckpt", {}),
+}
+"""Checkpoints that push the T, and what ``build`` has to be told of them."""
+ORIGINAL, SAFE = "original", "safe"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One way to make a call, on the way from PyTorch to the chosen plan.
+
+    Attributes:
+        what: it does, for people.
+        ms: median of a call.
+    """
+
+    what: str
+    ms: float
 
 
 def progress_bar() -> Progress:
@@ -50,152 +74,108 @@ def progress_bar() -> Progress:
 
 
 def record_calls(artifact: Path, output: Path, episodes: int, batch: int, threads: int) -> str:
-    """Drive Push-T with all of the 16 steps computed on seeds 0, 1, ... and write the observations.
+    """Drive Push-T with the original policy on seeds 0, 1, ... and write the observations.
 
     Returns:
         A line about it.
     """
-    full = open_variant(f"{artifact}:{FULL}", "onnxruntime", threads)
+    original = open_variant(f"{artifact}:{DENSE}", "onnxruntime", threads)
     with progress_bar() as progress:
         task = progress.add_task("recording episodes", total=episodes)
-        rollout = run_episodes(PushT, full, range(episodes), batch, lambda n: progress.update(task, completed=n))
+        rollout = run_episodes(PushT, original, range(episodes), batch, lambda n: progress.update(task, completed=n))
     save_trajectories(output, [episode.windows for episode in rollout.episodes])
     return f"{sum(episode.calls for episode in rollout.episodes)} calls in {episodes} episodes"
 
 
-def compare(artifact: Path, seeds: Sequence[int], batch: int, jobs: int) -> list[Evaluation]:
-    """Evaluate the original, the 16 steps and the compiled policy on the same seeds, with the same initial noise.
+def drive(artifact: Path, plans: Sequence[str], seeds: Sequence[int], batch: int, jobs: int) -> list[Evaluation]:
+    """Evaluate the original and plans on the same seeds, with the same initial noise.
 
     The original is run by onnxruntime, which gives the actions of the checkpoint's own code and takes less time.
     Episodes are kept beside the artifact, so that a second demo or ``evaluate.py`` need not run them again.
     """
     name, runtime, cache = "pusht", "onnxruntime", artifact.parent / "episodes"
-    texts = {f"{artifact}:{DENSE}": ORIGINAL, f"{artifact}:{FULL}": ALL_COMPUTED, str(artifact): COMPILED}
+    texts = [f"{artifact}:{plan}" for plan in (DENSE, *plans)]
+    labels = dict(zip(texts, (ORIGINAL, *plans), strict=True))
     with progress_bar() as progress:
-        tasks = {text: progress.add_task(f"evaluating: {label}", total=len(seeds)) for text, label in texts.items()}
+        tasks = {text: progress.add_task(f"driving: {label}", total=len(seeds)) for text, label in labels.items()}
 
         def finished(text: str, count: int) -> None:
             progress.update(tasks[text], completed=count)
 
-        fill_cache(name, list(texts), seeds, batch, runtime, cache, Processes(jobs), finished)
-    opened = [open_variant(text, runtime, 1) for text in texts]
+        fill_cache(name, texts, seeds, batch, runtime, cache, Processes(jobs), finished)
+    opened = [replace(open_variant(text, runtime, 1), label=label) for text, label in labels.items()]
     caches = [Episodes(cache, name, variant, runtime) for variant in opened]
-    variants = [Variant(texts[v.label], v.policy, v.plan, v.noise) for v in opened]
-    return evaluate(PushT, variants, seeds, batch, caches=caches)
+    return evaluate(PushT, opened, seeds, batch, caches=caches)
 
 
-def time_alone(artifact: Path, checkpoint: Path, runs: int) -> list[Measurement]:
-    """Time eager, all computed and compiled with one thread each, in a process that has done nothing else."""
+def time_steps(checkpoint: Path, artifact: Path, plan: str, calls: int) -> list[Step]:
+    """What each step from PyTorch to a plan makes of a call, one thread each: compiled, sparse, in fewer bits."""
+    opened = load_artifact(artifact)
+    chosen = opened.plan(plan)
+    names = [f"{plan}@{FP32}", plan] if chosen.precision else [plan]
+    first, *_ = originals(checkpoint, None, 1, opened)
+    measured = measure([first, *contestants({"": opened}, names, [Way()])], calls, seed=0)
+    computed = 0 if chosen.cells is None else int((np.asarray(chosen.cells) == 0).all(axis=1).sum())
+    told = ["the original, in PyTorch", "compiled, everything computed", f"{computed} steps computed"]
+    bits = f"8-bit weights in {', '.join(chosen.precision)}"
+    return [Step(what, each.median_ms) for what, each in zip([*told, bits], measured, strict=False)]
+
+
+def time_alone(checkpoint: Path, artifact: Path, plan: str, calls: int) -> list[Step]:
+    """``time_steps``, in a process that has done nothing else."""
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as process:
-        measurements: list[Measurement] = process.submit(time_calls, artifact, checkpoint, runs, threads=1).result()
-    return measurements
+        return process.submit(time_steps, checkpoint, artifact, plan, calls).result()
 
 
-def calibration_table(result: CalibrationResult) -> Table:
-    """The plans that calibration judged, on the episodes that it did not learn from."""
-    title = f"distance from the original on {result.calls['validation']} observations that were held out"
-    table = Table(title=title, caption="1: as far as other noise moves the original's actions")
-    table.add_column("plan")
-    for column in ("distance", "95 % interval", "cells reused", "FLOPs saved"):
-        table.add_column(column, justify="right")
-    for name, score in result.plans.items():
-        table.add_row(
-            f"{name} (default)" if name == result.default_plan else name,
-            f"{score.distance:.3f}",
-            "[{:.3f}, {:.3f}]".format(*score.interval),
-            f"{score.sparsity:.1%}",
-            f"{score.flops_saved:.1%}",
-        )
-    return table
-
-
-def successes(evaluation: Evaluation) -> list[float]:
-    """1 for each episode that covered the goal, else 0."""
-    return [float(episode.success) for episode in evaluation.rollout.episodes]
-
-
-def percent(estimate: Estimate, sign: str = "") -> str:
-    """A share with its interval, in percent."""
-    return f"{estimate.mean:{sign}.0%} [{estimate.low:{sign}.0%}, {estimate.high:{sign}.0%}]"
-
-
-def difference(estimate: Estimate | None) -> str:
-    """A difference of scores with its interval; nothing for what the others are compared with."""
-    return "" if estimate is None else f"{estimate.mean:+.3f} [{estimate.low:+.3f}, {estimate.high:+.3f}]"
-
-
-def final_table(speeds: Sequence[Measurement], evaluations: Sequence[Evaluation]) -> Table:
-    """The three ways to run the policy, side by side: speed of one call, and how well they do on the same episodes."""
-    first = speeds[0]
-    full, compiled = evaluations[1:]
-    from_full = paired_difference(successes(compiled), successes(full))
-    episodes = len(evaluations[0].rollout.episodes)
-    table = Table(title=f"Push-T, the same {episodes} episodes for each; in brackets 95 % intervals")
+def speed_table(steps: Sequence[Step]) -> Table:
+    """Each step with its own factor, and all together."""
+    table = Table(title="one call, one thread", caption="medians of calls that took turns")
     table.add_column("")
-    for label in (ORIGINAL, ALL_COMPUTED, COMPILED):
-        table.add_column(label, justify="right")
-    table.add_row("ms a call, 1 thread", *(f"{m.median:.1f}" for m in speeds))
-    table.add_row("times faster than the original", *(f"{first.median / m.median:.1f}" for m in speeds))
-    table.add_row("calls a second", *(f"{1000 / m.median:.1f}" for m in speeds))
-    table.add_row("GFLOP a call", *(f"{m.flops / 1e9:.2f}" for m in speeds))
-    table.add_row("blocks reused, not computed", *(f"{m.sparsity:.1%}" for m in speeds))
-    table.add_row("score, at most 1", *(str(e.score) for e in evaluations))
-    table.add_row("   its difference from the original", *(difference(e.score_difference) for e in evaluations))
-    table.add_row("success", *(percent(e.success) for e in evaluations))
-    table.add_row(
-        "   its difference from the original",
-        *("" if e.success_difference is None else percent(e.success_difference, "+") for e in evaluations),
-    )
-    table.add_row("   its difference from all computed", "", "", percent(from_full, "+"))
+    for column in ("ms a call", "faster than the row above", "than the original"):
+        table.add_column(column, justify="right")
+    for before, step in zip([None, *steps], steps, strict=False):
+        factors = ("", "") if before is None else (f"{before.ms / step.ms:.1f} x", f"{steps[0].ms / step.ms:.1f} x")
+        table.add_row(step.what, f"{step.ms:.2f}", *factors)
     return table
 
 
-def conclusion(speeds: Sequence[Measurement], evaluations: Sequence[Evaluation]) -> str:
-    """What the table means: the speed, and whether success was kept."""
-    original, compiled = speeds[0], speeds[-1]
-    _, full, sparse = evaluations
-    change = sparse.success_difference
-    assert change is not None
-    return (
-        f"A compiled call takes {compiled.median:.0f} ms where the original takes {original.median:.0f} ms:"
-        f" it is {original.median / compiled.median:.0f} times faster."
-        f" {_told('the original', change)}"
-        f" {_told('the same 16 steps, all computed', paired_difference(successes(sparse), successes(full)))}"
-        f" These are {len(sparse.rollout.episodes)} episodes; docs/evidence/results.md has 200."
-    )
+def conclusion(plan: str, steps: Sequence[Step], pair: tuple[Verdict, Verdict]) -> str:
+    """What was found, in the order in which somebody would ask."""
+    score, success = pair
+    faster = f"Plan '{plan}' takes {steps[-1].ms:.1f} ms a call, and is {steps[0].ms / steps[-1].ms:.0f} times faster"
+    within = f"{score.margin:g} of the score and {success.margin:.0%} of success"
+    word = joined(pair)
+    if word == EQUIVALENT:
+        return f"{faster}. It is equivalent to the original: less than {within} is lost, in {score.episodes} episodes."
+    if wanted := [each.enough for each in pair if each.enough is not None]:
+        return (
+            f"{faster}. {score.episodes} episodes are too few to say whether {within} is lost; {max(wanted):,} may do."
+        )
+    return f"{faster}. It is worse than the original, or not told from a loss of {within}."
 
 
-def _told(other: str, change: Estimate) -> str:
-    """Whether the compiled policy's success differs from another's."""
-    if change.low <= 0 <= change.high:
-        return f"Its success is not told apart from that of {other}: the interval of the difference contains 0."
-    return f"Its success is {'higher' if change.mean > 0 else 'lower'} than that of {other}."
+def best_of(evaluations: Sequence[Evaluation]) -> int:
+    """The first plan that is equivalent to the original, else the last: plans come fastest first."""
+    words = [joined(pair) for pair in verdicts_of(evaluations, (SCORE_MARGIN, SUCCESS_MARGIN))]
+    return words.index(EQUIVALENT) if EQUIVALENT in words else len(words) - 1
 
 
 @click.command()
-@click.option("--checkpoint", default=CHECKPOINT, show_default=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--policy", default="flow", show_default=True, type=click.Choice(list(POLICIES)))
 @click.option("--directory", default=BUILD, show_default=True, type=click.Path(file_okay=False, path_type=Path))
 @click.option("--record-episodes", default=16, show_default=True, type=click.IntRange(2))
-@click.option("--calibration-minutes", default=6.0, show_default=True, type=click.FloatRange(min=0.1))
-@click.option(
-    "--target-sparsity",
-    default=0.625,
-    show_default=True,
-    type=click.FloatRange(0, 1, max_open=True),
-    help="Share of the blocks to reuse: of 16 steps 6 are computed.",
-)
-@click.option("--episodes", default=32, show_default=True, type=click.IntRange(1), help="Of the evaluation.")
+@click.option("--minutes", default=5.0, show_default=True, type=click.FloatRange(min=0.1), help="Of the build.")
+@click.option("--episodes", default=1000, show_default=True, type=click.IntRange(2), help="Of the evaluation.")
 @first_seed_option
-@click.option("--runs", default=10, show_default=True, type=click.IntRange(1), help="Timed calls of each.")
-@click.option("--batch", default=16, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
+@click.option("--runs", default=30, show_default=True, type=click.IntRange(1), help="Timed calls of each.")
+@click.option("--batch", default=25, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
 @threads_option
 @click.option("--jobs", type=click.IntRange(1), help="Processes that evaluate; one a core if you say nothing.")
 def main(
-    checkpoint: Path,
+    policy: str,
     directory: Path,
     record_episodes: int,
-    calibration_minutes: float,
-    target_sparsity: float,
+    minutes: float,
     episodes: int,
     first_seed: int,
     runs: int,
@@ -203,50 +183,47 @@ def main(
     threads: int,
     jobs: int | None,
 ) -> None:
-    """Compile the Push-T policy, calibrate it, and compare it with the original."""
+    """Build a policy that pushes the T, and say whether it is as good as the original."""
     console = results_console()
+    checkpoint, told = POLICIES[policy]
+    directory = directory / policy
     directory.mkdir(parents=True, exist_ok=True)
     artifact, calls = directory / "compiled", directory / "calls.npz"
     machine = fingerprint()
     console.print(one_line(machine), highlight=False, soft_wrap=True)
 
-    console.rule("1 of 5: convert, with the original loop and one of fewer steps")
-    program = ttscompile.convert(checkpoint, artifact, sampler=SAMPLER, steps=STEPS, prediction_horizon=HORIZON)
-    original = f"plan {DENSE}, {program.spec.sampler.steps} steps, {program.dense_flops / 1e9:.1f} GFLOP a call"
-    console.print(f"{len(program.blocks)} residual blocks; the original: {original}")
-    console.print(f"{SAMPLER}, {STEPS} steps, the first {HORIZON} actions: plan {FULL} of {artifact}")
+    console.rule("1 of 4: record what the policy observes")
+    ttscompile.convert(checkpoint, directory / "original", **told)
+    console.print(f"{record_calls(directory / 'original', calls, record_episodes, batch, threads)}: {calls}")
 
-    console.rule("2 of 5: record what the policy observes")
-    console.print(f"{record_calls(artifact, calls, record_episodes, batch, threads)}: {calls}")
+    console.rule("2 of 4: build: what can be left out of a call?")
+    ttscompile.build(checkpoint, artifact, [calls], max_minutes=minutes, **told)
+    built = load_artifact(artifact)
+    print_frontier(built, artifact, console, threads=1)
 
-    console.rule("3 of 5: calibrate: which steps can do without computing?")
-    result = ttscompile.calibrate(
-        artifact, trajectories=[calls], target_sparsity=target_sparsity, seed=0, max_minutes=calibration_minutes
-    )
-    console.print(calibration_table(result))
-    for name, reason in result.skipped.items():
-        console.print(f"{name}: none, {reason}")
-
-    console.rule("4 of 5: drive the robot with each")
+    console.rule("3 of 4: drive the robot with the original and with the compiled policy")
+    plans = [built.manifest.default_plan, *(name for name in (SAFE,) if name in built.plans)]
     seeds = range(first_seed, first_seed + episodes)
-    evaluations = compare(artifact, seeds, batch, jobs or machine["cores"])
+    evaluations = drive(artifact, plans, seeds, batch, jobs or machine["cores"])
+    verdicts = verdicts_of(evaluations, (SCORE_MARGIN, SUCCESS_MARGIN))
     console.print(evaluation_table(PushT.title, evaluations, seeds))
+    console.print(verdict_table(evaluations, verdicts))
 
-    console.rule("5 of 5: time one call")
-    speeds = time_alone(artifact, checkpoint, runs)
-    console.print(speed_table(speeds, threads=1))
+    console.rule("4 of 4: time one call")
+    best = best_of(evaluations)
+    plan = plans[best]
+    steps = time_alone(checkpoint, artifact, plan, runs)
+    console.print(speed_table(steps))
 
     console.rule("result")
-    console.print(final_table(speeds, evaluations))
-    console.print(conclusion(speeds, evaluations), highlight=False)
+    console.print(conclusion(plan, steps, verdicts[best]), highlight=False)
     picture, animation = directory / "plan.png", directory / "episode.gif"
-    kinds = [block.kind for block in program.blocks]
-    plan = speeds[-1].plan
-    if plan is not None:
-        plot_plan(plan, kinds, picture)
+    cells = built.plan(plan).cells
+    if cells is not None:
+        plot_plan(cells, [block.kind for block in built.manifest.blocks], picture)
         console.print(f"which blocks one call computes: {picture}")
-    pair = [evaluations[0].rollout.episodes[0], evaluations[-1].rollout.episodes[0]]
-    save_animation(animation, PushT, pair, [ORIGINAL, COMPILED])
+    pair = [evaluations[0].rollout.episodes[0], evaluations[1 + best].rollout.episodes[0]]
+    save_animation(animation, PushT, pair, [ORIGINAL, plan])
     console.print(f"the episode of seed {first_seed}, original and compiled: {animation}")
     console.print(f"everything on one page: .venv/bin/ttscompile inspect {artifact} -o page.html", soft_wrap=True)
     console.print("what to do with a policy of your own: docs/tutorial.md", soft_wrap=True)

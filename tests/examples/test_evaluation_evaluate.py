@@ -117,11 +117,12 @@ def test_many_tasks_have_a_row_each() -> None:
     assert list(one.tasks) == ["push", "reach"]
     assert one.tasks["reach"].success.mean == 1.0
     assert one.tasks["push"].success_difference is None
-    assert other.tasks["push"].success_difference == Estimate(0.0, -1.0, 1.0)
+    assert (push := other.tasks["push"].success_difference) is not None
+    assert push.mean == 0 and -1 < push.low < -0.5 and 0.5 < push.high < 1  # of two episodes each way
     assert (reach := other.tasks["reach"].score_difference) is not None and reach.mean == 0.0
     rows = [[c.strip() for c in line.split("│")[1:-1]] for line in printed(task_table([one, other]), 150)]
-    assert ["push", "2", "0.500", "0.500, 0.000 [-1.000, 1.000]"] in rows
-    assert ["reach", "2", "1.000", "1.000, 0.000 [0.000, 0.000]"] in rows
+    assert ["push", "2", "0.500", f"0.500, {push}"] in rows
+    assert ["reach", "2", "1.000", f"1.000, {other.tasks['reach'].success_difference}"] in rows
     document = json.loads(json.dumps(other.to_json()))
     assert document["tasks"]["push"]["episodes"] == 2
     assert document["tasks"]["push"]["success"]["mean"] == 0.5

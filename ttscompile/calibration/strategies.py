@@ -76,7 +76,7 @@ class Strategy:
 STRATEGIES = (
     Strategy(
         "tts",
-        "test-time sparsity, arXiv 2605.13316; this project's own",
+        "whole steps with a correction, the same for every observation; this project's own",
         "calibration.tts:Tts",
         fits_correction=True,
     ),
@@ -89,7 +89,7 @@ STRATEGIES = (
     ),
     Strategy(
         "tts-paper",
-        "test-time sparsity as published: gates trained for each observation, arXiv 2605.13316",
+        "test-time sparsity as published, arXiv 2605.13316: gates trained for each observation",
         "calibration.pruner.paper:Paper",
         uses_pruner=True,
         consecutive=True,

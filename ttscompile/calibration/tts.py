@@ -1,9 +1,10 @@
-"""Test-time sparsity, after arXiv 2605.13316: whole steps, placed by their true error, with a correction.
+"""Whole steps, placed by their true error, with a correction: the default, and the same for every observation.
 
-The search places whole steps, because with a correction (``fit_correction``) it is they that carry information
-about the observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of
-its own, fitted on some of the calls, and is judged by the true error of its actions on others. It starts with a family
-of crowded schedules. Where there are few others, it tries them all; else it moves one step of the best at a time, far
+Test-time sparsity (arXiv 2605.13316) has a head decide for each observation, which ``pruner.paper`` trains. This search
+places whole steps, because with a correction (``fit_correction``) it is they that carry information about the
+observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of its own,
+fitted on some of the calls, and is judged by the true error of its actions on others. It starts with a family of
+crowded schedules. Where there are few others, it tries them all; else it moves one step of the best at a time, far
 at first, until no move helps. The winner's correction is fitted again, on all calls.
 """
 

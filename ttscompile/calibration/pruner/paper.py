@@ -8,6 +8,9 @@ noise.
 
 What differs from the authors' training, and why:
 
+- *The default.* Theirs is always a head. Here ``tts`` is the default, whose schedule is the same for every observation:
+  no head was nearer to the original at as many computed cells (``docs/evidence/ablation.md``).
+- *The head.* Theirs has a decoder layer. This one is of low rank, so that it costs little beside a sparse loop.
 - *The budget.* They add ``|reuse - target|`` to the loss. In the few hundred updates that there is time for, that
   holds no budget. Here COMPUTE has a price, which is set in every update so that the calls of the batch keep the budget
   on average: what such a term comes to where it is strong enough.
