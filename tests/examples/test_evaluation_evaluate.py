@@ -10,7 +10,7 @@ import evaluate
 import jobs
 import numpy as np
 import pytest
-from bootstrap import Estimate, estimate, paired_difference
+from bootstrap import estimate, paired_difference
 from click.testing import CliRunner
 from evaluate import evaluation_table, summarise, task_table
 from rollout import Episode, Rollout

@@ -33,7 +33,7 @@ class Tried:
         interval: 95 % interval of that.
         milliseconds: median of a call on this machine.
         worst: longest of the calls that were timed, in milliseconds.
-        near: whether it may be the default (``proposer.near``).
+        near: whether it is near enough to be offered (``proposer.near``).
         on_frontier: whether no other plan is faster and nearer.
         kept: whether the artifact has it.
     """
@@ -62,21 +62,24 @@ class Frontier:
         plans: that the artifact gets, by name.
         scores: of these, by name.
         default: name of the one that was chosen.
+        remark: that it is further from the original than a default should be; None where it is not.
     """
 
     tried: tuple[Tried, ...]
     plans: Mapping[str, Plan]
     scores: Mapping[str, Score]
     default: str
+    remark: str | None
 
 
 def choose(kept: Kept, request: Request) -> Frontier:
     """Judge and time every plan, in each precision that it can have, and choose.
 
     Without a deadline the fastest plan that is near enough is the default, or the nearest of those that are as fast
-    (``ALIKE``). With one it is the nearest of those whose longest call keeps it. ``schedule`` is the name of the
-    default, ``safe`` that of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next
-    faster one, whose distance is within the bound, if not its limit.
+    (``ALIKE``). With one it is the nearest of those whose longest call keeps it. Where none is within ``Request.bound``
+    it is the nearest within ``Request.farthest``, with a remark. ``schedule`` is the name of the default, ``safe`` that
+    of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that is not
+    too far.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -99,15 +102,16 @@ def choose(kept: Kept, request: Request) -> Frontier:
     times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))
     points = {name: Point("", name, scores[name].distance, times[name].median) for name in entered}
     best = {point.name for point in efficient(list(points.values()))}
-    close = [name for name in entered if name != DENSE and near(scores[name], request.bound)]
-    chosen = _chosen(close, scores, times, request)
+    allowed = [name for name in entered if name != DENSE and near(scores[name], request.farthest)]
+    close = [name for name in allowed if near(scores[name], request.bound)]
+    chosen = _chosen(close, allowed, scores, times, request)
     named = {chosen: SCHEDULE}
     others = [name for name in best if name not in (DENSE, chosen)]
     wanted = SAFER * scores[chosen].distance
-    if nearer := [name for name in others if name in close and scores[name].distance <= wanted]:
+    if nearer := [name for name in others if name in allowed and scores[name].distance <= wanted]:
         named[min(nearer, key=lambda name: times[name].median)] = SAFE
     faster = [name for name in others if times[name].median < times[chosen].median]
-    if within := [name for name in faster if scores[name].distance <= request.bound]:
+    if within := [name for name in faster if scores[name].distance <= request.farthest]:
         named[max(within, key=lambda name: times[name].median)] = FAST
     plans = {named[name]: entered[name] for name in named}
     plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
@@ -119,26 +123,42 @@ def choose(kept: Kept, request: Request) -> Frontier:
             interval=scores[name].interval,
             milliseconds=times[name].median,
             worst=max(times[name].ms),
-            near=name == DENSE or name in close,
+            near=name == DENSE or name in allowed,
             on_frontier=name in best,
             kept=name == DENSE or name in named,
         )
         for name in sorted(entered, key=lambda one: times[one].median)
     )
-    return Frontier(tried, plans, {named[name]: scores[name] for name in named}, SCHEDULE)
+    remark = None if chosen in close else _remark(scores[chosen], request)
+    return Frontier(tried, plans, {named[name]: scores[name] for name in named}, SCHEDULE, remark)
 
 
-def _chosen(close: Sequence[str], scores: Mapping[str, Score], times: Mapping[str, Times], request: Request) -> str:
-    if not close:
+def _remark(score: Score, request: Request) -> str:
+    in_time = "" if request.deadline_ms is None else f" that keeps {request.deadline_ms:.3g} ms"
+    return (
+        f"no plan{in_time} is within {request.bound:g} of the original: the default is {score.distance:.2g} away, and"
+        f" {score.interval[1]:.2g} at worst. Such plans lost several points of success where they were driven. Evaluate"
+        " it, record more episodes, or allow more time."
+    )
+
+
+def _chosen(
+    close: Sequence[str],
+    allowed: Sequence[str],
+    scores: Mapping[str, Score],
+    times: Mapping[str, Times],
+    request: Request,
+) -> str:
+    if not allowed:
         name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
-        raise CalibrationFailedError(too_far(name, scores[name], request.bound))
+        raise CalibrationFailedError(too_far(name, scores[name], request.farthest))
     if request.deadline_ms is None:
-        most = ALIKE * min(times[name].median for name in close)
-        alike = [name for name in close if times[name].median <= most]
+        most = ALIKE * min((times[name].median for name in close), default=float("inf"))
+        alike = [name for name in close or allowed if times[name].median <= most]
         return min(alike, key=lambda name: scores[name].distance)
-    in_time = [name for name in close if max(times[name].ms) <= request.deadline_ms]
+    in_time = [name for name in allowed if max(times[name].ms) <= request.deadline_ms]
     if not in_time:
-        name = min(close, key=lambda name: max(times[name].ms))
+        name = min(allowed, key=lambda name: max(times[name].ms))
         raise CalibrationFailedError(
             f"no plan that is near enough keeps {request.deadline_ms:.3g} ms: the fastest, {name!r}, took"
             f" {times[name].median:.3g} ms, and {max(times[name].ms):.3g} at worst, with {request.threads} thread"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..artifact.ceiling import BOUND, few_steps, usual_sparsity
+from ..artifact.ceiling import BOUND, NEAR, few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import locked, update_plans
@@ -157,8 +157,9 @@ def calibrate(
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
         request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
         if chooses:  # its bound is of what is chosen in the end, and not of each that learns
-            near = BOUND if max_distance is None else max_distance
-            request = replace(request, margin=None, bound=near, deadline_ms=latency_ms, threads=goal.threads)
+            bounds = (NEAR, BOUND) if max_distance is None else (max_distance, max_distance)
+            request = replace(request, margin=None, bound=bounds[0], farthest=bounds[1])
+            request = replace(request, deadline_ms=latency_ms, threads=goal.threads)
         made = [(row, row.make(request)) for row in rows]
         for _, proposer in made:
             if (reason := proposer.applies(artifact)) is not None:
@@ -206,6 +207,8 @@ def calibrate(
             if frontier is not None:
                 kept.plans = {DENSE: kept.plans[DENSE], **frontier.plans}
                 kept.scores, kept.default = dict(frontier.scores), frontier.default
+                if frontier.remark is not None:
+                    bar.warn(frontier.remark)
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),

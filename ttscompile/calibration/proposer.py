@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy.typing as npt
 
-from ..artifact.ceiling import BOUND
+from ..artifact.ceiling import BOUND, NEAR
 from ..errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -84,7 +84,8 @@ class Request:
         rank: of the low-rank update to each weight matrix.
         updates: of the weights.
         margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
-        bound: distance from the original that a plan may have, see ``near``; for who chooses among loops.
+        bound: distance from the original that the default may have, see ``near``; for who chooses among loops.
+        farthest: that any plan may have, and the default where none is within ``bound``.
         deadline_ms: of a call, for the same; None for the fastest that is near enough.
         threads: of calls that are timed.
     """
@@ -96,7 +97,8 @@ class Request:
     rank: int = 16
     updates: int = 600
     margin: float | None = None
-    bound: float = BOUND
+    bound: float = NEAR
+    farthest: float = BOUND
     deadline_ms: float | None = None
     threads: int = 1
 

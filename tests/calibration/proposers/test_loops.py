@@ -222,6 +222,7 @@ def chosen(
     )
     frontier = choose(kept, request(**asked))
     assert frontier.default == "schedule"
+    assert (frontier.remark is None) == (frontier.scores["schedule"].distance <= request(**asked).bound)
     return {name: names[id(plan)] for name, plan in frontier.plans.items()}
 
 
@@ -247,3 +248,17 @@ def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, record
         chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=1.5)
     with pytest.raises(CalibrationFailedError, match="'c', is 0.15 away, and 0.2 at worst; 0.1 and 0.2 are"):
         chosen(monkeypatch, trials, figures, bound=0.1)
+
+
+def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(
+    monkeypatch: pytest.MonkeyPatch, directory: Path, recording: Path
+) -> None:
+    trials = trials_of(directory, [recording])
+    figures = {"a": (0.20, 0.25, 1.0), "b": (0.12, 0.20, 2.0), "c": (0.08, 0.15, 4.0), "d": (0.01, 0.02, 9.0)}
+    bounds = {"bound": 0.1, "farthest": 0.25}
+    assert chosen(monkeypatch, trials, figures, **bounds) == {"schedule": "c", "fast": "b", "safe": "d"}
+    # Without it, and where it does not keep the deadline, the nearest is taken, and said to be far (``chosen``).
+    far = {name: figures[name] for name in "ab"}
+    assert chosen(monkeypatch, trials, far, **bounds) == {"schedule": "b", "fast": "a"}
+    assert chosen(monkeypatch, trials, figures, deadline_ms=3.0, **bounds)["schedule"] == "b"
+    assert chosen(monkeypatch, trials, figures, deadline_ms=5.0, **bounds)["schedule"] == "c"

@@ -17,7 +17,9 @@ from ttscompile.core.plan import Plan
 
 
 def request(**fields: Any) -> Request:
-    """What was asked for: of the fields that proposers read, these."""
+    """What was asked for: of the fields that proposers read, these. A bound that is given holds for all plans."""
+    if "bound" in fields:
+        fields = {"farthest": fields["bound"], **fields}
     return Request(Goal(SPARSITY, 0.8), **fields)
 
 

@@ -1,12 +1,13 @@
 """Which loop, and how many of its steps: of each loop the fewest computed steps that are near enough to the original.
 
 Loops are tried from the one on whose cheapest call this machine spends least. In each, schedules of more and more whole
-steps are proposed, with corrections, until one is near enough (``proposer.near``). One more follows, for what is
-learned after it to trade. A loop is left out that is too far from the original when all is computed, and one whose
-cheapest call takes longer than the best plan so far.
+steps are proposed, with corrections, until one is near enough to be the default (``proposer.near``). One more follows,
+for what is learned after it to trade. A loop that is further itself, when all is computed, is searched for a plan that
+may be ``fast``; one that is too far even for that is left out, and so is one whose cheapest call takes longer than the
+best plan so far.
 
 The original's own loop comes last. Another one is somewhere else even where it computes every step, so its plans come
-near only so far. Where the fastest of them uses more than half of the bound, the original's loop is searched for a plan
+near only so far. Where the best of them uses more than half of the bound, the original's loop is searched for a plan
 that is a good deal nearer, however long a call of it takes: for tasks that forgive less than the bound does.
 """
 
@@ -70,12 +71,13 @@ class Loops:
     """See the module, and ``Proposer``."""
 
     def __init__(self, request: Request) -> None:
-        self._request, self._bound = request, request.bound
+        self._request, self._bound, self._farthest = request, request.bound, request.farthest
         self.told = ""
         self._left_out: list[str] = []
         self._scores: dict[str, Score] = {}
         self._best: Proposal | None = None
         self._fastest = float("inf")  # ms of the best one, by ``Cost``
+        self._nearest: Proposal | None = None  # of those within ``farthest``, where none is within the bound
 
     def applies(self, artifact: Artifact) -> str | None:
         """See ``Proposer``."""
@@ -98,11 +100,17 @@ class Loops:
                 continue
             share = clock.left() / (len(order) - number)
             own = self._opened(trials, loop, share)
-            if loop != ORIGINAL and (reason := self._too_far(_full(own, loop), own)) is not None:
-                self._left_out.append(f"{loop} {reason} with every step computed")
-                continue
+            if loop != ORIGINAL:
+                whole = judge(own, _full(own, loop))
+                if whole.interval[0] > self._farthest:
+                    told = f"{loop} is {whole.distance:.3g} from the original with every step computed"
+                    self._left_out.append(told)
+                    continue
+                if whole.distance > self._bound:  # a plan is hardly nearer than its loop: this one is for ``fast``
+                    wanted = self._farthest
             ends = clock.until(min(1.0, (clock.elapsed() + share) / clock.limit))
             yield from self._of_loop(own, loop, ends, costs[loop], wanted)
+        self._best = self._best or self._nearest
         if self._best is None:
             raise CalibrationFailedError(self._none())
         yield self._best
@@ -131,13 +139,17 @@ class Loops:
             if quick is None and number:
                 clock.cut = True
                 break
-            if quick is not None and quick.error > HOPELESS * wanted * apart and count != counts[-1]:
+            hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
+            if quick is not None and quick.error > hopeless and count != counts[-1]:
                 continue
             proposal = self._searched(own, task, loop, count)
             yield proposal
             name = proposal.name
+            alone = replace(proposal, beside=False, margin=float("inf"))
             if near(self._scores[name], self._bound) and cost.of(count) < self._fastest:
-                self._best, self._fastest = replace(proposal, beside=False, margin=float("inf")), cost.of(count)
+                self._best, self._fastest = alone, cost.of(count)
+            if near(self._scores[name], self._farthest) and self._is_nearest(name):
+                self._nearest = alone
             reached = near(self._scores[name], wanted) and self._deadline is None  # with a deadline as many as keep it
             if further or (reached and safer):
                 break
@@ -170,19 +182,15 @@ class Loops:
             return f"takes {least:.3g} ms and {self._deadline:.3g} are allowed" if slow else None
         return f"takes {least:.3g} ms at least, and the best {fastest:.3g}" if least > CLEARLY * fastest else None
 
-    def _too_far(self, plan: Plan, own: Trials) -> str | None:
-        """Why no plan of a loop can be near enough."""
-        score = judge(own, plan)
-        if score.interval[0] <= self._bound:
-            return None
-        return f"is {score.distance:.3g} from the original"
+    def _is_nearest(self, name: str) -> bool:
+        return self._nearest is None or self._scores[name].distance < self._scores[self._nearest.name].distance
 
     def _refusal(self, name: str, score: Score, _: Mapping[str, Score]) -> str | None:
         """Why a plan is too far from the original for all purposes."""
         self._scores[name] = score
-        if score.distance <= self._bound:
+        if score.distance <= self._farthest:
             return None
-        return f"is {score.distance:.3g} from the original; {self._bound:g} is allowed"
+        return f"is {score.distance:.3g} from the original; {self._farthest:g} is allowed"
 
     def _none(self) -> str:
         """Why there is nothing to propose."""
@@ -190,7 +198,7 @@ class Loops:
             left = "; ".join(self._left_out) or "the time ended the search"
             return f"no plan could be tried: {left}. Allow more time."
         nearest = min(self._scores, key=lambda name: self._scores[name].interval[1])
-        return too_far(nearest, self._scores[nearest], self._bound)
+        return too_far(nearest, self._scores[nearest], self._farthest)
 
     def _cost(self, trials: Trials, loop: str, clock: Clock) -> Cost:
         """What calls of a loop take on this machine, in the faster precision; measured once."""
