@@ -64,8 +64,8 @@ def build(
             plan is then the nearest of those whose longest call keeps up.
         policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
         latency_ms: that the longest call may take, in place of ``control_hz``.
-        max_distance: from the original, that the default may have (``calibration.proposer.near``), in units of what
-            other noise changes; None for a quarter, ``artifact.ceiling.BOUND``.
+        max_distance: from the original, that a plan may have (``calibration.proposer.near``), in units of what other
+            noise changes; None for a tenth for the default, and a quarter for faster plans (``artifact.ceiling``).
         threads: that calls have.
         max_minutes: for all but the conversion.
         seed: of everything random.

@@ -1,6 +1,6 @@
 """What must be true of a calibrated artifact's speed and memory, measured and judged.
 
-    python examples/benchmark/requirements.py build/pusht/compiled
+    python examples/benchmark/requirements.py build/pusht/transformer/compiled
 
 One process times, call by call in turn and at every thread count: eager PyTorch, onnxruntime with every block
 computed, the artifact's plan, its blocks back to back (the floor, see ``floor.py``), its tails back to back, and the

@@ -1,6 +1,6 @@
 """Draw episodes of one seed, side by side, as one small animation.
 
-    python examples/evaluation/animate.py build/pusht/compiled:dense build/pusht/compiled -o build/pusht/episode.gif
+    python examples/evaluation/animate.py DIR:dense DIR -o episode.gif
 
 A seed and its actions are the episode: it is played once more, and drawn by its environment.
 """

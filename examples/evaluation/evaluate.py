@@ -1,6 +1,6 @@
 """Evaluate policies on numbered seeds of an environment, all on the same initial states and with the same noise.
 
-    python examples/evaluation/evaluate.py build/pusht/compiled:dense build/pusht/compiled --episodes 48 --jobs 4
+    python examples/evaluation/evaluate.py DIR:dense DIR --episodes 48 --jobs 4
 
 What the score of an episode is, 0 to 1, its environment says. Differences are taken episode by episode, against the
 first variant. A second table says of each other variant whether it is as good as the first: equivalent within the

@@ -1,6 +1,6 @@
 """Record calls for calibration: drive the robot with every block computed, and keep what it observed.
 
-    python examples/evaluation/record.py build/pusht/compiled -o build/pusht/calls.npz --episodes 16
+    python examples/evaluation/record.py build/pusht/flow/compiled -o build/pusht/flow/calls.npz --episodes 16
 
 The seeds start at 0; evaluation starts at 100000, so that no policy is judged on episodes it was calibrated on.
 """

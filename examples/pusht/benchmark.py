@@ -1,6 +1,6 @@
 """Time one call of the Push-T policy: eager PyTorch, dense onnxruntime, and sparse, in one run on one machine.
 
-    python examples/pusht/benchmark.py build/pusht/compiled --threads 1
+    python examples/pusht/benchmark.py build/pusht/transformer/compiled --threads 1
 
 One stream, warm calls of one episode. The contestants take turns, call by call, on the same observation and noise, so
 that whatever else the machine does hits all of them; the table has medians and the quartiles around them. One thread

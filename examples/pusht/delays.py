@@ -1,6 +1,6 @@
 """What latency does to a policy that is played by the executor, and what seam, margin and horizon do about it.
 
-    python examples/pusht/delays.py build/pusht/compiled --hz 50 --latency-ms 0,20,40,80 --seams replace,blend,prefix
+    python examples/pusht/delays.py DIR --hz 50 --latency-ms 0,20,40,80 --seams replace,blend,prefix
 
 The world takes a step each tick and never waits, not for the first chunk of an episode either: the agent stands still
 until it comes. A call takes as long as ``--latency-ms`` says, in simulated time, so the result is the same on every

@@ -4,8 +4,8 @@
 
 The policy pushes a T-shaped block onto its goal; LeRobot's own code trained it, by flow matching, as vision-language-
 action models are. The demo records 16 episodes, has ``ttscompile build`` find the fastest plan, times it beside
-PyTorch, and drives a thousand paired episodes with each. It ends with a verdict: equivalent to the original within a
-margin, or not. That takes about ten minutes on 2 cores; everything it makes is in ``build/pusht``.
+PyTorch, and drives 2,400 paired episodes with each. It ends with a verdict: equivalent to the original within a
+margin, or not. That takes about twelve minutes on 2 cores; everything it makes is in ``build/pusht``.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def best_of(evaluations: Sequence[Evaluation]) -> int:
 @click.option("--directory", default=BUILD, show_default=True, type=click.Path(file_okay=False, path_type=Path))
 @click.option("--record-episodes", default=16, show_default=True, type=click.IntRange(2))
 @click.option("--minutes", default=5.0, show_default=True, type=click.FloatRange(min=0.1), help="Of the build.")
-@click.option("--episodes", default=1000, show_default=True, type=click.IntRange(2), help="Of the evaluation.")
+@click.option("--episodes", default=2400, show_default=True, type=click.IntRange(2), help="Of the evaluation.")
 @first_seed_option
 @click.option("--runs", default=30, show_default=True, type=click.IntRange(1), help="Timed calls of each.")
 @click.option("--batch", default=25, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")

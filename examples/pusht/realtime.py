@@ -1,6 +1,6 @@
 """Drive Push-T in real time: a control loop that asks for an action every tick, while the policy computes beside it.
 
-    python examples/pusht/realtime.py build/pusht/compiled --hz 10 --hz 50 --minutes 10 --against-eager
+    python examples/pusht/realtime.py build/pusht/transformer/compiled --hz 10 --hz 50 --minutes 10 --against-eager
 
 The world does not wait. At 10 Hz it runs at its own speed: a step of the environment is 0.1 s, as in the
 demonstrations. At another rate the world runs faster or slower, one step a tick: at 50 Hz, five times as fast as in

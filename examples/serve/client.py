@@ -1,6 +1,6 @@
 """A client of ``ttscompile serve`` in nothing but Python's standard library: what any language needs, in a page.
 
-    ttscompile serve build/pusht/compiled --control-hz 10
+    ttscompile serve build/pusht/flow/compiled --control-hz 10
     python examples/serve/client.py ws://127.0.0.1:8765/ --seconds 5
 
 Where the server has a token and a certificate:
