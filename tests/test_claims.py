@@ -1,0 +1,53 @@
+"""A page that says a compiled policy is as good as the original names a margin and a number of episodes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.pages import ROOT
+
+PAGES = [ROOT / "README.md", *(p for p in sorted((ROOT / "docs").rglob("*.md")) if p.name != "decisions.md")]
+PROVES_NOTHING = re.compile(
+    r"\bke(?:eps?|pt) (?:the|its|their|his)?(?: original's)? ?(?:score|success)|\blos(?:es?|t) nothing|\bno loss\b"
+)
+"""What only an infinite number of episodes could show."""
+EQUIVALENT = re.compile(r"\bequivalent\b")
+MARGIN, EPISODES = re.compile(r"\d(?: points| %|\.\d+)|margin"), re.compile(r"\bepisodes\b")
+
+
+def items(text: str) -> list[str]:
+    """Paragraphs, points of lists and rows of tables, each on one line."""
+    return [" ".join(one.split()) for one in re.split(r"\n\s*\n|\n(?=- |\| )", text)]
+
+
+def unproven(text: str) -> list[str]:
+    """Items that claim more than can be measured, or equivalence without a margin and a number of episodes."""
+    found = [one for one in items(text) if PROVES_NOTHING.search(one)]
+    return found + [
+        one
+        for one in items(text)
+        if EQUIVALENT.search(one) and "| equivalent |" not in one and not (MARGIN.search(one) and EPISODES.search(one))
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_page_claims_what_was_measured(page: Path) -> None:
+    assert not unproven(page.read_text())
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("Two steps keep the score.", 1),
+        ("- Two steps keep\n  the original's success, 20 %.", 1),
+        ("So half of the loop loses nothing.", 1),
+        ("It is equivalent to the original.", 1),
+        ("Three steps are equivalent: less than 5 points are lost, in 800 episodes.", 0),
+        ("Three steps score 0.93 where the original scores 0.94.", 0),
+    ],
+)
+def test_what_is_a_claim(text: str, count: int) -> None:
+    assert len(unproven(text)) == count
