@@ -22,6 +22,7 @@ from click.testing import CliRunner
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
+from ttscompile.artifact.ceiling import BOUND, NEAR
 from ttscompile.cli import main
 
 PAGES = examples.pages()
@@ -234,14 +235,30 @@ def test_the_comparison_of_outputs_sees_what_is_gone() -> None:
     assert examples.renewed([], printed) == printed
 
 
-def test_the_lattice_is_drawn_by_its_script(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["distance", "lattice"])
+def test_a_picture_is_drawn_by_its_script(tmp_path: Path, name: str) -> None:
     from PIL import Image
 
-    load(ROOT / "docs" / "pictures" / "lattice.py", "docs_lattice").draw(tmp_path / "lattice.png")
-    made, kept = (Image.open(p).convert("RGB") for p in (tmp_path / "lattice.png", ROOT / "docs/pictures/lattice.png"))
+    drawn, folder = tmp_path / f"{name}.png", ROOT / "docs" / "pictures"
+    load(folder / f"{name}.py", f"docs_{name}").draw(drawn)
+    made, kept = (Image.open(p).convert("RGB") for p in (drawn, folder / f"{name}.png"))
     assert made.size == kept.size
     difference = np.abs(np.asarray(made, np.int16) - np.asarray(kept, np.int16))
-    assert difference.mean() < 2, "the picture in the tree is not the script's: python docs/pictures/lattice.py"
+    assert difference.mean() < 2, f"the picture in the tree is not the script's: python docs/pictures/{name}.py"
+
+
+def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
+    """The default's bound was chosen by these numbers."""
+    plans = load(ROOT / "docs" / "pictures" / "distance.py", "docs_distance").plans()
+    within = [row["points"] for row in plans if row["distance"] <= NEAR]
+    beyond = [row["points"] for row in plans if NEAR < row["distance"] <= BOUND]
+    said = (
+        f"Within a tenth no plan lost more than {-min(within):.1f} points of success**; between a tenth and a quarter"
+        f" {['none', 'one', 'two', 'three'][sum(points <= -6 for points in beyond)]} of"
+        f" {['five', 'six', 'seven', 'eight'][len(beyond) - 5]} lost 6 points or more"
+    )
+    assert said in " ".join((ROOT / "docs" / "evidence" / "results.md").read_text().split())
+    assert all(row["low"] <= row["points"] <= row["high"] for row in plans)
 
 
 def test_links_between_pages_lead_somewhere() -> None:
