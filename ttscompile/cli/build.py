@@ -46,8 +46,8 @@ from ttscompile.report.summary import document
 @number_option(
     "--error",
     ERROR,
-    "Largest distance from the original that a plan may have, in units of what other noise changes; with 95 % confidence"
-    " it is at most twice that. Without this option it is 0.1 for the default plan, and 0.25 for faster ones.",
+    "Largest distance from the original that a plan may have, in units of what other noise changes; with 95 %"
+    " confidence it is at most twice that. Without this option it is 0.1 for the default plan, and 0.25 for others.",
 )
 @threads_option("Threads that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..artifact.ceiling import BOUND, few_steps
+from ..artifact.ceiling import BOUND, NEAR, few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
@@ -243,8 +243,13 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
     score = scores(record).get(str(name), {})
     if not isinstance(distance := score.get("distance"), int | float):
         return ()
-    where = "within" if distance <= BOUND else "above"
-    return (f"Plan {name!r} is {distance:.2f} from the original, {where} a quarter of what other noise changes.",)
+    where, cost = "above a quarter", "18 points of success and more"
+    if distance <= NEAR:
+        where, cost = "within a tenth", "at most 1.5 points of success"
+    elif distance <= BOUND:
+        where, cost = "within a quarter", "up to 11 points of success"
+    driven = f"Such plans cost {cost} where they were driven (docs/evidence/results.md, 'What a distance means')"
+    return (f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes. {driven}.",)
 
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
