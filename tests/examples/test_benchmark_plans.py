@@ -170,7 +170,7 @@ class Small(nn.Module):
         return torch.tanh(self.mix(sample)) + 0.01 * timestep[:, None, None] * obs.mean((1, 2), keepdim=True)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 def test_torch_compile_computes_the_same() -> None:
     network = replace(random_network(16, "ddim", 8, layers=1), module=Small().eval())

@@ -103,7 +103,7 @@ def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Art
     assert_equal_but_for_rounding(found.detach(), expected(artifact, other, "mixed"), terms(artifact))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(artifact: Artifact, tmp_path: Path) -> None:
     if shutil.which("g++") is None:

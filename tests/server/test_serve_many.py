@@ -65,7 +65,7 @@ def test_memory_files_and_threads_stay_as_they_were() -> None:
     assert bytes_after - bytes_before < MOST_BYTES_EACH * count
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_what_is_printed_of_a_million() -> None:
     """A short version of ``served.py``."""
     first, *_, last = made = served(80)
