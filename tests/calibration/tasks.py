@@ -12,7 +12,8 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.task import Task
+from ttscompile.calibration.search import open_search, search_plan
+from ttscompile.calibration.task import Found, Task
 from ttscompile.trajectories import load_trajectories
 from ttscompile.trajectories.episodes import Episode
 
@@ -33,6 +34,11 @@ def make_task(
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
     prepared = replace(prepared, path=executor.run_dense(prepared))
     return Task.of(executor, prepared, budget, seed)
+
+
+def found_by(name: str, task: Task, intervals: int | None = None) -> Found:
+    """What a strategy finds."""
+    return search_plan(open_search(name, task), task.clock, intervals)[0]
 
 
 def in_windows(task: Task, windows: int, window: int = WINDOW, pinned: bool = False) -> Calls:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 
 from .clock import Clock
 from .strategies import strategy_of
@@ -24,27 +22,6 @@ def open_search(name: str, task: Task) -> Search:
     strategy, model = strategy_of(name), task.executor.model
     strategy.require_reach(model.steps, model.blocks, task.budget)
     return strategy.make()(task)
-
-
-def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float = math.inf) -> tuple[Found, bool]:
-    """What a strategy finds, whether or not it is any better than the uniform schedule: for comparisons.
-
-    Args:
-        name: the name of the strategy.
-        task: see ``Task``; its clock is not used.
-        intervals: how many at most; None for the strategy's own number.
-        seconds: after which nothing more is begun that can be left out.
-
-    Returns:
-        What was found, and whether the time cut the search short.
-
-    Raises:
-        CalibrationError: there is no such strategy, or it cannot keep the budget.
-        CalibrationFailedError: the time was up before there was a plan within the budget.
-    """
-    clock = Clock(seconds)
-    found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
-    return found, stopped == "time limit"
 
 
 def search_plan(
