@@ -26,7 +26,7 @@ from ttscompile.calibration.compare import compare
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.search import open_search, search_plan
+from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
@@ -36,7 +36,7 @@ from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
-from ttscompile.rivals.switched import Switched
+from ttscompile.rivals.adaptation import Switched
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.runtimes.runtime import Runtime
 from ttscompile.trajectories import load_trajectories

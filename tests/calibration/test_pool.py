@@ -6,7 +6,7 @@ import importlib.util
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,8 @@ from ttscompile.errors import ClusterError, RuntimeUnavailableError
 from ttscompile.pool import Here, RayPool, Work
 
 from . import policies
+from .pools import Elsewhere, needs_ray
 
-needs_ray = pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None, reason="NO RAY TESTS: ray is not installed; pip install 'ttscompile[ray]'"
-)
 SEARCH = {"target_sparsity": 0.7, "max_intervals": 6, "progress": False}
 
 
@@ -43,26 +41,6 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def identity(folder: Path) -> str:
     return ttscompile.load(folder).info.identity
-
-
-class Elsewhere:
-    """Does what a cluster does, in this process: parts are opened from what is sent, and several are given at once.
-
-    Args:
-        count: of a cluster.
-        lasts: parts after which the cluster is gone.
-    """
-
-    def __init__(self, count: int, lasts: int | None = None) -> None:
-        self.count, self.lasts, self.done = count, lasts, 0
-
-    def map(self, work: Work, parts: Sequence[Any]) -> Iterator[Any]:
-        run = work.elsewhere(*work.given)
-        for part in parts:
-            if self.done == self.lasts:
-                raise ClusterError("the cluster is gone")
-            self.done += 1
-            yield run(part)
 
 
 @pytest.fixture

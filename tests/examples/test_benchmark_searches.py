@@ -15,7 +15,7 @@ from searches import ComparisonState, Searches, Searching, plan_of
 
 import ttscompile
 from tests.calibration import policies
-from tests.calibration.test_pool import Elsewhere, needs_ray
+from tests.calibration.pools import Elsewhere, needs_ray
 from tests.once import Once
 from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact

@@ -14,9 +14,7 @@ from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.task import Found
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.errors import CalibrationError
-from ttscompile.rivals.dbcache import dbcache, proposals
-from ttscompile.rivals.online import Criterion, Decisions, decide, within
-from ttscompile.rivals.teacache import dense_changes, proposal
+from ttscompile.rivals.online import Criterion, Decisions, dbcache, decide, dense_changes, proposal, proposals, within
 from ttscompile.runtimes.reference.model import ReferenceModel
 
 RULES = [
