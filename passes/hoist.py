@@ -66,16 +66,7 @@ class Hoist(Pass[Cut, Program]):
             },
             loop_tables=evaluated,
         )
-        new = Program(
-            spec,
-            program.denoiser,
-            program.weights,
-            program.blocks,
-            pieces,
-            dense_flops=program.dense_flops,
-            once_flops=program.once_flops,
-            unmoved=program.unmoved,
-        )
+        new = Program(**program.carried, blocks=program.blocks, pieces=pieces)
         return PassResult(new, _notes(new))
 
     def ensures(self, program: Program) -> None:

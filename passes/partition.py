@@ -65,18 +65,7 @@ class Partition(Pass[Captured, Cut]):
         inside = sum(len(piece.graph.nodes) for piece in loop.blocks)
         early, stem, tail = (len(graph.nodes) for graph in (prologue, loop.stem.graph, loop.tail.graph))
         note = f"nodes: prologue {early}, stem {stem}, {len(blocks)} blocks {inside}, tail {tail}"
-        cut = Cut(
-            spec,
-            graph,
-            program.weights,
-            blocks,
-            prologue,
-            loop,
-            dense_flops=program.dense_flops,
-            once_flops=program.once_flops,
-            unmoved=program.unmoved,
-        )
-        return PassResult(cut, (note,))
+        return PassResult(Cut(**program.carried, blocks=blocks, prologue=prologue, loop=loop), (note,))
 
 
 def _own_output(piece: Graph) -> Graph:

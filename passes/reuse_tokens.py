@@ -19,7 +19,6 @@ from .base import Pass, PassResult
 
 _CLOSE = 1e-3
 """Share of the largest number by which the tower and all of its tokens may differ: rounding is below it."""
-_ROWLESS = 1  # rows run one by one, so that the one symbolic size can be the number of tokens
 
 
 class ReuseTokens(Pass[Program, Program]):
@@ -90,22 +89,9 @@ def for_tokens(tower: Graph, stream: TokenStream) -> Graph:
     return _Changed(tower, stream).graph()
 
 
-def _rowless(argument: Argument) -> Argument:
-    """An argument for one row."""
-    if isinstance(argument, tuple):
-        return tuple(map(_rowless, argument))
-    return argument.multiple * _ROWLESS if isinstance(argument, Batch) else argument
-
-
-def _rowless_type(type_: TensorType) -> TensorType:
-    return replace(type_, shape=type_.at(_ROWLESS))
-
-
-def _rowless_node(node: Node) -> Node:
-    kwargs = tuple((name, _rowless(value)) for name, value in node.kwargs)
-    return replace(
-        node, args=tuple(map(_rowless, node.args)), kwargs=kwargs, types=tuple(map(_rowless_type, node.types))
-    )
+def _rowless(batch: Batch) -> int:
+    """A size of one row: rows run one by one, so that the one symbolic size can be the number of tokens."""
+    return batch.multiple
 
 
 def _pixels_graph(tower: Graph, stream: TokenStream) -> Graph:
@@ -140,7 +126,7 @@ class _Changed:
         types, stream, axes = self.tower.types(), self.stream, self.stream.axes
         own = backward_slice(self.tower, self.tower.outputs, {stream.pixels: types[stream.pixels]})
         self.makers, self.types = own.producers(), types
-        index, pixels = {INDEX: TensorType((Batch(),), "int64")}, _rowless_type(types[stream.pixels])
+        index, pixels = {INDEX: TensorType((Batch(),), "int64")}, types[stream.pixels].resized(_rowless)
         self.nodes.append(Node(stream.pixels, "aten.clone.default", (Ref(PIXELS),), (), (pixels,)))
         for node in own.nodes:
             if node.name in axes and node.name != stream.entry:
@@ -148,7 +134,7 @@ class _Changed:
                 continue
             for name in node.refs():
                 self._whole(name)
-            self.nodes.append(_rowless_node(node))
+            self.nodes.append(node.resized(_rowless))
             self.there.add(node.name)
             if node.name == stream.entry:
                 self._gather(node.name, axes[node.name])
@@ -164,7 +150,7 @@ class _Changed:
 
     def _part(self, type_: TensorType, axis: int) -> TensorType:
         """The type of a value with the rows of some tokens alone."""
-        sizes: list[Size] = list(_rowless_type(type_).shape)
+        sizes: list[Size] = list(type_.resized(_rowless).shape)
         sizes[axis] = Batch()
         return replace(type_, shape=tuple(sizes))
 
@@ -186,7 +172,7 @@ class _Changed:
             if isinstance(argument, tuple):
                 return tuple(operand(place, item) for item in argument)
             if not isinstance(argument, Ref):
-                return _rowless(argument)
+                return _rowless(argument) if isinstance(argument, Batch) else argument
             if node.op == ATTENTION and place in (1, 2):
                 self._whole(argument.name)
                 return argument
@@ -209,11 +195,11 @@ class _Changed:
             return
         self.there.add(name)
         node, axis = self.makers[name], self.stream.axes[name]
-        type_ = _rowless_type(node.type)
+        type_ = node.type.resized(_rowless)
         if operation(node.op).movement in (Movement.RESHAPE, Movement.PERMUTE):
             for read in node.refs():
                 self._whole(read)
-            self.nodes.append(_rowless_node(node))
+            self.nodes.append(node.resized(_rowless))
             return
         front = (axis, *(a for a in range(len(type_.shape)) if a != axis))
         back = tuple(front.index(a) for a in range(len(front)))

@@ -10,9 +10,10 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.core.spec import ObservationSpec
+from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import node_flops
-from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice
+from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Program
 
@@ -121,7 +122,7 @@ def _largest(
 ) -> _Tower | None:
     """The tower with the most FLOPs among what is in no other."""
     taken = {name for tower in found for name in (*tower.inside, *tower.before)}
-    observed, starts = _observed(graph), list[tuple[str, ...]]()
+    observed, starts = reachable_from(graph, graph.inputs), list[tuple[str, ...]]()
     types = graph.types()
     alone = {key: types[key] for key in graph.inputs if key in frames}
     for node in graph.nodes:
@@ -138,15 +139,6 @@ def _rows(types: Mapping[str, TensorType], name: str) -> int:
     size = types[name].shape[0]
     assert isinstance(size, Batch)
     return size.multiple
-
-
-def _observed(graph: Graph) -> set[str]:
-    """Values that depend on an observation."""
-    found = set(graph.inputs)
-    for node in graph.nodes:
-        if not found.isdisjoint(node.refs()):
-            found.add(node.name)
-    return found
 
 
 def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, TensorType]) -> bool:
@@ -171,13 +163,15 @@ def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], tak
     while True:
         inside, free = set(entries), set(graph.constants)
         for node in graph.nodes:
-            read, fits = set(node.refs()), _speaks_of(node, rows)
+            sizes = (*node.leaves(), *(size for type_ in node.types for size in type_.shape))
+            read, fits = set(node.refs()), all(n.multiple % rows == 0 for n in sizes if isinstance(n, Batch))
             if node.name not in observed and read <= free and fits:
                 free.add(node.name)
             elif node.name not in banned and read & inside and read <= inside | free and fits:
                 inside.add(node.name)
         inside.difference_update(entries)
-        exits = [n.name for n in graph.nodes if n.name in inside and _leaves(n.name, graph, users, inside)]
+        read_outside = {name for name in inside if any(user.name not in inside for user in users[name])}
+        exits = [n.name for n in graph.nodes if n.name in inside and n.name in {*read_outside, *graph.outputs}]
         bad = [name for name in exits if not _is_exit(graph, name, rows)]
         if not bad:
             break
@@ -190,20 +184,6 @@ def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], tak
     names = frozenset(node.name for node in own.nodes if node.name in observed)
     earlier = frozenset(node.name for node in before.nodes)
     return _Tower(entries, rows, names, earlier, tuple(exits), _of_rows(own, rows, exits), flops)
-
-
-def _leaves(name: str, graph: Graph, users: Mapping[str, list[Node]], inside: Collection[str]) -> bool:
-    return name in graph.outputs or any(user.name not in inside for user in users[name])
-
-
-def _batches(node: Node) -> list[Batch]:
-    sizes = [size for type_ in node.types for size in type_.shape]
-    return [size for size in (*sizes, *node.leaves()) if isinstance(size, Batch)]
-
-
-def _speaks_of(node: Node, rows: int) -> bool:
-    """Whether all sizes of a node are multiples of the number of rows."""
-    return all(batch.multiple % rows == 0 for batch in _batches(node))
 
 
 def _is_exit(graph: Graph, name: str, rows: int) -> bool:
@@ -221,26 +201,13 @@ def _crossing(name: str) -> str:
 def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
     """The graph of one row for each that ``rows * B`` stand for."""
 
-    def size(argument: Argument) -> Argument:
-        if isinstance(argument, tuple):
-            return tuple(map(size, argument))
-        return Batch(argument.multiple // rows) if isinstance(argument, Batch) else argument
+    def size(batch: Batch) -> Batch:
+        return Batch(batch.multiple // rows)
 
-    def kind(type_: TensorType) -> TensorType:
-        return replace(type_, shape=tuple(size(n) for n in type_.shape))  # type: ignore[misc]
-
-    nodes = tuple(
-        replace(
-            node,
-            args=tuple(map(size, node.args)),
-            kwargs=tuple((name, size(value)) for name, value in node.kwargs),
-            types=tuple(map(kind, node.types)),
-        )
-        for node in graph.nodes
-    )
+    nodes = tuple(node.resized(size) for node in graph.nodes)
     types = {node.name: node.type for node in nodes}
     out = tuple(Node(_crossing(n), "aten.clone.default", (Ref(n),), (), (types[n],)) for n in exits)
-    inputs = {name: kind(type_) for name, type_ in graph.inputs.items()}
+    inputs = {name: type_.resized(size) for name, type_ in graph.inputs.items()}
     return Graph(inputs, graph.constants, (*nodes, *out), tuple(map(_crossing, exits)))
 
 

@@ -4,7 +4,7 @@
 - ``reference``: torch, plain, differentiable; the definition of reuse.
 - ``onnxruntime``: numpy and onnxruntime only; what runs on the robot.
 - ``torch``: a call as one straight line, on any device that torch has.
-- ``instructions``, ``call_inputs``: what several of them make of a plan, and of what a call is given.
+- ``instructions``: what several of them make of a plan.
 - ``policy``: the object that users hold, around any of them; ``load``: how they get it.
 """
 

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.core.coercion import integer, is_tensor, plain
-from ttscompile.core.images import fitted
 from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
-from ttscompile.core.values import check_numbers, check_values
+from ttscompile.core.values import check_numbers, check_values, fitted
 from ttscompile.errors import ObservationError, TtscompileError
 
 Array: TypeAlias = npt.NDArray[Any]

@@ -30,22 +30,9 @@ Array: TypeAlias = npt.NDArray[Any]
 Content: TypeAlias = tuple[bytes, ...]
 """The bytes of one frame, of each input of the piece that reads it; before them those of its lane, if it has one."""
 Stop: TypeAlias = Callable[[], bool]
-Compute: TypeAlias = Callable[[int], "Computed"]
-"""The number of a row to what a frame piece gives for it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Computed:
-    """What a frame piece gave for a row.
-
-    Attributes:
-        values: ``[1, ...]`` each.
-        of: how many tokens it has; 0 where the whole frame is the unit.
-    """
-
-    values: tuple[Array, ...]
-    tokens: int = 0
-    of: int = 0
+Compute: TypeAlias = Callable[[int], tuple[tuple[Array, ...], int, int]]
+"""The number of a row to what a frame piece gives for it, ``[1, ...]`` each; how many of its tokens were computed, and
+how many it has: 0 where the whole frame is the unit."""
 
 
 def _never() -> bool:
@@ -80,17 +67,11 @@ class FrameWork:
         return FrameWork(*(mine + theirs for mine, theirs in zip(astuple(self), astuple(other), strict=True)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    values: tuple[Array, ...]
-    took: float  # ms
-
-
 class FrameMemory:
     """The rows of one frame piece that were computed last."""
 
     def __init__(self) -> None:
-        self._known: OrderedDict[Content, _Known] = OrderedDict()
+        self._known: OrderedDict[Content, tuple[tuple[Array, ...], float]] = OrderedDict()  # values, and ms they took
 
     def __len__(self) -> int:
         return len(self._known)
@@ -112,22 +93,22 @@ class FrameMemory:
             known = self._known.get(content)
             if known is not None:
                 self._known.move_to_end(content)
-                work += FrameWork(remembered=1, saved=known.took)
+                work += FrameWork(remembered=1, saved=known[1])
                 continue
             if stop():
                 break
             start = time.perf_counter()
-            made = compute(i)
+            values, tokens, of = compute(i)
             took = 1000.0 * (time.perf_counter() - start)
-            self._known[content] = _Known(made.values, took)
-            work += FrameWork(computed=1, waited=took, tokens=made.tokens, of=made.of)
+            self._known[content] = values, took
+            work += FrameWork(computed=1, waited=took, tokens=tokens, of=of)
         while len(self._known) > WINDOWS * len(contents):
             self._known.popitem(last=False)
         return work
 
     def values(self, contents: Sequence[Content]) -> tuple[Array, ...]:
         """What the piece gives for rows of these contents, ``[N, ...]`` each; they must be known."""
-        found = [self._known[content].values for content in contents]
+        found = [self._known[content][0] for content in contents]
         return tuple(np.concatenate(each) for each in zip(*found, strict=True))
 
 
@@ -202,12 +183,12 @@ class FramePieces:
         """What computes one of the rows, of each input of the piece ``[N, ...]``."""
         piece, tower = self._pieces[name], self._tokens.get(name)
 
-        def compute(i: int) -> Computed:
+        def compute(i: int) -> tuple[tuple[Array, ...], int, int]:
             row = {n: each[i : i + 1] for n, each in zip(piece.inputs, rows, strict=True)}
             if tower is None:
-                return Computed(self._run(name, row))
+                return self._run(name, row), 0, 0
             values, count = tower.compute(lanes[i], row)
-            return Computed(values, count, tower.tokens)
+            return values, count, tower.tokens
 
         return compute
 

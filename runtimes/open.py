@@ -143,9 +143,9 @@ def open_runtime(
     options, opener = Options(threads, device or CPU), list[Open]()
 
     def backend(view: View) -> Backend[Any]:
-        require_able(runtime, artifact, Plan(precision=view.precision, tokens=view.tokens))
+        require_able(runtime, artifact, Plan(precision=view.precision, tokens=view.variant.tokens))
         try:
-            with view.reading(), fitting(view):  # a backend reads arrays that are mapped from the files
+            with artifact.reading(), fitting(view):  # a backend reads arrays that are mapped from the files
                 if not opener:
                     opener.append(kind.make(options))
                 return opener[0](view)

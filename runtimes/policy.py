@@ -24,6 +24,7 @@ from .inpainting import check_prefix, prefix_refusal
 from .instruct import Instruct
 from .liveness import rollout_needs
 from .queues import Queues, is_window
+from .random_calls import noise_of_any_horizon
 from .report import GIVEN, CallReport
 from .runtime import Runtime
 
@@ -129,13 +130,10 @@ class CompiledPolicy:
         """
         seed = check_seed(seed)
         with self._turn():
-            self._reset()
+            self._runtime.reset()
             self._queues.reset()
             if seed is not None:
                 self._rng = np.random.default_rng(seed)
-
-    def _reset(self) -> None:
-        self._runtime.reset()
 
     def predict_action(
         self,
@@ -301,7 +299,8 @@ class CompiledPolicy:
         if prefix is not None:
             prefix = check_prefix(prefix, streams, spec, self._prefix_refusal(wanted))
             prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
-        noise = self._draw(streams, wanted) if noise is None else noise
+        if noise is None:
+            noise = noise_of_any_horizon(self._runtime.noise_spec(wanted), self._rng, streams)
         with np.errstate(all="ignore"):  # onnxruntime and torch raise no flags either: a call is judged by its actions
             normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
             sample, report = self._runtime.predict(normalized, noise, wanted, prefix)
@@ -317,16 +316,6 @@ class CompiledPolicy:
             )
         self._report = report
         return actions
-
-    def _draw(self, streams: int, plan: Plan) -> Noise:
-        """Noise of all steps of the original's horizon: a seed means the same however many are predicted."""
-        spec = self._runtime.noise_spec(plan)
-        shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
-        initial = self._rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
-        if not spec.sampler.stochastic:
-            return Noise(initial)
-        steps = self._rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)
-        return Noise(initial, steps[:, :, :predicted])
 
     def _plan(self, plan: str | Plan | npt.ArrayLike | None) -> Plan:
         """The plan that a caller means."""

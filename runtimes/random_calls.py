@@ -35,6 +35,15 @@ def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
     return Noise(initial, draws if any(loop.stochastic for loop in loops) else None)
 
 
+def noise_of_any_horizon(spec: PolicySpec, rng: np.random.Generator, streams: int) -> Noise:
+    """Noise of calls in a loop, drawn for the original's whole horizon: the same however many steps are predicted."""
+    shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
+    initial = rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
+    if not spec.sampler.stochastic:
+        return Noise(initial)
+    return Noise(initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)[:, :, :predicted])
+
+
 def normalized(spec: PolicySpec, obs: Observation) -> Observation:
     """What the network is given of an observation as ``predict_action`` takes it."""
     return {key: one.normalized(obs[key]) for key, one in spec.observations.items()}

@@ -57,7 +57,6 @@ RIVALS_READ = {
     for name in (
         "calls",
         "execute",
-        "pruner.head",
         "spacing",
         "task",
         "tts",

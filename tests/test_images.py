@@ -10,7 +10,7 @@ import torch
 from torch.nn import functional
 
 from ttscompile import ObservationSpec
-from ttscompile.core.images import fitted
+from ttscompile.core.values import fitted
 from ttscompile.errors import ObservationError, SpecError, TrajectoryError
 from ttscompile.runtimes.arrays import check_observation, read_observation
 from ttscompile.trajectories import load_trajectories

@@ -36,22 +36,21 @@ from ttscompile.calibration.calls import (
     draw_noise,
     load_episodes,
     prepare_calls,
-    sample_windows,
+    sample_calls,
     split_episodes,
     window_of,
 )
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pruner.paper import UPDATES, Paper
-from ttscompile.calibration.schedule import uniform_of
-from ttscompile.calibration.search import search_plan
+from ttscompile.calibration.schedule import search_plan, uniform_of
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Search, Task
 from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source, dense_plan
-from ttscompile.rivals.switched import Switched
+from ttscompile.rivals.adaptation import Switched
 from ttscompile.runtimes.plans import pruner_plan
 
 WITH_OTHER_NOISE = 64
@@ -257,9 +256,16 @@ def drawn(
 ) -> Calls:
     """Windows of consecutive calls, with what is answered if every block is computed."""
     spec = executor.view.manifest.spec
-    chosen = sample_windows(episodes, numbers, most, window, seed, REPEATS if stage == 0 else 1)
-    calls = prepare_calls(executor.model, spec, episodes, chosen, (seed, 9, stage), window, pinned)
+    chosen = sample_calls(episodes, numbers, most, seed, REPEATS if stage == 0 else 1, window)
+    calls = prepare_calls(executor.model, spec, episodes, chosen, (seed, 9, stage), window)
+    calls = pin(calls) if pinned else calls
     return replace(calls, path=torch.cat(list(dense_rounds(executor, calls))))
+
+
+def pin(calls: Calls) -> Calls:
+    """All calls of a window have the noise of its first."""
+    first = torch.arange(calls.count) // calls.window * calls.window
+    return replace(calls, initial=calls.initial[first], noise=None if calls.noise is None else calls.noise[:, first])
 
 
 def show(rows: Sequence[Row], title: str) -> None:

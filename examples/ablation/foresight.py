@@ -30,9 +30,9 @@ from ttscompile.calibration.calls import (
     split_episodes,
 )
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.progress import Progress
 from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Array
 from ttscompile.calibration.trials import base_of

@@ -39,7 +39,7 @@ def blocks_contestant(directory: Path, threads: int, plan: str | None = None) ->
     """
     view = view_of(load_artifact(directory), plan)
     manifest = view.manifest
-    with view.reading():
+    with view.artifact.reading():
         sessions = Sessions(threads).of(view)
     bound = [_bind(view, sessions[block_name(b)], b) for b in range(len(manifest.blocks))] * SEQUENCES
 
@@ -62,7 +62,7 @@ def tails_contestant(directory: Path, threads: int, cells: PlanArray, plan: str 
     """
     view = view_of(load_artifact(directory), plan)
     manifest = view.manifest
-    with view.reading():
+    with view.artifact.reading():
         work = Workspace(view, Sessions(threads).of(view, blocks=False), 1)
     ((obs, noise),) = random_calls(manifest.spec, 1, seed=0)
     for key, spec in manifest.spec.observations.items():

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from searches import LEARNED, Searching
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import NAMES
@@ -70,7 +71,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     "--with", "others", multiple=True, type=PATH, metavar="DIR...", help="Let these artifacts take part, too."
 )
 @count_option("--calls", "Judge on so many held-out calls, at most.", default=32)
-@count_option("--learned-calls", "Learn from so many calls, at most.", default=256, least=2)
+@count_option("--learned-calls", "Learn from so many calls, at most.", default=LEARNED, least=2)
 @threads_option("Threads that onnxruntime computes with.")
 @click.option(
     "--max-minutes",
@@ -97,17 +98,22 @@ def main(
     strategies: tuple[str, ...],
     sparsities: tuple[float, ...] | None,
     others: tuple[Path, ...],
+    calls: int,
     learned_calls: int,
+    threads: int,
+    seed: int,
     picture: Path | None,
     as_json: bool,
-    **search: Any,  # ttscompile.calibration.compare takes them by the same names
+    **search: Any,  # Searching takes them by the same names
 ) -> None:
     """Hold plans that strategies find now against those of the artifact DIRECTORY."""
     artifacts = {str(path): load_artifact(path) for path in (directory, *others)}
     of = artifacts[str(directory)].manifest
     wished = (sparsities or default_sparsities(of.steps)) if strategies else ()
-    how = {"observation": sources, "learned": learned_calls, **search}
-    found = compare(directory, artifacts, others, trajectories, strategies, wished, **how)
+    joining = Searching(directory, strategies, wished, learned=learned_calls, **search)
+    how: dict[str, Any] = {"observation": sources, "calls": calls, "threads": threads, "seed": seed}
+    found = compare(directory, artifacts, others, trajectories, joining=joining, **how)
+    joining.forget()
     if as_json:
         compared = [{"path": str(path), "identity": artifacts[str(path)].manifest.identity} for path in others]
         machine = fingerprint()

@@ -3,7 +3,7 @@
 Everything that decides is a state machine without clock or thread, driven by ``executor``, which has the one thread:
 
 - ``window``: frames in, observation windows out.
-- ``timeline``: actions by control tick, and how chunks join.
+- ``schedule``: actions by control tick, and how chunks join.
 - ``feasibility``: whether a policy keeps up, when its next call must start, and which plan runs under pressure.
 - ``guard``: what a chunk must be before it is executed.
 - ``state``: all of these together.

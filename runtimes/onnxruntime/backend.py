@@ -74,16 +74,6 @@ class OnnxBackend:
         self.keeps = readable_rollout(view)
         self.workspace: Workspace | None = self._open_workspace(1)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the buffers of the batch size under way, the rollout cache included; weights are onnxruntime's."""
-        return 0 if self.workspace is None else self.workspace.nbytes
-
-    @property
-    def rollout_nbytes(self) -> int:
-        """Memory of the rollout cache."""
-        return 0 if self.workspace is None else self.workspace.rollout.nbytes
-
     def lower(self, plan: PlanArray) -> Instructions:
         """See ``Backend.lower``."""
         return self._lowered.get(plan.tobytes()) or instructions_of(plan, self._manifest.groups)
@@ -123,7 +113,7 @@ class OnnxBackend:
 
     def _open_frames(self) -> FramePieces:
         """Frame pieces that remember nothing yet."""
-        towers = token_towers(self._manifest, self._view.tokens, self._run, self._renew)
+        towers = token_towers(self._manifest, self._view.variant.tokens, self._run, self._renew)
         return FramePieces(self._manifest.pieces, self._run, towers)
 
     @property

@@ -36,11 +36,6 @@ class ContextValues:
             else:
                 self.values[name] = np.zeros((*steps, *context.type.at(streams)), context.type.dtype)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the values."""
-        return sum(array.nbytes for array in (*self.values.values(), *self._step_inputs.values()))
-
     def fill(self, obs: Mapping[str, FloatArray]) -> None:
         """The prologue: what the normalised observations ``[B, ...]`` decide."""
         piece = self._manifest.pieces[CONDITION]
@@ -129,14 +124,8 @@ class BoundBlock:
                 self._by_step.append((arrays[name], value.take(np.arange(count), axis=batch + 1)))
             else:
                 self._gathered.append((arrays[name], value, batch, stepwise))
-        self._own = (*arrays.values(), stream, residual) if not whole else tuple(to for to, _ in self._by_step)
         inputs = {name: stream if name == piece.stream else arrays[name] for name in piece.inputs}
         self._bound = Bound(session, inputs, {piece.outputs[0]: residual})
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays that are its own."""
-        return sum(array.nbytes for array in self._own)
 
     def run(self, k: int) -> None:
         """Run at step k on the stream as it is."""

@@ -65,12 +65,6 @@ class IdleSteps:
             self._copies.append((_by_part(self._features[:, :, last:], horizon), parts[2:]))
         self._to_x0 = np.stack([sampler.sample_to_x0, sampler.out_to_x0], axis=1)[:, None]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays."""
-        own = (self.total, self._base, self._product, self._shift, self._parts, self._features, self._to_x0)
-        return sum(array.nbytes for array in (*own, *(self._clip or ())))
-
     def enter(self, sample: FloatArray, history: FloatArray, memory: FloatArray | None) -> None:
         """Take in the state before a step: ``[D, B, T]``, ``[D, B, 4 T]`` and, with memories, ``[D, B, S T]``."""
         np.copyto(self._parts[0], sample)

@@ -97,7 +97,7 @@ class Sessions:
         manifest = view.manifest
         single = {block_name(b) for b in range(len(manifest.blocks))}
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
-        unused = filter(of_tokens, manifest.pieces) if view.tokens is None else manifest.tokens
+        unused = filter(of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
         others = set(filter(is_of_loop, manifest.pieces))
         sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
         sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
@@ -109,7 +109,7 @@ class Sessions:
         Raises:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
         """
-        with view.reading():
+        with view.artifact.reading():
             return self._of_blocks(view)
 
     def of_layers(self, view: View) -> dict[str, Any]:
@@ -118,7 +118,7 @@ class Sessions:
         Raises:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
         """
-        with view.reading():
+        with view.artifact.reading():
             return self._open(view, [LAYERS])
 
     def _of_blocks(self, view: View) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool) 
     if os.environ.get(CONFIG_FROM_MODEL) not in (None, "", "0"):
         problem = f"the environment variable {CONFIG_FROM_MODEL} has onnxruntime ignore the threads and options that"
         raise RuntimeUnavailableError(f"{problem} a policy is loaded with. Unset it.")
-    path, options = view.files / file, _options(ort, threads, spins, careful)
+    path, options = view.artifact.files / file, _options(ort, threads, spins, careful)
     try:
         session = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
     except Exception as error:  # onnxruntime's own classes are derived from Exception

@@ -22,7 +22,7 @@ from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir import pieces
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
-from ttscompile.runtimes.call_inputs import fill_initial, fill_offset, hold_known
+from ttscompile.runtimes.backend import fill_initial, fill_offset, hold_known
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .contexts import BoundBlock, ContextValues
@@ -230,16 +230,6 @@ class Workspace:
             self._sums = np.zeros((count, *self.stream.shape), np.float32)
         return self._sums
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of all buffers, the rollout cache included."""
-        arrays = [*self.sample, self.fresh, self.stream, self.current, self.table, self._sums, self._offset]
-        arrays += [self._history, self._initial, self._prediction, *self._memory]
-        arrays += [advances.updates for advances in self._advances.values()]
-        bound = sum(block.nbytes for block in (*self._blocks, *self._some.values()))
-        idle = 0 if self.idle is None else self.idle.nbytes
-        return sum(array.nbytes for array in arrays) + self._contexts.nbytes + self.rollout.nbytes + bound + idle
-
     def advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
         """Bindings of all steps to the rows of a correction; made once for each, and once for its prefixes."""
         made = self._advances.get((id(correction), known is not None))
@@ -307,11 +297,6 @@ class RolloutStore:
         """One stream's part of an entry, as a view."""
         view: Array = np.moveaxis(self.entry(cell), self._axis, 0)[s]
         return view
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the entries."""
-        return sum(entry.nbytes for entry in self.entries.values())
 
 
 class _Advances(NamedTuple):

@@ -24,7 +24,7 @@ from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.pieces import CONDITION, LoopPiece
-from ttscompile.ir.program import Binding, Pieces, Program, frame_values
+from ttscompile.ir.program import Binding, Pieces, frame_values
 from ttscompile.runtimes.inpainting import Known
 
 from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
@@ -109,12 +109,6 @@ class ReferenceModel:
         self.groups = tuple(groups)
 
     @classmethod
-    def from_program(cls, program: Program) -> ReferenceModel:
-        """The model of a program in memory, after all passes."""
-        types, groups = zip(*((block.type, block.group) for block in program.blocks), strict=True)
-        return cls(program.pieces, program.spec, types, groups, program.weights)
-
-    @classmethod
     def from_view(cls, view: View, device: torch.device | None = None) -> ReferenceModel:
         """The model of a view of an artifact, in fp32, on a device; None for the CPU.
 
@@ -125,12 +119,6 @@ class ReferenceModel:
         weights = {**view.weights, **view.pruner}
         types = [block.type for block in manifest.blocks]
         return cls(view.pieces, manifest.spec, types, manifest.groups, weights, device, view.first_weights)
-
-    @property
-    def pruner_weights(self) -> dict[str, Tensor]:
-        """The pruner's tensors by name; empty if the program has no pruner."""
-        pruner = self._pieces.pruner
-        return {} if pruner is None else {n: self.weights[n] for n in pruner.constants if n.startswith("pruner.")}
 
     def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
         """Everything that the observation decides before the loop starts.

@@ -7,7 +7,6 @@ Sample and what belongs to it have the action dimensions first, ``[D, B, T]``, a
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol
 
@@ -39,19 +38,6 @@ class Network(Protocol):
         """The prediction ``[B, T, D]`` of step k from the stream after the last block."""
 
 
-@dataclass(frozen=True)
-class Denoised:
-    """Result of a call.
-
-    Attributes:
-        sample: ``[B, T, D]``.
-        residuals: those that were to be kept, by flat index ``k * blocks + b``.
-    """
-
-    sample: Tensor
-    residuals: Mapping[int, Tensor]
-
-
 def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     network: Network,
     plan: Instructions,
@@ -62,7 +48,7 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     rollout: Mapping[int, Tensor],
     read: Tensor | None,
     free: Tensor | None = None,
-) -> Denoised:
+) -> tuple[Tensor, dict[int, Tensor]]:
     """All steps of a call in which every stream follows one plan.
 
     Args:
@@ -75,6 +61,9 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
         rollout: entries of the rollout cache that the plan reads, by flat index.
         read: what the correction reads of the condition, ``[B, F]``; None if it reads nothing.
         free: ``[D, 1, T]``, 0 for what a prefix makes known and 1 elsewhere; None without a prefix.
+
+    Returns:
+        The sample ``[B, T, D]``, and the residuals that were to be kept, by flat index ``k * blocks + b``.
     """
     offset = list(offset)
 
@@ -117,7 +106,7 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
         prediction = network.tail(stream, k).permute(2, 0, 1)
         state = go_on(state, prediction, k)
         k += 1
-    return Denoised(state.sample.permute(1, 2, 0), residuals)
+    return state.sample.permute(1, 2, 0), residuals
 
 
 class _Operands:

@@ -22,10 +22,9 @@ from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.pieces import PRUNER
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 
-from .call_module import CPU, CallModule
 from .loop import denoise
-from .planned_loop import either
-from .pruned_call import PrunedCall
+from .plain_network import CPU, CallModule
+from .pruned_call import PrunedCall, either
 from .sampler import Advance
 
 
@@ -110,14 +109,14 @@ class SparseCall(CallModule):
         """
         network = self._network(obs, initial)
         advance, offset, read = self._moves(network, initial, steps)
-        sample = denoise(network, self._plan, (), advance, initial, offset.unbind(), {}, read).sample
+        sample, _ = denoise(network, self._plan, (), advance, initial, offset.unbind(), {}, read)
         if self._plain is None:
             return self._actions(sample)
         plain, far = self._plain, self._is_far(network)
         uncorrected, others, _ = self._moves(network, initial, steps, corrected=False)
 
         def some_plain() -> Tensor:
-            made = denoise(network, plain, (), uncorrected, initial, others.unbind(), {}, None).sample
+            made, _ = denoise(network, plain, (), uncorrected, initial, others.unbind(), {}, None)
             return torch.where(far[:, None, None], made, sample).contiguous()
 
         if not torch.compiler.is_compiling():

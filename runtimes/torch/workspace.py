@@ -12,8 +12,7 @@ from torch import Tensor
 from ttscompile.core.lattice import BoolArray
 from ttscompile.core.spec import FloatArray
 from ttscompile.errors import ObservationError
-from ttscompile.runtimes.backend import Call
-from ttscompile.runtimes.call_inputs import fill_initial, fill_offset, hold_known
+from ttscompile.runtimes.backend import Call, fill_initial, fill_offset, hold_known
 from ttscompile.runtimes.instructions import Instructions
 
 from .loop import denoise
@@ -97,7 +96,7 @@ class Workspace:
             own, rest = offset[..., : self._horizon], offset[..., self._horizon :]
             offset = torch.cat([own + added * self._free.tensor, rest], 3)
         stored = np.flatnonzero(plan.rollout).tolist()
-        made = denoise(
+        sample, residuals = denoise(
             self.network,
             plan,
             frozenset(np.flatnonzero(keep).tolist()),
@@ -108,8 +107,8 @@ class Workspace:
             read,
             self._free.tensor,
         )
-        self.result.copy_(made.sample)
-        for cell, residual in made.residuals.items():
+        self.result.copy_(sample)
+        for cell, residual in residuals.items():
             self.rollout[cell].copy_(residual)
 
     def take(self, whole: Workspace, index: Tensor, plan: Instructions) -> None:

@@ -13,8 +13,8 @@ import pytest
 from tests.artifact.updates import PLAN, update
 from tests.hostile.forged import rehash
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.block_weights import BlockWeights
 from ttscompile.artifact.codec import decode, encode, identities
+from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.write import identified, update_plans
 from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError

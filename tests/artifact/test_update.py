@@ -16,8 +16,8 @@ from tests.artifact.tiny import tiny_program, write_tiny
 from tests.artifact.updates import PLAN, RECORD, new_pruner, update
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.block_weights import BlockWeights
 from ttscompile.artifact.manifest import PlanRecord, StartRecord
+from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.plan import Plan, TokenReuse
 from ttscompile.errors import ArtifactError, IllegalPlanError

@@ -12,7 +12,8 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.task import Task
+from ttscompile.calibration.schedule import open_search, search_plan
+from ttscompile.calibration.task import Found, Task
 from ttscompile.trajectories import load_trajectories
 from ttscompile.trajectories.episodes import Episode
 
@@ -35,11 +36,16 @@ def make_task(
     return Task.of(executor, prepared, budget, seed)
 
 
-def in_windows(task: Task, windows: int, window: int = WINDOW, pinned: bool = False) -> Calls:
+def found_by(name: str, task: Task, intervals: int | None = None) -> Found:
+    """What a strategy finds."""
+    return search_plan(open_search(name, task), task.clock, intervals)[0]
+
+
+def in_windows(task: Task, windows: int, window: int = WINDOW) -> Calls:
     """Consecutive calls of made-up episodes, with targets."""
     spec, model = task.executor.view.manifest.spec, task.executor.model
     walk = np.cumsum(np.random.default_rng(5).standard_normal((windows, window, 2, 3)), 1).astype(np.float32)
     episodes = [Episode("made up", {"obs": one}) for one in walk]
     chosen = [(n, row) for n in range(windows) for row in range(window)]
-    calls = prepare_calls(model, spec, episodes, chosen, (0, 9), window, pinned)
+    calls = prepare_calls(model, spec, episodes, chosen, (0, 9), window)
     return replace(calls, path=task.executor.run_dense(calls))

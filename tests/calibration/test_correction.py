@@ -12,8 +12,7 @@ import torch
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import regression
-from ttscompile.calibration.fit_correction import fit_correction
-from ttscompile.calibration.sparse_loop import anchors_of
+from ttscompile.calibration.sparse_loop import anchors_of, fit_correction
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.whole_steps import WholeSteps, _set_apart, _sizes
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan

@@ -16,8 +16,8 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score, _Answers, further, judge, timed
+from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import DRAWS, FEWEST_OBSERVATIONS, HELD_OUT, LEARNED, STRETCH, Trials
@@ -97,7 +97,7 @@ def test_dense_is_the_original_and_fewer_steps_are_further(trials: Trials) -> No
     assert two.flops_saved > five.flops_saved > 0.4
     again = Plan(cells=whole_steps_plan(10, 6, (0, 9)))
     assert two == judge(trials, again), "the same noise, whatever was judged before"
-    assert judge(trials, again, threads=1).milliseconds is not None
+    assert timed([(trials, again)], 1)[0].median > 0
     assert judge(trials, again, LEARNED) != two
 
 
@@ -224,12 +224,12 @@ def test_a_plan_that_begins_with_the_chunk_before_is_judged_in_both_ways(
         answers = list(_Answers(held, proposal.plan, held.held_out).all())
         assert len(answers) == 2
         distances = [distance(executed(made), executed(held.held_out.answers)) for made in answers]
-        scores[last] = judge(held, proposal.plan, threads=1)
+        scores[last] = judge(held, proposal.plan)
         assert scores[last].distance == pytest.approx(max(distances), rel=0.1)
         assert distances[0] != distances[1]
         assert scores[last].error is None
         assert scores[last].sparsity == 0.0
-        assert (scores[last].milliseconds or 0.0) > 0
+        assert timed([(held, proposal.plan)], 1)[0].median > 0
     assert scores[9].distance < scores[1].distance
     assert scores[1].flops_saved > scores[9].flops_saved
 

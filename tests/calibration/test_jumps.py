@@ -8,9 +8,8 @@ import torch
 
 from ttscompile.calibration import sparse_loop
 from ttscompile.calibration.calls import IntArray
-from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.jumps import FOLDS, Layers, fit_jump
-from ttscompile.calibration.sparse_loop import SparseLoop
+from ttscompile.calibration.sparse_loop import SparseLoop, fit_correction
 from ttscompile.core.correction import HIDDEN
 from ttscompile.core.lattice import PlanArray
 from ttscompile.runtimes.reference.sampler import through

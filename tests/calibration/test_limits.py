@@ -26,7 +26,7 @@ from ttscompile.calibration.compare import compare
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.search import open_search, search_plan
+from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
@@ -36,7 +36,7 @@ from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
-from ttscompile.rivals.switched import Switched
+from ttscompile.rivals.adaptation import Switched
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.runtimes.runtime import Runtime
 from ttscompile.trajectories import load_trajectories
@@ -190,17 +190,15 @@ def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
     with pytest.raises(CalibrationError, match="seed must be an integer of at least 0; found -1"):
         calibrate(artifact, [recording], 0.7, seed=-1, progress=False)
     with pytest.raises(CalibrationError, match="found -1"):
-        compare(artifact, [recording], [], [], seed=-1)
+        compare(artifact, [recording], seed=-1)
     for name in ("seed", "threads", "max_intervals"):
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found 0.5"):
             calibrate(artifact, [recording], 0.7, **{name: 0.5}, progress=False)
     with pytest.raises(CalibrationError, match="max_intervals must be an integer of at least 1; found 0"):
         calibrate(artifact, [recording], 0.7, max_intervals=0, progress=False)
-    with pytest.raises(CalibrationError, match="intervals must be an integer of at least 1; found 0"):
-        compare(artifact, [recording], [], [], intervals=0)
-    for name in ("calls", "learned", "seed", "threads", "intervals"):
+    for name in ("calls", "seed", "threads"):
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found True"):
-            compare(artifact, [recording], [], [], **{name: True})
+            compare(artifact, [recording], **{name: True})
 
 
 def test_a_state_that_cannot_be_removed_is_an_error(

@@ -6,8 +6,8 @@ import importlib.util
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,12 @@ import pytest
 import ttscompile
 from tests.once import Once
 from ttscompile.calibration import pipeline
-from ttscompile.calibration.compare import compare
 from ttscompile.errors import ClusterError, RuntimeUnavailableError
 from ttscompile.pool import Here, RayPool, Work
 
 from . import policies
+from .pools import Elsewhere, needs_ray
 
-needs_ray = pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None, reason="NO RAY TESTS: ray is not installed; pip install 'ttscompile[ray]'"
-)
 SEARCH = {"target_sparsity": 0.7, "max_intervals": 6, "progress": False}
 
 
@@ -44,26 +41,6 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def identity(folder: Path) -> str:
     return ttscompile.load(folder).info.identity
-
-
-class Elsewhere:
-    """Does what a cluster does, in this process: parts are opened from what is sent, and several are given at once.
-
-    Args:
-        count: of a cluster.
-        lasts: parts after which the cluster is gone.
-    """
-
-    def __init__(self, count: int, lasts: int | None = None) -> None:
-        self.count, self.lasts, self.done = count, lasts, 0
-
-    def map(self, work: Work, parts: Sequence[Any]) -> Iterator[Any]:
-        run = work.elsewhere(*work.given)
-        for part in parts:
-            if self.done == self.lasts:
-                raise ClusterError("the cluster is gone")
-            self.done += 1
-            yield run(part)
 
 
 @pytest.fixture
@@ -116,29 +93,6 @@ def test_a_cluster_that_goes_leaves_a_state_from_which_this_process_goes_on(
     assert content(artifact) == content(alone)
 
 
-@pytest.mark.slow
-def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(
-    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Four parts of the dense calls, then two of the four searches; the others come next, and the held-out calls."""
-
-    def compared(pool: Elsewhere | Here, **options: Any) -> Any:
-        monkeypatch.setattr("ttscompile.calibration.compare.opened_pool", lambda address: nullcontext(pool))
-        options = {"calls": 4, "learned": 64, "intervals": 3, "ray": "an address", **options}
-        return compare(artifact, [recording], ["tts", "interval"], [0.6, 0.7], **options)
-
-    with pytest.raises(ClusterError, match="is gone"):
-        compared(Elsewhere(3, 6))
-    rest = Elsewhere(1)
-    found, expected = compared(rest, resume=True), compared(Here())
-    assert rest.done == 2 + 2  # searches, and what the original answers: once to time it, and the rest
-    here, there = (
-        [(p.series, p.name, p.sparsity, p.error, p.distance) for p in one.points] for one in (found, expected)
-    )
-    assert len(here) == 5
-    assert here == there
-
-
 def test_another_artifact_on_a_machine_of_the_cluster_is_refused(artifact: Path, tmp_path: Path) -> None:
     from ttscompile.pool import artifact_elsewhere
 
@@ -169,27 +123,6 @@ def test_ray_gives_the_same_bytes(
     cluster(ray_pool)
     ttscompile.calibrate(artifact, [recording], **SEARCH, ray="an address")
     assert content(artifact) == content(alone)
-
-
-@needs_ray
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_a_comparison_on_ray_finds_the_same_plans(
-    ray_pool: RayPool, artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    @contextmanager
-    def opened(address: str | None) -> Iterator[Any]:
-        yield Here() if address is None else ray_pool
-
-    monkeypatch.setattr("ttscompile.calibration.compare.opened_pool", opened)
-    found = [
-        compare(artifact, [recording], ["tts", "interval"], [0.6, 0.7], calls=4, learned=64, intervals=3, ray=address)
-        for address in (None, "an address")
-    ]
-    here, there = ([(p.series, p.name, p.sparsity, p.error) for p in one.points] for one in found)
-    assert len(here) == 5
-    assert here == there
-    assert found[0].skipped == found[1].skipped
 
 
 def dies_once(folder: str) -> Callable[[int], int]:

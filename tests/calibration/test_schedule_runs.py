@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from ttscompile.calibration import schedule_runs
-from ttscompile.calibration.schedule_runs import ScheduleRuns
+from ttscompile.calibration import whole_steps
 from ttscompile.calibration.spacing import FEW, other_placements, spacings
 from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.calibration.task import Task
+from ttscompile.calibration.whole_steps import ScheduleRuns
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -51,7 +51,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
     return count
 
 
-def runs_of(task: Task, reads: bool | None, bytes_: int = schedule_runs.BYTES) -> ScheduleRuns:
+def runs_of(task: Task, reads: bool | None, bytes_: int = whole_steps.BYTES) -> ScheduleRuns:
     fitted = None if reads is None else task.executor.select(task.calls, range(30))
     judged, model = task.executor.select(task.calls, range(30, 40)), task.executor.model
     loop = SparseLoop(task.executor, fitted, judged, reads=bool(reads), whole=True)
@@ -100,7 +100,7 @@ def test_what_schedules_share_is_computed_once(task: Task, counted: Counted) -> 
 
 
 def test_the_same_bits_whatever_was_kept(task: Task, counted: Counted) -> None:
-    kept, none = (counted(runs_of(task, True, bytes_), SCHEDULES) for bytes_ in (schedule_runs.BYTES, 0))
+    kept, none = (counted(runs_of(task, True, bytes_), SCHEDULES) for bytes_ in (whole_steps.BYTES, 0))
     alone = [runs_of(task, True).end(steps).samples for steps in SCHEDULES]
     for one, two, three in zip(kept[0], none[0], alone, strict=True):
         assert one.numpy().tobytes() == two.numpy().tobytes() == three.numpy().tobytes()

@@ -12,14 +12,14 @@ import pytest
 
 import ttscompile
 from ttscompile.calibration.pruner import paper
-from ttscompile.calibration.search import open_search, plan_of
+from ttscompile.calibration.schedule import open_search
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, Strategy, strategy_of
 from ttscompile.calibration.task import Found, Search
 from ttscompile.core.lattice import Source, illegal_cells
 from ttscompile.errors import CalibrationError
 from ttscompile.rivals import evo, gates, online
 
-from .tasks import MakeTask
+from .tasks import MakeTask, found_by
 
 BUDGET = 34
 """Of 10 x 6 cells: enough for all strategies."""
@@ -49,7 +49,7 @@ def run(search: Search, first: int = 0) -> Found:
 )
 def test_a_plan_is_legal_and_within_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
     task = make_task(budget, calls=8)
-    found, _ = plan_of(name, task)
+    found = found_by(name, task)
     model = task.executor.model
     assert found.schedule.shape == (model.steps, model.blocks)
     assert found.schedule.dtype == np.int8
@@ -81,7 +81,7 @@ def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, 
 @pytest.mark.parametrize("name", ["evo", "dip-go", "tts"])
 def test_a_search_beats_even_steps(make_task: MakeTask, name: str) -> None:
     task = make_task(20, calls=24)
-    even, searched = (task.error(plan_of(one, task)[0].schedule, task.calls) for one in ("interval", name))
+    even, searched = (task.error(found_by(one, task).schedule, task.calls) for one in ("interval", name))
     assert searched < even
 
 
@@ -97,14 +97,14 @@ def test_a_budget_out_of_reach_is_refused_and_the_next_cell_is_not(make_task: Ma
         open_search(name, make_task(least - 1))
     with pytest.raises(CalibrationError, match=f"leaves {least - 1}"):
         strategy_of(name).require_reach(10, 6, least - 1)
-    found, _ = plan_of(name, make_task(least))
+    found = found_by(name, make_task(least))
     assert int((found.schedule == Source.COMPUTE).sum()) == least
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
-    found, _ = plan_of(name, make_task(BUDGET, calls=1))
+    found = found_by(name, make_task(BUDGET, calls=1))
     assert int((found.schedule == Source.COMPUTE).sum()) <= BUDGET
 
 
@@ -115,8 +115,8 @@ def test_an_unknown_name_is_refused() -> None:
 
 def test_fewer_intervals_than_a_strategy_has(make_task: MakeTask) -> None:
     task = make_task(BUDGET)
-    assert plan_of("evo", task, 2)[0].notes == {"generations": 2}
-    assert plan_of("evo", task, 1000)[0].notes == {"generations": 4}
+    assert found_by("evo", task, 2).notes == {"generations": 2}
+    assert found_by("evo", task, 1000).notes == {"generations": 4}
 
 
 MAKERS = {one.name: one.make() for one in STRATEGIES}

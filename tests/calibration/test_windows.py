@@ -8,10 +8,10 @@ import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.calibration import execute
-from ttscompile.calibration.calls import Calls, Split, sample_windows, window_of
+from ttscompile.calibration.calls import Calls, Split, sample_calls, window_of
 from ttscompile.calibration.execute import Executor, whole_windows
-from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.pruner.straight_through import Practice, legal
+from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import Source, legalize
 from ttscompile.core.spec import FloatArray
@@ -96,27 +96,17 @@ def test_what_is_selected_is_windows_where_whole_ones_are_taken(make_task: MakeT
         assert whole_windows(np.array(numbers), 4) == (window == 4)
 
 
-def test_one_noise_for_a_window(make_task: MakeTask) -> None:
-    task = make_task(calls=2)
-    pinned, fresh = (in_windows(task, 2, pinned=one) for one in (True, False))
-    for calls, same in ((pinned, True), (fresh, False)):
-        assert calls.noise is not None
-        assert torch.equal(calls.initial[4], calls.initial[7]) == same
-        assert torch.equal(calls.noise[:, 4], calls.noise[:, 7]) == same
-    assert not torch.equal(pinned.initial[0], pinned.initial[4])
-
-
 def test_windows_are_consecutive_and_of_one_episode() -> None:
     episodes = [Episode("made up", {"obs": np.zeros((n, 2), np.float32)}) for n in (3, 9, 4, 13)]
     split = Split(calibration=(0, 1, 3), validation=(2,))
     assert window_of(episodes, split) == 4
-    chosen = sample_windows(episodes, split.calibration, 100, 4, seed=0)
+    chosen = sample_calls(episodes, split.calibration, 100, 0, window=4)
     assert len(chosen) == 4 * (2 + 3)
     windows = np.array(chosen).reshape(-1, 4, 2)
     assert (windows[:, :, 0] == windows[:, :1, 0]).all()
     assert (np.diff(windows[:, :, 1]) == 1).all()
-    assert len(sample_windows(episodes, split.calibration, 11, 4, seed=0)) == 8
-    assert len(sample_windows(episodes, (2,), 100, 4, seed=0, repeats=3)) == 12
+    assert len(sample_calls(episodes, split.calibration, 11, 0, window=4)) == 8
+    assert len(sample_calls(episodes, (2,), 100, 0, repeats=3, window=4)) == 12
 
 
 @pytest.mark.slow

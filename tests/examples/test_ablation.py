@@ -5,14 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ablate import DIRECTIONS, interval, main, rows_of
+import torch
+from ablate import DIRECTIONS, interval, main, pin, rows_of
 from click.testing import CliRunner
 
 import ttscompile
 from tests.calibration import policies
 from tests.once import Once
 from ttscompile.calibration import tts
+from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.pruner.paper import UPDATES
+from ttscompile.runtimes.reference.model import Contexts
 
 WAYS = ["searched", "switched", "gates", "head", "refined"]
 
@@ -27,6 +30,18 @@ def test_an_interval_is_over_episodes() -> None:
     episodes = np.repeat([0, 1], 10)
     assert interval(np.where(episodes == 0, 1.0, 3.0), episodes) == (1.0, 3.0)
     assert interval(np.full(20, 2.0), episodes) == (2.0, 2.0)
+
+
+def test_pinned_calls_have_one_noise_a_window() -> None:
+    draw = torch.Generator().manual_seed(0)
+    noise = torch.randn(3, 8, 2, generator=draw)
+    fresh = Calls(Contexts(8, {}, ({},) * 3), torch.randn(8, 2, generator=draw), noise, np.zeros(8, np.int64), window=4)
+    pinned = pin(fresh)
+    for calls, same in ((pinned, True), (fresh, False)):
+        assert calls.noise is not None
+        assert torch.equal(calls.initial[4], calls.initial[7]) == same
+        assert torch.equal(calls.noise[:, 4], calls.noise[:, 7]) == same
+    assert not torch.equal(pinned.initial[0], pinned.initial[4])
 
 
 @pytest.mark.slow

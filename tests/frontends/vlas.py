@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.core.images import fitted
 from ttscompile.core.spec import PolicySpec
+from ttscompile.core.values import fitted
 
 STATE = "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"

@@ -206,7 +206,7 @@ def test_a_precision_that_cannot_be_had_is_refused_with_what_can() -> None:
 
 
 def test_the_product_that_a_convolution_became_is_found_behind_its_reshape() -> None:
-    """``lower.translations``: ``[out, channels, kernel]`` is turned and reshaped to ``[kernel * channels, out]``."""
+    """``lower.program``: ``[out, channels, kernel]`` is turned and reshaped to ``[kernel * channels, out]``."""
     rng = np.random.default_rng(0)
     sizes = {"w": (5, 4, 3), "b": (5,)}
     weights = {name: rng.standard_normal(size).astype(np.float32) for name, size in sizes.items()}

@@ -20,7 +20,7 @@ from tests.runtimes.agreement import call_terms
 from tests.runtimes.pruners import calibrated, random_pruner
 from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.block_weights import BlockWeights
+from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan

@@ -7,9 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from tests.calibration.tasks import MakeTask
+from tests.calibration.tasks import MakeTask, found_by
 from tests.rounding import Counted, assert_equal_but_for_rounding, bound
-from ttscompile.calibration.search import plan_of
 from ttscompile.core.lattice import Source
 from ttscompile.rivals.bac import Schedule, best_schedules, bubbling, dense_residuals, dense_statistics, spend, union
 
@@ -98,5 +97,5 @@ def test_the_residuals_are_those_of_the_reference(make_task: MakeTask) -> None:
 
 
 def test_the_plan_reads_timestep_only(make_task: MakeTask) -> None:
-    found, _ = plan_of("bac", make_task(20))
+    found = found_by("bac", make_task(20))
     assert set(np.unique(found.schedule)) == {Source.COMPUTE, Source.TIMESTEP}

@@ -13,8 +13,8 @@ from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
-from ttscompile.rivals import linear, sensitivity
-from ttscompile.rivals.linear import LinearModel, linearise
+from ttscompile.rivals import sensitivity
+from ttscompile.rivals.sensitivity import LinearModel, linearise
 
 CELLS = [(k, b) for k in range(1, 10) for b in range(6)]
 
@@ -48,13 +48,13 @@ def weighted_squares(task: Task, plans: list[PlanArray]) -> np.ndarray:
     executed = [task.actions.executed(task.executor.run(plan, task.calls)) for plan in plans]
     differences = torch.stack(executed) - task.actions.executed(task.calls.targets)
     sizes = differences[0].abs()
-    return (differences**2 / (sizes + linear.SOFTEN * sizes.median() + 1e-9)).sum(-1).numpy()
+    return (differences**2 / (sizes + sensitivity.SOFTEN * sizes.median() + 1e-9)).sum(-1).numpy()
 
 
 @pytest.fixture
 def every_direction(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many directions as the actions have, so that the projected error keeps all of the error."""
-    monkeypatch.setattr(linear, "DIRECTIONS", 8)
+    monkeypatch.setattr(sensitivity, "DIRECTIONS", 8)
 
 
 @pytest.mark.slow

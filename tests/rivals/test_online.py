@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.calibration.tasks import MakeTask
+from tests.calibration.tasks import MakeTask, found_by
 from tests.rounding import FLOAT64, Counted, assert_equal_but_for_rounding, bound
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.search import plan_of
 from ttscompile.calibration.task import Found
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.errors import CalibrationError
-from ttscompile.rivals.dbcache import dbcache, proposals
-from ttscompile.rivals.online import Criterion, Decisions, decide, within
-from ttscompile.rivals.teacache import dense_changes, proposal
+from ttscompile.rivals.online import Criterion, Decisions, dbcache, decide, dense_changes, proposal, proposals, within
 from ttscompile.runtimes.reference.model import ReferenceModel
 
 RULES = [
@@ -95,7 +92,7 @@ def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criteri
 @pytest.mark.parametrize("budget", [20, 40])
 def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
     task = make_task(budget, calls=24)
-    found, _ = plan_of(name, task)
+    found = found_by(name, task)
     rule = criterion_of(found)
     assert rule.name == name
     assert found.notes["criterion"] == rule.record()
@@ -109,7 +106,7 @@ def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: i
 @pytest.mark.parametrize("name", ["teacache", "dbcache"])
 def test_the_schedule_is_the_best_decision(make_task: MakeTask, name: str) -> None:
     task = make_task(30, calls=12)
-    found, _ = plan_of(name, task)
+    found = found_by(name, task)
     plans = within(decide(task.executor, criterion_of(found), task.calls).plans, 30)
     errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 1

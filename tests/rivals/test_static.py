@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.calibration.tasks import MakeTask
-from ttscompile.calibration.search import plan_of
+from tests.calibration.tasks import MakeTask, found_by
 from ttscompile.calibration.strategies import strategy_of
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.errors import CalibrationError
@@ -58,7 +57,7 @@ def test_delta_dit_of_one_block_is_refused() -> None:
 
 def test_a_rule_takes_the_parameters_with_the_lowest_error(make_task: MakeTask) -> None:
     task = make_task(34)
-    found, _ = plan_of("delta-dit", task)
+    found = found_by("delta-dit", task)
     plans = [plan for plan, _ in static.delta_plans(10, 6, 34)]
     errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 3

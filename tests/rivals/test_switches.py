@@ -10,8 +10,8 @@ import torch
 
 from tests.calibration.tasks import MakeTask
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.pruner.head import has_head
 from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
+from ttscompile.ir.plan_head import has_head
 from ttscompile.rivals.switches import Switch, capacity, fit_switches, head_features, head_weights
 from ttscompile.runtimes.plans import pruner_plan
 

@@ -29,6 +29,7 @@ from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.runtimes.torch.network import StreamsNetwork
 
 from .agreement import call_terms, random_inputs
+from .buffers import nbytes, rollout_nbytes
 from .conftest import MakeArtifact
 from .toys import toy_program
 
@@ -284,19 +285,19 @@ def test_a_batch_that_finds_no_memory_leaves_a_runtime_that_works(
         with pytest.raises(MemoryError):
             runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))
     assert isinstance(runtime.backend, OnnxBackend)
-    assert runtime.backend.nbytes == runtime.backend.rollout_nbytes == 0
+    assert runtime.backend.workspace is None
     assert runtime.predict(obs, noise, Plan(cells=dense_plan(5, 5)))[1].computed == (25, 25)
 
 
 def test_a_workspace_is_given_back_when_the_batch_changes(toy_artifact: Artifact) -> None:
     runtime = open_runtime(toy_artifact)
     assert isinstance(runtime.backend, OnnxBackend)
-    assert runtime.backend.rollout_nbytes == 0
+    assert rollout_nbytes(runtime) == 0
     sizes = []
     for streams in (1, 4, 2):
         obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), streams)
         runtime.predict(obs, Noise(noise.initial, noise.steps), Plan(cells=dense_plan(5, 5)))
-        assert runtime.backend.rollout_nbytes == 25 * streams * 3 * 4 * 4
-        sizes.append(runtime.backend.nbytes)
+        assert rollout_nbytes(runtime) == 25 * streams * 3 * 4 * 4
+        sizes.append(nbytes(runtime.backend.workspace))
         runtime.reset()
     assert sizes[0] < sizes[2] < sizes[1] <= 4 * sizes[0]

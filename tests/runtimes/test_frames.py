@@ -16,7 +16,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.runtimes.frames import WINDOWS, Computed, FrameMemory, contents_of
+from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import verify
 from ttscompile.verification.engaged import ENGAGED
@@ -226,9 +226,9 @@ def test_memory_is_bounded(policy: CompiledPolicy) -> None:
 def test_frames_that_differ_in_one_number_are_two() -> None:
     memory, asked = FrameMemory(), list[float]()
 
-    def double(i: int) -> Computed:
+    def double(i: int) -> tuple[tuple[Any, ...], int, int]:
         asked.append(float(rows[i].sum()))
-        return Computed((2 * rows[i : i + 1],))
+        return (2 * rows[i : i + 1],), 0, 0
 
     rows = np.zeros((3, 4), np.float32)
     rows[1, 2], rows[2, 2] = np.float32(1e-30), np.float32(-0.0)

@@ -18,20 +18,20 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.fit_correction import fit_correction
+from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.core.correction import correction_flops
 from ttscompile.core.plan import Plan
 from ttscompile.core.update import update_flops
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.reference.model import ReferenceModel, noise_tensors
+from ttscompile.runtimes.reference.model import noise_tensors
 from ttscompile.samplers.table import sampler_table
 
 from .agreement import call_terms, largest_difference, random_inputs
 from .literal import Episode
 from .plans import random_correction, random_plan
-from .toys import as_functions, pencil_program, toy_program
+from .toys import as_functions, model_of, pencil_program, toy_program
 
 C, T = Source.COMPUTE, Source.TIMESTEP
 
@@ -77,7 +77,7 @@ def test_the_memory_with_a_pencil() -> None:
         memory_to_next=np.array([[-0.5], [-0.5]]),
         to_memory=np.array([[[0, 0, 1, 0]], [[0, 0, 7, 7]]]),
     )
-    model = ReferenceModel.from_program(replace(program, spec=replace(program.spec, sampler=table)))
+    model = model_of(replace(program, spec=replace(program.spec, sampler=table)))
     contexts = model.prologue({"obs": torch.tensor([[-32.0]])})
     for plan, expected in (([C, C], 25), ([C, T], 22)):
         rollout = model.denoise(contexts, torch.full((1, 1, 1), 35.0), None, np.array(plan, np.int8)[:, None])
@@ -87,7 +87,7 @@ def test_the_memory_with_a_pencil() -> None:
 @pytest.mark.parametrize("name", TABLES)
 def test_the_reference_is_the_formula(name: str) -> None:
     program = program_of(TABLES[name])
-    model, rng = ReferenceModel.from_program(program), np.random.default_rng(0)
+    model, rng = model_of(program), np.random.default_rng(0)
     for _ in range(3):
         obs, initial = (rng.standard_normal(shape).astype(np.float32) for shape in ((1, 2), (1, 3, 2)))
         steps = rng.standard_normal((model.steps, 1, 3, 2)).astype(np.float32)

@@ -18,9 +18,9 @@ from tests.once import Once
 from tests.rounding import bound
 from ttscompile import Plan
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.block_weights import BlockWeights
 from ttscompile.artifact.codec import to_json
 from ttscompile.artifact.manifest import StartRecord
+from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import Source

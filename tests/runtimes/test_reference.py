@@ -19,11 +19,11 @@ from ttscompile.runtimes.reference.model import Contexts, ReferenceModel, Rollou
 
 from .literal import Episode
 from .plans import random_plan
-from .toys import as_functions, pencil_program, toy_program
+from .toys import as_functions, model_of, pencil_program, pruner_weights, toy_program
 
 C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
 TOY = toy_program()
-MODEL = ReferenceModel.from_program(TOY)
+MODEL = model_of(TOY)
 
 
 def pencil(
@@ -36,14 +36,14 @@ def pencil(
 
 
 def test_reuse_gives_41_and_compute_gives_44() -> None:
-    model = ReferenceModel.from_program(pencil_program())
+    model = model_of(pencil_program())
     assert pencil(model, 35, [C, T], None)[0] == 41
     assert pencil(model, 35, [C, F], None)[0] == 41
     assert pencil(model, 35, [C, C], None)[0] == 44
 
 
 def test_rollout_is_the_last_call_in_which_the_cell_was_computed() -> None:
-    model = ReferenceModel.from_program(pencil_program())
+    model = model_of(pencil_program())
     _, cache = pencil(model, 35, [C, C], None)  # writes f(38) = 6 at step 1
     reused, cache = pencil(model, 40, [C, T], cache)  # 40 + 8 + 8, and writes nothing at step 1
     assert reused == 56
@@ -51,7 +51,7 @@ def test_rollout_is_the_last_call_in_which_the_cell_was_computed() -> None:
 
 
 def test_a_rollout_that_was_never_written_is_refused() -> None:
-    model = ReferenceModel.from_program(pencil_program())
+    model = model_of(pencil_program())
     _, cache = pencil(model, 35, [C, T], None)
     with pytest.raises(IllegalPlanError, match="step 1, block 0"):
         pencil(model, 35, [C, R], cache)
@@ -168,7 +168,7 @@ def test_without_gradients_only_computed_blocks_are_evaluated(monkeypatch: pytes
 
 def test_the_pruners_logits_are_differentiable_in_given_weights() -> None:
     contexts = MODEL.prologue(inputs(np.random.default_rng(0), 2)[0])
-    weights = {name: value.clone().requires_grad_() for name, value in MODEL.pruner_weights.items()}
+    weights = {name: value.clone().requires_grad_() for name, value in pruner_weights(TOY).items()}
     assert set(weights) == {"pruner.w", "pruner.b", "pruner.mask"}
     logits = MODEL.logits(contexts, weights)
     assert logits.shape == (2, MODEL.steps, MODEL.blocks, 4)
@@ -192,8 +192,7 @@ def test_gates_that_are_not_one_hot_are_refused() -> None:
 
 def test_a_program_without_pieces_or_pruner_is_refused() -> None:
     program = toy_program(pruner=False)
-    model = ReferenceModel.from_program(program)
-    assert model.pruner_weights == {}
+    model = model_of(program)
     with pytest.raises(IllegalPlanError, match="no pruner"):
         model.logits(model.prologue(inputs(np.random.default_rng(0), 1)[0]))
     with pytest.raises(TypeError, match="'blocks' and 'pieces'"):

@@ -15,7 +15,7 @@ import pytest
 
 import ttscompile
 from tests.plans import store_schedules
-from ttscompile.artifact import folder, load_artifact
+from ttscompile.artifact import files, load_artifact
 from ttscompile.artifact.files import beside, exchange, replace_folder
 from ttscompile.artifact.golden import load_golden_plans
 from ttscompile.artifact.load import read_manifest
@@ -210,7 +210,7 @@ def test_without_proc_exchanged_there_and_back_is_seen(
     places: tuple[Path, Path], expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, runtime: str
 ) -> None:
     """As on macOS: what was opened by name in between is the other's, and nothing of it is used."""
-    monkeypatch.setattr(folder, "HELD", str(places[0] / "none"))
+    monkeypatch.setattr(files, "HELD", str(places[0] / "none"))
     assert ttscompile.load(places[0], runtime).info.identity in expected
     monkeypatch.setattr(loading, "TRIES", 1)
 

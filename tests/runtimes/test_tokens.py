@@ -18,7 +18,7 @@ from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import PieceRecord
-from ttscompile.artifact.size import check_size
+from ttscompile.artifact.requires import check_size
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.plan import DENSE, Plan, TokenReuse
@@ -90,7 +90,7 @@ def counted(policy: CompiledPolicy) -> tuple[int, int]:
 def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) -> TokenTower:
     reuse = TokenReuse(threshold, refresh)
     view = view_of(artifact, reusing(artifact, reuse))
-    with view.reading():
+    with view.artifact.reading():
         backend = OnnxBackends()(view)
     (tower,) = token_towers(backend._manifest, reuse, backend._run, backend._renew).values()
     return tower

@@ -23,12 +23,10 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Enum, Graph, Ref
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.instructions import instructions_of
-from ttscompile.runtimes.torch.backend import TorchBackend, TorchBackends
-from ttscompile.runtimes.torch.capture import Line, Lines
-from ttscompile.runtimes.torch.functions import write_function
+from ttscompile.runtimes.torch.backend import Line, Lines, TorchBackend, TorchBackends
+from ttscompile.runtimes.torch.functions import HALF_LINEAR, write_function
 from ttscompile.runtimes.torch.loop import denoise
 from ttscompile.runtimes.torch.network import Parts, Placed, StreamsNetwork
-from ttscompile.runtimes.torch.packed import HALF_LINEAR
 from ttscompile.runtimes.torch.sampler import Advance
 
 from .agreement import call_terms, largest_difference, random_inputs
@@ -385,7 +383,7 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     rollout = dict.fromkeys(np.flatnonzero(lowered.rollout).tolist(), entry)
     read, _ = advance.of_condition(network.condition())
     assert advance.jumps
-    made = denoise(network, lowered, range(25), advance, initial, offset, rollout, read)
-    results = [made.sample, network.logits(), network.condition(), *made.residuals.values()]
+    sample, residuals = denoise(network, lowered, range(25), advance, initial, offset, rollout, read)
+    results = [sample, network.logits(), network.condition(), *residuals.values()]
     assert len(results) == 3 + np.count_nonzero(plan == Source.COMPUTE)
     assert {each.device.type for each in results} == {"meta"}

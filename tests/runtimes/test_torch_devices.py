@@ -14,8 +14,7 @@ from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.torch.backend import TorchBackends
-from ttscompile.runtimes.torch.capture import cuda_graphs
+from ttscompile.runtimes.torch.backend import TorchBackends, cuda_graphs
 from ttscompile.runtimes.torch.devices import device_of, exact_arithmetic
 
 from .agreement import random_inputs

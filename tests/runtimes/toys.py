@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.artifact import Artifact, load_artifact
@@ -15,6 +16,7 @@ from ttscompile.artifact.write import write_artifact
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Binding, Block, Pieces, Program
+from ttscompile.runtimes.reference.model import ReferenceModel
 
 from .literal import Toy
 
@@ -274,3 +276,16 @@ def written_artifact(program: Program, directory: Path) -> Artifact:
 
     write_artifact(program, lower_program(program), directory)
     return load_artifact(directory)
+
+
+def model_of(program: Program) -> ReferenceModel:
+    """The reference of a program in memory, after all passes."""
+    types, groups = zip(*((block.type, block.group) for block in program.blocks), strict=True)
+    return ReferenceModel(program.pieces, program.spec, types, groups, program.weights)
+
+
+def pruner_weights(program: Program) -> dict[str, torch.Tensor]:
+    """The constants of the pruner that may be trained, by name; none without a pruner."""
+    pruner = program.pieces.pruner
+    own = () if pruner is None else [name for name in pruner.constants if name.startswith("pruner.")]
+    return {name: torch.from_numpy(np.array(program.weights[name])) for name in own}

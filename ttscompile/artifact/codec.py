@@ -32,7 +32,6 @@ from ..ir.pieces import (
     tokens_name,
 )
 from . import typed_json
-from .calibration_record import check_record
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, PrecisionRecord, WeightsRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
 from .upgrade import upgraded
@@ -305,6 +304,49 @@ def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value, uses
     if set(record.precision_models) != lower or (record.precision_weights is None) is bool(lower):
         value.fail(f"models in another precision, and a file of their weights, for {sorted(lower) or 'nothing'}")
     _require_alone(value, record.files, uses)
+
+
+_SCORE = ("distance", "error", "error_p90", "of_other_noise", "sparsity", "flops_sparsity", "flops_saved", "tokens")
+_BUDGET = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
+_RECORD: Mapping[str, Any] = {
+    "strategy": str,
+    "seed": int,
+    "learned": tuple[str, ...],
+    "plans": Mapping[str, Mapping[str, Any]],
+    "budget": Mapping[str, Any],
+    "other_noise": float | None,
+    "episodes": Mapping[str, tuple[int, ...]],
+    "calls": Mapping[str, int],
+    "skipped": Mapping[str, str],
+    "told": Mapping[str, str],
+    "frontier": tuple[Mapping[str, Any], ...],
+}
+_TRIED: Mapping[str, Any] = {
+    "name": str,
+    "told": str,
+    "distance": float,
+    "interval": tuple[float, ...],
+    "milliseconds": float,
+    "worst": float,
+    "near": bool,
+}
+
+
+def check_record(record: Value) -> None:
+    """Raise ArtifactError unless what commands read of a calibration record is of its type; the rest is free JSON."""
+    members = record.members()
+    _check_kinds(members, _RECORD)
+    if "budget" in members:
+        _check_kinds(members["budget"].members(), dict.fromkeys(_BUDGET, float | None))
+    for score in members["plans"].members().values() if "plans" in members else ():
+        _check_kinds(score.members(), dict.fromkeys(_SCORE, float | None))
+    for tried in members["frontier"].items() if "frontier" in members else ():
+        _check_kinds(tried.members(), _TRIED)
+
+
+def _check_kinds(members: Mapping[str, Value], kinds: Mapping[str, Any]) -> None:
+    for name in members.keys() & kinds.keys():
+        typed_json.read_as(kinds[name], members[name])
 
 
 def _checksum(document: object) -> str:

@@ -39,13 +39,11 @@ from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
 from .codec import MAX_MANIFEST_BYTES, decode, identities
 from .corrections import ENVELOPE, PREFIX, read_corrections, read_envelope
-from .files import check_file, read_file
-from .folder import Folder, Stamp
+from .files import Folder, Stamp, check_file, read_file
 from .graph_json import graph_from_json
 from .manifest import MANIFEST, Manifest, PlanRecord, abbreviated
 from .onnx_files import check_models
-from .requires import check_runtime
-from .size import check_size
+from .requires import check_runtime, check_size
 from .strict_json import REMEDY, Value, parse
 
 TABLE_PREFIX = "table/"

@@ -24,8 +24,7 @@ from ..ir.layers import layers_graph
 from ..ir.program import Binding, Program
 from . import tensors
 from .bind import REPORT, interface
-from .calibration_record import check_record
-from .codec import plan_fault
+from .codec import check_record, plan_fault
 from .manifest import PLAN_NAME, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
 from .strict_json import Value, dump_compact, parse
 from .towers import TokensRecord

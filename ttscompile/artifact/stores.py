@@ -1,9 +1,9 @@
-"""Files of an artifact that an update writes anew: the plans' arrays, and the weights of a pruner."""
+"""Files of an artifact that an update writes anew: the plans' arrays, weights of pruners, and those of blocks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,27 @@ import numpy.typing as npt
 
 from ..core.envelope import Envelope
 from ..core.plan import ORIGINAL, Plan
-from ..ir.pieces import PRUNER, of_loop
+from ..errors import ArtifactError
+from ..ir.pieces import OF_ALL_BLOCKS, PRUNER, block_name, of_loop
 from . import tensors
-from .bind import bind, places_of
+from .bind import Place, bind, places_of
 from .corrections import correction_arrays, envelope_arrays, require_fit
 from .files import content_hash, describe, replace_file
 from .load import Artifact
-from .manifest import Manifest
+from .manifest import FileRecord, Manifest, WeightsRecord
+
+
+@dataclass(frozen=True)
+class BlockWeights:
+    """Constants of residual blocks that a plan has in place of the original's.
+
+    Attributes:
+        weights: by name.
+        precision: what the artifact's other precision makes of them, by name; empty where it has none.
+    """
+
+    weights: Mapping[str, npt.NDArray[Any]]
+    precision: Mapping[str, npt.NDArray[Any]]
 
 
 def plan_arrays_of(
@@ -42,9 +56,7 @@ def store_arrays(directory: Path, manifest: Manifest, store: str, arrays: Mappin
     stores: dict[str, Any] = {store: None}
     if arrays:
         content = tensors.serialize(arrays)
-        path = directory / f"{store}-{content_hash(content)}.safetensors"
-        replace_file(path, content)
-        stores[store], files[path.name] = path.name, describe(path)
+        stores[store] = _put(directory, f"{store}-{content_hash(content)}.safetensors", content, files).name
     return replace(manifest, files=files, stores=replace(manifest.stores, **stores))
 
 
@@ -57,8 +69,6 @@ def store_pruner(
     artifact: Artifact, manifest: Manifest, weights: Mapping[str, npt.NDArray[Any]], loop: str
 ) -> Manifest:
     """Write the weights of a loop's pruner, and its model that refers to them, beside the old ones."""
-    import onnx
-
     own = artifact.pruner if loop == ORIGINAL else artifact.loop_pruners[loop]
     piece = PRUNER if loop == ORIGINAL else of_loop(PRUNER, loop)
     old = manifest.stores.pruner if loop == ORIGINAL else manifest.loop_pruners[loop]
@@ -66,15 +76,73 @@ def store_pruner(
     values = {name: np.asarray(value) for name, value in weights.items()}
     expected = {name: (str(value.dtype), value.shape) for name, value in own.items()}
     tensors.check_arrays("pruner's weight", values, expected, artifact.path, "Calibrate this artifact again.")
-    content = tensors.serialize(values)
-    path = artifact.path / f"{pruner_name(piece, content)}.safetensors"
-    replace_file(path, content)
-    model = onnx.load(artifact.path / record.file, load_external_data=False)
-    bound = bind(model, places_of(path, values), piece, again=True)
-    replace_file(path.with_suffix(".onnx"), bound)
     files = {name: one for name, one in manifest.files.items() if name not in (old, record.file)}
-    files |= {each.name: describe(each) for each in (path, path.with_suffix(".onnx"))}
-    pieces = {**manifest.pieces, piece: replace(record, file=path.with_suffix(".onnx").name)}
+    content = tensors.serialize(values)
+    path = _put(artifact.path, f"{pruner_name(piece, content)}.safetensors", content, files)
+    bound = _bound_again(artifact, piece, record.file, places_of(path, values))
+    model = _put(artifact.path, path.with_suffix(".onnx").name, bound, files)
+    manifest = replace(manifest, files=files, pieces={**manifest.pieces, piece: replace(record, file=model.name)})
     if loop == ORIGINAL:
-        return replace(manifest, files=files, pieces=pieces, stores=replace(manifest.stores, pruner=path.name))
-    return replace(manifest, files=files, pieces=pieces, loop_pruners={**manifest.loop_pruners, loop: path.name})
+        return replace(manifest, stores=replace(manifest.stores, pruner=path.name))
+    return replace(manifest, loop_pruners={**manifest.loop_pruners, loop: path.name})
+
+
+def without_weights(manifest: Manifest, kept: Collection[str]) -> Manifest:
+    """The manifest with only these of its weights for blocks; files of the others are no longer listed."""
+    gone = {file for name, record in manifest.weights.items() if name not in kept for file in record.files}
+    return replace(
+        manifest,
+        files={name: record for name, record in manifest.files.items() if name not in gone},
+        weights={name: record for name, record in manifest.weights.items() if name in kept},
+    )
+
+
+def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockWeights) -> Manifest:
+    """Write weights of blocks, in files that nothing has yet; the manifest with their record.
+
+    Raises:
+        ArtifactError: a weight that is no constant of the artifact, or is one of another type.
+        OSError: they cannot be written.
+    """
+    files = dict(manifest.files)
+    if unknown := sorted(set(own.weights) - set(artifact.weights)):
+        raise ArtifactError(f"weights {name!r}: expected constants of the artifact; found {unknown[0]!r}.")
+    contents = [tensors.serialize(each) for each in (own.weights, own.precision)]
+    prefix = f"blocks-{content_hash(b''.join(contents))}-"
+
+    def again(models: Mapping[str, str], places: Mapping[str, Place], suffix: str = "") -> dict[str, str]:
+        """The models of these files by piece, bound to the places; names of the new files."""
+        made = dict[str, str]()
+        for piece, file in models.items():
+            model = _bound_again(artifact, piece, file, places)
+            made[piece] = _put(artifact.path, f"{prefix}{piece}{suffix}.onnx", model, files).name
+        return made
+
+    weights = _put(artifact.path, f"{prefix}weights.safetensors", contents[0], files)
+    places = places_of(weights, own.weights)
+    blocks = (*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS)
+    models = again({piece: manifest.pieces[piece].file for piece in blocks}, places)
+    lower = {} if manifest.precision is None else manifest.precision.models
+    lower = {piece: file for piece, file in lower.items() if piece in blocks}
+    lower_file, lower_models = None, dict[str, str]()
+    if lower:
+        path = _put(artifact.path, f"{prefix}weights_lower.safetensors", contents[1], files)
+        lower_file, places = path.name, places | places_of(path, own.precision)
+        lower_models = again(lower, places, "_lower")
+    record = WeightsRecord(weights.name, models, lower_file, lower_models)
+    return replace(manifest, files=files, weights={**manifest.weights, name: record})
+
+
+def _put(directory: Path, name: str, content: bytes, files: dict[str, FileRecord]) -> Path:
+    """Write a file, and list it among others."""
+    path = directory / name
+    replace_file(path, content)
+    files[name] = describe(path)
+    return path
+
+
+def _bound_again(artifact: Artifact, piece: str, file: str, places: Mapping[str, Place]) -> bytes:
+    """The model of a piece, whose constants at these places get new values."""
+    import onnx
+
+    return bind(onnx.load(artifact.path / file, load_external_data=False), places, piece, again=True)

@@ -6,11 +6,9 @@ files are the artifact's own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -18,12 +16,11 @@ import numpy.typing as npt
 
 from ..core.correction import condition_flops, groups_of
 from ..core.lattice import PlanArray
-from ..core.plan import ORIGINAL, Plan, TokenReuse, Variant
+from ..core.plan import ORIGINAL, Plan, Variant
 from ..core.start import Start, rest_of
 from ..core.update import update_flops
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.flops import graph_flops
-from ..ir.graph import Graph
 from ..ir.pieces import ADVANCE, PRUNER, STEP, frame_pieces, of_loop, part_of
 from ..ir.program import Pieces
 from .load import Artifact
@@ -51,22 +48,6 @@ class View:
     plans: Mapping[str, Plan]
 
     @property
-    def path(self) -> Path:
-        """Of the artifact."""
-        return self.artifact.path
-
-    @property
-    def files(self) -> Path:
-        """See ``Artifact``."""
-        return self.artifact.files
-
-    @contextmanager
-    def reading(self, *names: str) -> Iterator[None]:
-        """See ``Artifact``."""
-        with self.artifact.reading(*names):
-            yield
-
-    @property
     def pruner(self) -> Arrays:
         """Constants of this loop's pruner."""
         return self.artifact.loop_pruners.get(self.variant.loop, self.artifact.pruner)
@@ -76,11 +57,6 @@ class View:
         """Into how many groups of action dimensions the models of this loop take the sampler's update."""
         whole = self.manifest.steps + (0 if self.start is None else self.start.skipped)
         return groups_of(whole, self.manifest.spec.sample)
-
-    @property
-    def tokens(self) -> TokenReuse | None:
-        """When a token of an image encoder is computed anew."""
-        return self.variant.tokens
 
     @property
     def precision(self) -> Mapping[str, str]:
@@ -128,10 +104,6 @@ class View:
         file = self.manifest.pieces[piece].file
         return file if own is None else own.models.get(piece, file)
 
-    def graph(self, name: str) -> Graph:
-        """See ``Artifact``."""
-        return self.artifact.graph(name)
-
     @cached_property
     def pieces(self) -> Pieces:
         """The pieces as the reference runtime executes them; see ``Artifact``."""
@@ -141,7 +113,7 @@ class View:
     @property
     def frames_key(self) -> object:
         """Equal for views whose frame pieces remember the same of the same frames."""
-        return self.tokens, tuple(self.onnx_file(piece) for piece in frame_pieces(self.manifest.pieces))
+        return self.variant.tokens, tuple(self.onnx_file(piece) for piece in frame_pieces(self.manifest.pieces))
 
 
 def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:

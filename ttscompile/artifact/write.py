@@ -21,7 +21,6 @@ from ..ir.program import Binding, Program
 from ..measure.versions import VERSION
 from . import records, tensors
 from .bind import LoweredPieces, Place, bind, places_of, store_pieces
-from .block_weights import BlockWeights, store_weights, without_weights
 from .codec import decode, encode, identities
 from .files import (
     PARTIAL,
@@ -38,7 +37,15 @@ from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import Artifact, load_artifact, plan_of, read_manifest, require_artifact_path, table_prefix
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
-from .stores import plan_arrays_of, pruner_name, store_arrays, store_pruner
+from .stores import (
+    BlockWeights,
+    plan_arrays_of,
+    pruner_name,
+    store_arrays,
+    store_pruner,
+    store_weights,
+    without_weights,
+)
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -243,7 +250,8 @@ def _fill(
     places = places_of(folder / WEIGHTS, stored)
     pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()
     own = {PRUNER: pruner} if PRUNER in graphs else {}
-    for piece, constants in {**own, **_loop_pruners(program)}.items():
+    further = {of_loop(PRUNER, loop): program.loop_weights[loop] for loop in program.pieces.loop_pruners}
+    for piece, constants in {**own, **further}.items():
         content = tensors.serialize(constants)
         name = pruner_name(piece, content)
         pruner_files[piece], files[piece] = f"{name}.safetensors", f"{name}.onnx"
@@ -352,11 +360,6 @@ def locked(directory: Path) -> Iterator[None]:
         except OSError as error:  # no permission; a file system without locks
             raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error
         yield
-
-
-def _loop_pruners(program: Program) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
-    """Constants of the pruners of further loops, by piece."""
-    return {of_loop(PRUNER, loop): program.loop_weights[loop] for loop in program.pieces.loop_pruners}
 
 
 def _file_name(piece: str, program: Program) -> str:

@@ -120,33 +120,21 @@ class Calls:
         return self.path[:, -1]
 
 
-def sample_calls(
-    episodes: Sequence[Episode], numbers: Sequence[int], limit: int, seed: int, repeats: int = 1
-) -> list[tuple[int, int]]:
-    """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
-
-    Args:
-        repeats: how often a call may be drawn (it will have another noise each time), after all the others were.
-    """
-    draw = np.random.default_rng((seed, 1, *numbers))
-    places = [(n, row) for n in numbers for row in range(episodes[n].calls)]
-    order = np.concatenate([draw.permutation(len(places)) for _ in range(repeats)])
-    return [places[i] for i in order[:limit]]
-
-
 def window_of(episodes: Sequence[Episode], split: Split) -> int:
     """How many consecutive calls are a window: ``WINDOW``, or the most that an episode of either part has."""
     longest = (max(episodes[n].calls for n in part) for part in (split.calibration, split.validation))
     return min(WINDOW, *longest)
 
 
-def sample_windows(
-    episodes: Sequence[Episode], numbers: Sequence[int], limit: int, window: int, seed: int, repeats: int = 1
+def sample_calls(
+    episodes: Sequence[Episode], numbers: Sequence[int], limit: int, seed: int, repeats: int = 1, window: int = 1
 ) -> list[tuple[int, int]]:
-    """The same as ``sample_calls``, by windows: the calls of a window one after the other, at most ``limit`` in all.
+    """At most ``limit`` calls, drawn at random from some episodes: number of the episode, and row in it.
 
-    The windows of an episode do not overlap, and cover it from its first call on; calls that are left over at its end
-    are not drawn.
+    Args:
+        repeats: how often a call may be drawn (it will have another noise each time), after all the others were.
+        window: consecutive calls that are drawn together, and stand one after the other. The windows of an episode do
+            not overlap, and cover it from its first call on; calls that are left over at its end are not drawn.
     """
     draw = np.random.default_rng((seed, 1, *numbers))
     places = [(n, row) for n in numbers for row in range(0, episodes[n].calls - window + 1, window)]
@@ -166,20 +154,14 @@ def prepare_calls(
     chosen: Sequence[tuple[int, int]],
     seed: tuple[int, ...],
     window: int = 1,
-    pinned: bool = False,
 ) -> Calls:
     """Calls without targets: draw their noise and run the prologue.
 
     Args:
         spec: of the policy, with the loop of the model.
         chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
-        pinned: whether all calls of a window have the noise of its first; else each has noise of its own.
     """
-    initial, noise = draw_noise(spec, len(chosen), seed)
-    if pinned:
-        first = torch.arange(len(chosen)) // window * window
-        initial, noise = initial[first], None if noise is None else noise[:, first]
-    return calls_at(model, spec, episodes, chosen, (initial, noise), window)
+    return calls_at(model, spec, episodes, chosen, draw_noise(spec, len(chosen), seed), window)
 
 
 def calls_at(

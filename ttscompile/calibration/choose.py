@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-from ..core.plan import DENSE, FULL, Plan
+from ..core.plan import DENSE, FULL
 from ..errors import CalibrationFailedError
 from ..measure.points import Point, efficient
 from ..measure.timer import Times
@@ -22,64 +22,20 @@ ALIKE = 1.1
 Where little is left to compute, a further step costs less than timing is off, and makes a plan much nearer."""
 
 
-@dataclass(frozen=True)
-class Tried:
-    """A plan of the frontier, or one that is off it.
-
-    Attributes:
-        name: in the artifact, or what it was called while it was tried.
-        told: what it does, in words.
-        distance: from the original on held-out episodes; see ``judge``.
-        interval: 95 % interval of that.
-        milliseconds: median of a call on this machine.
-        worst: longest of the calls that were timed, in milliseconds.
-        near: whether it is near enough to be offered (``proposer.near``).
-        on_frontier: whether no other plan is faster and nearer.
-        kept: whether the artifact has it.
-    """
-
-    name: str
-    told: str
-    distance: float
-    interval: tuple[float, float]
-    milliseconds: float
-    worst: float
-    near: bool
-    on_frontier: bool
-    kept: bool
-
-    def record(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self) | {"interval": list(self.interval)}
-
-
-@dataclass(frozen=True)
-class Frontier:
-    """What was tried, and what was chosen.
-
-    Attributes:
-        tried: fastest first; the original is among them.
-        plans: that the artifact gets, by name.
-        scores: of these, by name.
-        default: name of the one that was chosen.
-        remark: that it is further from the original than a default should be; None where it is not.
-    """
-
-    tried: tuple[Tried, ...]
-    plans: Mapping[str, Plan]
-    scores: Mapping[str, Score]
-    default: str
-    remark: str | None
-
-
-def choose(kept: Kept, request: Request) -> Frontier:
-    """Judge and time every plan, in each precision that it can have, and choose.
+def choose(kept: Kept, request: Request) -> list[dict[str, Any]]:
+    """Judge and time every plan, in each precision that it can have, and keep what is chosen, and nothing else.
 
     Without a deadline the fastest plan that is near enough is the default, or the nearest of those that are as fast
     (``ALIKE``). With one it is the nearest of those whose longest call keeps it. Where none is within ``Request.bound``
-    it is the nearest within ``Request.farthest``, with a remark. ``schedule`` is the name of the default, ``safe`` that
-    of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that is not
-    too far.
+    it is the nearest within ``Request.farthest``, with a warning. ``schedule`` is the name of the default, ``safe``
+    that of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that
+    is not too far.
+
+    Returns:
+        What was tried, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
+        called while it was tried; ``told`` what it does, in words; ``milliseconds`` and ``worst`` the median and the
+        longest of its calls on this machine; ``near`` whether it is near enough to be offered (``proposer.near``);
+        ``on_frontier`` whether no other is faster and nearer; ``kept`` whether the artifact has it.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -115,22 +71,25 @@ def choose(kept: Kept, request: Request) -> Frontier:
         named[max(within, key=lambda name: times[name].median)] = FAST
     plans = {named[name]: entered[name] for name in named}
     plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
-    tried = tuple(
-        Tried(
-            name=named.get(name, name),
-            told=entered[name].in_words(),
-            distance=scores[name].distance,
-            interval=scores[name].interval,
-            milliseconds=times[name].median,
-            worst=max(times[name].ms),
-            near=name == DENSE or name in allowed,
-            on_frontier=name in best,
-            kept=name == DENSE or name in named,
-        )
+    tried = [
+        {
+            "name": named.get(name, name),
+            "told": entered[name].in_words(),
+            "distance": scores[name].distance,
+            "interval": list(scores[name].interval),
+            "milliseconds": times[name].median,
+            "worst": max(times[name].ms),
+            "near": name == DENSE or name in allowed,
+            "on_frontier": name in best,
+            "kept": name == DENSE or name in named,
+        }
         for name in sorted(entered, key=lambda one: times[one].median)
-    )
-    remark = None if chosen in close else _remark(scores[chosen], request)
-    return Frontier(tried, plans, {named[name]: scores[name] for name in named}, SCHEDULE, remark)
+    ]
+    if chosen not in close:
+        kept.trials.bar.warn(_remark(scores[chosen], request))
+    kept.plans, kept.default = {DENSE: kept.plans[DENSE], **plans}, SCHEDULE
+    kept.scores = {named[name]: scores[name] for name in named}
+    return tried
 
 
 def _remark(score: Score, request: Request) -> str:

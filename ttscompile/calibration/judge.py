@@ -20,7 +20,9 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+import torch
 
+from ..artifact.view import view_of
 from ..core.lattice import Source, plan_flops, sparsity
 from ..core.plan import Plan
 from ..core.spec import FloatArray
@@ -59,7 +61,6 @@ class Score:
         flops_saved: share of the FLOPs of a dense call of the original that are saved; all that is computed is counted.
         plans: how many different matrices of cells the calls had.
         tokens: share of the tokens of new frames that were computed; 1 where no tokens are reused.
-        milliseconds: median of a call of one stream on this machine, with onnxruntime; None where it was not timed.
         gaps: mean h of each episode, and the mean over all episodes of |y_i - y_j|, that the others are of: what
             ``further`` compares.
     """
@@ -73,23 +74,19 @@ class Score:
     flops_saved: float
     plans: int
     tokens: float = 1.0
-    milliseconds: float | None = None
     gaps: tuple[tuple[float, ...], float] = ((), 0.0)
 
     def record(self) -> dict[str, Any]:
         """As JSON, for the record of a calibration; the same on every machine."""
         known = {name: one for name, one in asdict(self).items() if one is not None}
-        return {name: one for name, one in known.items() if name not in ("gaps", "milliseconds")}
+        return {name: one for name, one in known.items() if name != "gaps"}
 
 
-def judge(trials: Trials, plan: Plan, part: str = HELD_OUT, threads: int | None = None) -> Score:
+def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
     """Score a plan.
 
     A plan that begins with the chunk of the call before is judged along each stretch of an episode, and once more with
     the chunk of another episode, as if the world had changed between two calls; the worse of the two counts.
-
-    Args:
-        threads: with which its calls are timed; None leaves that out.
 
     Raises:
         IllegalPlanError: the plan names what the artifact lacks.
@@ -98,8 +95,7 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT, threads: int | None 
     plan, sample = replace(plan, repair=True), trials.sample(part)
     answered = _Answers(trials, plan, sample)
     scores = [_scored(trials, plan, sample, made, answered.reports) for made in answered.all()]
-    score = max(scores, key=lambda one: one.distance)
-    return score if threads is None else replace(score, milliseconds=timed([(trials, plan)], threads)[0].median)
+    return max(scores, key=lambda one: one.distance)
 
 
 def further(score: Score, other: Score) -> tuple[float, float]:
@@ -151,7 +147,7 @@ def _filed(trials: Trials, plan: Plan) -> Plan:
 
 def _loop_spec(trials: Trials, plan: Plan) -> Any:
     """The specification with the whole loop that the noise of a plan's calls is for."""
-    return trials.view(plan.otherwise or plan).manifest.spec
+    return view_of(trials.artifact, plan.otherwise or plan).manifest.spec
 
 
 def other_noise(trials: Trials) -> float:
@@ -189,7 +185,7 @@ class _Answers:
             name, device = "reference", None
         elif trials.device is not None and self._plan is self._plan.exact:
             name, device = "torch", str(trials.device)
-        threads = 1 if name == "reference" else trials.threads
+        threads = 1 if name == "reference" else torch.get_num_threads()
         self._runtime: Runtime = open_runtime(trials.artifact, name, threads, device, self._plan)
         # The scale of int8 activations is that of the whole batch, and a robot has one stream.
         self._streams = 1 if self._plan.precision else STREAMS
@@ -204,24 +200,34 @@ class _Answers:
                 )
                 raise CalibrationError(f"{told}; one that was recorded has one call. Record longer ones.")
             yield self._in_order()
-            yield self._after_another()
-        elif _goes_on(self._plan):
-            yield self._in_order()
+            yield self._apart(after_another=True)
         else:
-            yield self._apart()
+            yield self._in_order() if _goes_on(self._plan) else self._apart()
 
     def _empty(self) -> FloatArray:
         return np.empty((len(self._sample.calls), self._sample.draws, *self._spec.sample), np.float32)
 
-    def _apart(self) -> FloatArray:
-        """Every call the first of an episode."""
-        sample, made = self._sample, self._empty()
-        asked = [(n, draw) for n in range(len(sample.calls)) for draw in range(sample.draws)]
+    def _apart(self, after_another: bool = False) -> FloatArray:
+        """Every call the first of an episode, or after one of another, drawn at random: as if the world had changed."""
+        sample, made, draw = self._sample, self._empty(), np.random.default_rng((self._trials.seed, 6))
+        asked = [(n, r) for n in range(len(sample.calls)) for r in range(sample.draws)]
         for some in _batches(asked, self._streams):
             self._runtime.reset()
-            found = self._call([(*sample.calls[n].tolist(), draw) for n, draw in some], scored=range(len(some)))
+            if after_another:
+                self._call_elsewhere(some, draw)
+            found = self._call([(*sample.calls[n].tolist(), r) for n, r in some], scored=range(len(some)))
             made[tuple(np.array(some).T)] = found
         return made
+
+    def _call_elsewhere(self, some: Sequence[tuple[int, int]], draw: np.random.Generator) -> None:
+        """A call of another episode before each of these calls, by number and draw of noise."""
+        sample, trials, others = self._sample, self._trials, list[tuple[int, int]]()
+        for n, _ in some:
+            known = [i for i in range(len(trials.episodes)) if i != int(sample.episodes[n])]
+            other = int(draw.choice(known))
+            others.append((other, min(int(sample.calls[n, 1]) - 1, trials.episodes[other].calls - 1)))
+        keys = [(2, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
+        self._runtime.predict(trials.observation(others), trials.noise(self._spec, keys), self._plan)
 
     def _in_order(self) -> FloatArray:
         """All calls of each stretch, one after the other; those of several stretches together."""
@@ -240,24 +246,6 @@ class _Answers:
                 found = self._call(calls, wanted)
                 for i in wanted:
                     made[numbers[some[i][0], rows[i]], some[i][1]] = found[i]
-        return made
-
-    def _after_another(self) -> FloatArray:
-        """Every call after one of another episode, drawn at random: as if the world had changed between the two."""
-        sample, made, trials = self._sample, self._empty(), self._trials
-        draw = np.random.default_rng((trials.seed, 6))
-        asked = [(n, r) for n in range(len(sample.calls)) for r in range(sample.draws)]
-        for some in _batches(asked, self._streams):
-            self._runtime.reset()
-            others = []
-            for n, _ in some:
-                known = [i for i in range(len(trials.episodes)) if i != int(sample.episodes[n])]
-                other = int(draw.choice(known))
-                others.append((other, min(int(sample.calls[n, 1]) - 1, trials.episodes[other].calls - 1)))
-            keys = [(2, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
-            self._runtime.predict(trials.observation(others), trials.noise(self._spec, keys), self._plan)
-            found = self._call([(*sample.calls[n].tolist(), r) for n, r in some], scored=range(len(some)))
-            made[tuple(np.array(some).T)] = found
         return made
 
     def _call(self, calls: Sequence[tuple[int, int, int]], scored: Sequence[int]) -> FloatArray:

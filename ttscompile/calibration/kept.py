@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ..artifact.block_weights import BlockWeights
-from ..artifact.manifest import StartRecord
+from ..artifact.manifest import StartRecord, WeightsRecord
+from ..artifact.stores import BlockWeights
 from ..core.plan import DENSE, FULL, Plan
-from .held import holding
 from .judge import Score, further, judge
 from .proposer import Proposal
 from .trials import Trials
@@ -105,3 +104,23 @@ class Kept:
             if made.otherwise is not None:
                 made = replace(made, otherwise=new.get(id(made.otherwise), made.otherwise))
             self.plans[name] = made
+
+
+def holding(trials: Trials, proposal: Proposal) -> Trials:
+    """The same, of an artifact that holds in memory what a proposal brings."""
+    artifact, manifest, loop = trials.artifact, trials.artifact.manifest, proposal.plan.loop
+    added = {name: own.weights for name, own in proposal.weights.items()}
+    known = {**manifest.weights, **{name: WeightsRecord(name, {}, None, {}) for name in added}}
+    pruner, pruners = artifact.pruner, dict(artifact.loop_pruners)
+    if proposal.pruner is not None and loop in pruners:
+        pruners[loop] = proposal.pruner
+    elif proposal.pruner is not None:
+        pruner = proposal.pruner
+    held = replace(
+        artifact,
+        manifest=replace(manifest, starts={**manifest.starts, **proposal.starts}, weights=known),
+        block_weights={**artifact.block_weights, **added},
+        pruner=pruner,
+        loop_pruners=pruners,
+    )
+    return replace(trials, artifact=held, fresh=trials.fresh or bool(added) or proposal.pruner is not None)

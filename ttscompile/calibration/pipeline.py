@@ -14,7 +14,7 @@ from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import locked, update_plans
 from ..core.coercion import integer
-from ..core.plan import DENSE, ORIGINAL
+from ..core.plan import ORIGINAL
 from ..errors import CalibrationError, CalibrationFailedError
 from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
@@ -203,12 +203,7 @@ def calibrate(
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
                 bar.warn(f"plan {name!r} is left out: {reason}")
-            frontier = choose(kept, request) if chooses else None
-            if frontier is not None:
-                kept.plans = {DENSE: kept.plans[DENSE], **frontier.plans}
-                kept.scores, kept.default = dict(frontier.scores), frontier.default
-                if frontier.remark is not None:
-                    bar.warn(frontier.remark)
+            frontier = choose(kept, request) if chooses else []
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),
@@ -226,7 +221,7 @@ def calibrate(
             seconds=clock.elapsed(),
             budget=schedule.budget.record(),
             told=told,
-            frontier=() if frontier is None else tuple(one.record() for one in frontier.tried),
+            frontier=tuple(frontier),
         )
         if result.stopped == "time limit":
             bar.warn(

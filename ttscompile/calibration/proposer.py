@@ -6,7 +6,7 @@ Members as those of the algorithms of NNCF: whether it applies, what it does, an
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -17,9 +17,9 @@ from ..artifact.ceiling import BOUND, NEAR
 from ..errors import CalibrationError
 
 if TYPE_CHECKING:
-    from ..artifact.block_weights import BlockWeights
     from ..artifact.load import Artifact
     from ..artifact.manifest import StartRecord
+    from ..artifact.stores import BlockWeights
     from ..core.plan import Plan
     from .budget import Goal
     from .clock import Clock
@@ -162,8 +162,7 @@ class Row:
 
     def make(self, request: Request) -> Proposer:
         """The proposer. Raises ImportError: there is no such module, or it needs a package that is not installed."""
-        module, _, name = self.maker.partition(":")
-        made: Proposer = getattr(importlib.import_module(f"ttscompile.{module}"), name)(request)
+        made: Proposer = pkgutil.resolve_name(f"ttscompile.{self.maker}")(request)
         return made
 
 
@@ -186,7 +185,7 @@ PROPOSERS = (
         anew=True,
         takes=6.0,
     ),
-    Row("pruner", "gates for each observation", "calibration.pruner.proposer:Pruner", consecutive=True),
+    Row("pruner", "gates for each observation", "calibration.pruner.paper:Pruner", consecutive=True),
     Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
     Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
     Row("weights", "low-rank updates of later steps' weights", "calibration.proposers.weights:Weights", True, True),

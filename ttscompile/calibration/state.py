@@ -1,4 +1,4 @@
-"""What a calibration or comparison has done so far: a file each in the artifact's directory."""
+"""What a calibration has done so far: a file in the artifact's directory."""
 
 from __future__ import annotations
 
@@ -20,10 +20,8 @@ from ..errors import ArtifactError, CalibrationError
 
 Array = npt.NDArray[Any]
 
-CALIBRATION, COMPARISON = "calibration", "comparison"
-FILE = f"{CALIBRATION}-state.safetensors"
+FILE = "calibration-state.safetensors"
 """Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""
-_AGAIN = {CALIBRATION: "Calibrate", COMPARISON: "Compare"}
 
 MAX_TEXT_BYTES = 16 * 2**20
 
@@ -31,22 +29,20 @@ _SETTINGS, _PROGRESS, _CHECKSUM = "json/settings", "json/progress", "sha256"
 
 
 class StateFile:
-    """The state of one calibration or comparison.
+    """The state of one calibration.
 
     Args:
+        directory: of the artifact; None keeps nothing beyond the process.
         settings: everything that the outcome depends on; JSON. A state with other settings is not continued.
-        work: ``calibration`` or ``comparison``.
 
     Attributes:
         progress: how far the work is, as JSON.
     """
 
-    def __init__(
-        self, directory: Path, settings: Mapping[str, Any], work: str = CALIBRATION, needed: bool = True
-    ) -> None:
-        self.warning = "" if needed or directory.is_dir() else "its artifact is no directory"
-        self._needed = needed
-        self._path, self._work, self._again = directory / f"{work}-state.safetensors", work, _AGAIN[work]
+    WORK, AGAIN = "calibration", "Calibrate"
+
+    def __init__(self, directory: Path | None, settings: Mapping[str, Any]) -> None:
+        self._path = None if directory is None else directory / f"{self.WORK}-state.safetensors"
         self._settings = json.dumps(settings, sort_keys=True)
         self.arrays: dict[str, Array] = {}
         self.progress: dict[str, Any] = {}
@@ -60,7 +56,7 @@ class StateFile:
         Raises:
             CalibrationError: it is damaged, or belongs to a run with other settings.
         """
-        if self.warning or not self._path.exists():
+        if self._path is None or not self._path.exists():
             return False
         try:
             arrays = {name: np.array(array) for name, array in tensors.read(self._path).items()}
@@ -71,7 +67,7 @@ class StateFile:
             _check_progress(Value(progress, _PROGRESS))
         except (ArtifactError, ValueError) as error:
             raise CalibrationError(
-                f"{self._path}: cannot be read ({error}). {self._again} again without --resume: that begins anew."
+                f"{self._path}: cannot be read ({error}). {self.AGAIN} again without --resume: that begins anew."
             ) from error
         asked = json.loads(self._settings)
         if settings != asked:
@@ -79,7 +75,7 @@ class StateFile:
             differing = {key: (settings.get(key), asked.get(key)) for key in keys}
             told = "; ".join(f"{key} was {was}, now {now}" for key, (was, now) in differing.items())
             raise CalibrationError(
-                f"{self._path}: the {self._work} that was interrupted had other settings: {told}. Give the same ones to"
+                f"{self._path}: the {self.WORK} that was interrupted had other settings: {told}. Give the same ones to"
                 " resume it, or leave --resume out to begin anew."
             )
         self.arrays, self.progress = arrays, progress
@@ -87,7 +83,7 @@ class StateFile:
 
     def save(self) -> None:
         """Write everything, at once or not at all. Raises CalibrationError: the directory cannot be written."""
-        if self.warning:
+        if self._path is None:
             return
         texts = {_SETTINGS: self._settings, _PROGRESS: json.dumps(self.progress, sort_keys=True)}
         content = {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()}
@@ -96,14 +92,11 @@ class StateFile:
         try:
             replace_file(self._path, tensors.serialize(arrays))
         except OSError as error:
-            told = f"{self._path}: the state of the {self._work} cannot be written: {error}."
-            if self._needed:
-                raise CalibrationError(told) from error
-            self.warning = told
+            raise CalibrationError(f"{self._path}: the state of the {self.WORK} cannot be written: {error}.") from error
 
     def remove(self) -> None:
         """Forget everything. Raises CalibrationError: the directory cannot be written."""
-        if self.warning:
+        if self._path is None:
             return
         try:
             self._path.unlink(missing_ok=True)
@@ -124,7 +117,7 @@ class StateFile:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:
             raise CalibrationError(
-                f"{self._path}: does not fit this {self._work} ({str(error)[:200]}). {self._again} again without"
+                f"{self._path}: does not fit this {self.WORK} ({str(error)[:200]}). {self.AGAIN} again without"
                 " --resume: that begins anew."
             ) from error
 

@@ -10,7 +10,7 @@ plan, nor an artifact, nor the runtimes' sums of reused residuals could say or h
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -54,8 +54,7 @@ class Strategy:
             ImportError: there is no such module, or it needs a package that is not installed.
             AttributeError: the module has no such function.
         """
-        module, _, function = self.maker.partition(":")
-        found: Callable[[Task], Search] = getattr(importlib.import_module(f"ttscompile.{module}"), function)
+        found: Callable[[Task], Search] = pkgutil.resolve_name(f"ttscompile.{self.maker}")
         return found
 
     def require_reach(self, steps: int, blocks: int, budget: int) -> None:
@@ -83,7 +82,7 @@ STRATEGIES = (
     Strategy(
         "tts-switches",
         "the same, and single cells moved by the observation",
-        "rivals.switched:Switched",
+        "rivals.adaptation:Switched",
         fits_correction=True,
         uses_pruner=True,
     ),
@@ -125,13 +124,13 @@ STRATEGIES = (
     Strategy(
         "teacache",
         "TeaCache (arXiv 2411.19108)",
-        "rivals.teacache:teacache",
+        "rivals.online:teacache",
         least=lambda steps, blocks: blocks * min(2, steps),  # the first step and the last
     ),
     Strategy(
         "dbcache",
         "DBCache of cache-dit",
-        "rivals.dbcache:dbcache",
+        "rivals.online:dbcache",
         least=lambda steps, blocks: blocks + steps - 1,  # the first block of every step after step 0
     ),
 )

@@ -13,7 +13,7 @@ from ..core.plan import Plan
 from ..core.spec import PolicySpec
 from ..pool import Here, Pool, Work, artifact_elsewhere, place_of, workers
 from ..trajectories.episodes import Episode
-from .calls import Calls, Split, prepare_calls, sample_calls, sample_windows
+from .calls import Calls, Split, prepare_calls, sample_calls
 from .clock import Clock
 from .execute import Executor
 from .progress import Bar
@@ -117,8 +117,5 @@ def draw_calls(
 
     The seed is that of their choice and of their noise.
     """
-    if window == 1:
-        chosen = sample_calls(episodes, split.calibration, limit, seed, REPEATS)
-    else:
-        chosen = sample_windows(episodes, split.calibration, limit, window, seed, REPEATS)
+    chosen = sample_calls(episodes, split.calibration, limit, seed, REPEATS, window)
     return prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, 0), window)

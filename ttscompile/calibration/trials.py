@@ -16,14 +16,14 @@ import numpy as np
 import torch
 
 from ..artifact.load import Artifact
-from ..artifact.view import View, view_of
+from ..artifact.view import view_of
 from ..core.correction import COMPONENTS, numbers_of
 from ..core.envelope import Envelope
 from ..core.lattice import dense_plan
 from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..core.spec import FloatArray, Noise, PolicySpec
 from ..pool import Here, Pool
-from ..runtimes.random_calls import Observation, normalized
+from ..runtimes.random_calls import Observation, noise_of_any_horizon, normalized
 from ..runtimes.reference.model import noise_tensors
 from ..trajectories.episodes import Episode
 from .arguments import FEWEST_CALLS
@@ -205,11 +205,6 @@ class Trials:
         return sum(calls.count for calls in self._calls.values())
 
     @property
-    def threads(self) -> int:
-        """Of arithmetic."""
-        return torch.get_num_threads()
-
-    @property
     def learned(self) -> Sample:
         """Answered calls of the episodes that are learned from: for proposers to choose on."""
         return self.sample(LEARNED)
@@ -228,10 +223,6 @@ class Trials:
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls))
         return self._samples[part]
 
-    def view(self, plan: Plan) -> View:
-        """The artifact as a plan sees it."""
-        return view_of(self.artifact, plan)
-
     def observation(self, places: Sequence[tuple[int, int]]) -> Observation:
         """Normalised observations, by key ``[n, ...]``, of calls by number of the episode and row in it."""
         spec = self.artifact.manifest.spec
@@ -246,11 +237,9 @@ class Trials:
         Args:
             keys: of each call, what tells it from others: part, stretch, row and draw.
         """
-        drawn = [_draw(spec, (self.seed, 5, *key)) for key in keys]
-        initial = np.stack([one for one, _ in drawn])
-        if not spec.sampler.stochastic:
-            return Noise(initial)
-        return Noise(initial, np.stack([steps for _, steps in drawn if steps is not None], 1))
+        drawn = [noise_of_any_horizon(spec, np.random.default_rng((self.seed, 5, *key)), 1) for key in keys]
+        draws = [one.steps for one in drawn if one.steps is not None]
+        return Noise(np.concatenate([one.initial for one in drawn]), np.concatenate(draws, 1) if draws else None)
 
     def key(self, part: str, stretch: int, row: int, draw: int) -> tuple[int, ...]:
         """See ``noise``."""
@@ -305,15 +294,6 @@ class Trials:
 def base_of(artifact: Artifact) -> Plan:
     """What a calibration begins with: plan ``full``, or ``dense`` where there is none."""
     return artifact.plans.get(FULL, artifact.plans[DENSE])
-
-
-def _draw(spec: PolicySpec, seed: tuple[int, ...]) -> tuple[FloatArray, FloatArray | None]:
-    """Initial sample ``[T, D]``, and draws ``[K, T, D]`` where the sampler takes any, of one call."""
-    rng, shape, predicted = np.random.default_rng(seed), spec.whole_horizon.sample, spec.sample[0]
-    initial = rng.standard_normal(shape, dtype=np.float32)[:predicted]
-    if not spec.sampler.stochastic:
-        return initial, None
-    return initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)[:, :predicted]
 
 
 def _places(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 
@@ -10,14 +11,12 @@ import numpy as np
 from torch import Tensor
 
 from ..core.correction import Correction
-from ..core.lattice import BoolArray, PlanArray, whole_steps_plan
-from ..pool import Here, Pool, Work
+from ..core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
+from ..pool import Here, Pool, Work, workers
 from .calls import Actions, Calls, IntArray
 from .clock import Clock
 from .execute import Executor
-from .fit_correction import fit_correction
-from .schedule_runs import ScheduleRuns
-from .sparse_loop import SparseLoop, anchors_of
+from .sparse_loop import Place, SparseLoop, anchors_of, fit_correction
 from .targets import executor_elsewhere, where
 
 FITTED, COMPARED = 384, 128
@@ -117,7 +116,7 @@ class WholeSteps:
     def correction_of(self, plan: PlanArray | MakePlans) -> Correction | None:
         """The same for any plan ``[K, blocks]``, or for whatever makes plans ``[N, K, blocks]`` of N calls."""
         plans = _plans(plan, self._calls)
-        reads = self.reads(_full_steps(plans))
+        reads = self.reads(max(1, int(anchors_of(plans).sum())))  # of whole steps, those that are computed
         fitted = fit_correction(self._executor, _plans(plan, self._fitted), self._fitted, reads)
         tried = (
             self._executor.corrected(one).run(_plans(plan, self._compared), self._compared) for one in (fitted, None)
@@ -183,11 +182,6 @@ def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:
     return plan(calls) if callable(plan) else plan
 
 
-def _full_steps(plan: PlanArray) -> int:
-    """How many steps of a plan, or of plans, are anchors: those of a schedule of whole steps that are computed."""
-    return max(1, int(anchors_of(plan).sum()))
-
-
 def _sizes(count: int) -> tuple[int, int]:
     """Of so many calls, how many candidates are fitted on and measured on, at most."""
     return max(FITTED, count // FITTED_SHARE), max(COMPARED, count // COMPARED_SHARE)
@@ -203,3 +197,57 @@ def _set_apart(episodes: IntArray) -> BoolArray:
     if len(known) > 1:
         return np.isin(episodes, known[: max(1, len(known) // 4)])
     return np.arange(len(episodes)) < len(episodes) // 4 if len(episodes) > 1 else np.ones(1, np.bool_)
+
+
+BYTES = 2**29
+"""What kept places may hold of samples and residuals; those that were longest of no use go first."""
+
+
+class ScheduleRuns:
+    """The way of schedules through a sparse loop, each gone once.
+
+    Up to the first step in which they differ, two schedules make the same samples and get the same corrections, so the
+    places where they may part are kept. All placements of three steps among 16 take a third of the evaluations so.
+    """
+
+    def __init__(self, loop: SparseLoop, steps: int, blocks: int, bytes_: int = BYTES) -> None:
+        self._loop, self._steps, self._bytes = loop, steps, bytes_
+        self._computed: PlanArray = np.full((1, blocks), Source.COMPUTE, np.int8)
+        self._idle: PlanArray = np.full((1, blocks), Source.TIMESTEP, np.int8)
+        self._kept: dict[tuple[int, ...], list[Place]] = {}
+
+    def end(self, steps: Sequence[int]) -> Place:
+        """The place after the last step of the schedule that computes these, the first of which is 0."""
+        *before, last = steps
+        with workers() as pool:
+            for count in range(1, len(before) + 1):
+                self._go(tuple(before[:count]), steps[count], pool)
+            place = self._loop.after(self._parting(tuple(before), last), self._computed, pool)
+            while place.step < self._steps:
+                place = self._loop.after(place, self._idle, pool)
+        self._forget()
+        return place
+
+    def _parting(self, before: tuple[int, ...], step: int) -> Place:
+        """Where a schedule is before a step, after having computed some."""
+        return self._kept[before][step - before[-1] - 1] if before else self._loop.begin
+
+    def _go(self, steps: tuple[int, ...], to: int, pool: ThreadPoolExecutor) -> None:
+        """Compute the last of these steps, and no other one up to a later step; keep all places from there to that."""
+        places = self._kept.pop(steps, [])
+        self._kept[steps] = places  # the last of them is the one that was of use last
+        if not places:
+            places.append(self._loop.after(self._parting(steps[:-1], steps[-1]), self._computed, pool))
+        while places[-1].step < to:
+            places.append(self._loop.after(places[-1], self._idle, pool))
+
+    def _forget(self) -> None:
+        """Leave out what there is no room for."""
+        held = {
+            steps: sum({id(one): one.nbytes for place in places for one in place.held}.values())
+            for steps, places in self._kept.items()
+        }
+        for steps in list(held):
+            if sum(held.values()) <= self._bytes:
+                return
+            del held[steps], self._kept[steps]

@@ -8,7 +8,7 @@ import operator
 import re
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePath
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.export._trace
-from torch import nn
+from torch import Tensor, nn
 from torch.export.graph_signature import InputKind, OutputKind
 
 from ..core.spec import PolicySpec
@@ -26,7 +26,6 @@ from ..frontends.copies import sharing_copy
 from ..ir.evaluate import evaluator, without_stack_traces
 from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
 from .batch import BATCHES, REMEDY, unify_batch
-from .stacks import AS_CAT
 
 EXAMPLE_STREAMS = 3
 """Batch size of the example inputs; neither 0 nor 1, which torch.export would specialise on."""
@@ -347,3 +346,42 @@ def _innermost(trace: str) -> str:
         return "source unknown"
     path, line, function = (own or frames)[-1]
     return f"{PurePath(path).name}:{line} in {function}"
+
+
+Tensors = Sequence[Tensor]
+
+
+def _hstack(tensors: Tensors) -> Tensor:
+    """Along the first axis of vectors, along the second of all others."""
+    wide = [one.reshape(-1) if one.ndim == 0 else one for one in tensors]
+    return torch.cat(wide, 0 if wide[0].ndim == 1 else 1)
+
+
+def _vstack(tensors: Tensors) -> Tensor:
+    """Along the first axis, where a vector is a row."""
+    return torch.cat([one.reshape(1, -1) if one.ndim < 2 else one for one in tensors], 0)
+
+
+def _dstack(tensors: Tensors) -> Tensor:
+    """Along the third axis, where a vector is a row, and a matrix has one number there."""
+    rows = [one.reshape(1, -1) if one.ndim < 2 else one for one in tensors]
+    return torch.cat([one.unsqueeze(-1) if one.ndim == 2 else one for one in rows], 2)
+
+
+def _column_stack(tensors: Tensors) -> Tensor:
+    """Along the second axis, where a vector is a column."""
+    return torch.cat([one.reshape(-1, 1) if one.ndim < 2 else one for one in tensors], 1)
+
+
+AS_CAT: Mapping[Any, Callable[[Tensors], Tensor]] = {
+    torch.ops.aten.hstack.default: _hstack,
+    torch.ops.aten.vstack.default: _vstack,
+    torch.ops.aten.dstack.default: _dstack,
+    torch.ops.aten.column_stack.default: _column_stack,
+}
+"""Operations that put tensors beside each other, as the ``cat`` that they are: for ``run_decompositions``.
+
+``hstack`` and its kind first give each tensor the axes that it lacks. torch's ONNX exporter makes of that a function
+over a list of tensors, which no runtime here executes; passes see through ``cat``, and not through these.
+Source: the definitions in torch's documentation.
+"""

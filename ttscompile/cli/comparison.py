@@ -24,8 +24,6 @@ def compare(
     artifacts: Mapping[str, Artifact],
     others: Sequence[Path],
     trajectories: Sequence[Path],
-    strategies: Sequence[str] = (),
-    sparsities: Sequence[float] = (),
     **how: Any,
 ) -> Comparison:
     """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
@@ -41,7 +39,7 @@ def compare(
             f"-t needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
     with only_results_on_stdout(), counted_parts() as tell:
-        found = measure(directory, trajectories, strategies, sparsities, others, progress=tell, **how)
+        found = measure(directory, trajectories, others, progress=tell, **how)
     pairs = zip((directory, *others), artifacts.values(), strict=True)
     if changed := [path for path, one in pairs if manifest_of(path).identity != one.manifest.identity]:
         raise ArtifactChangedError(f"{changed[0]}: it was replaced meanwhile. Try again.")

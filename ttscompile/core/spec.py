@@ -85,7 +85,7 @@ class ObservationSpec:
         bounds: the range of the values that random observations are drawn from, low and high, each a number or one for
             each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
             embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
-        fit: of an image: one of another size is resized to this shape with its proportions (``core.images``). What is
+        fit: of an image: one of another size is resized to this shape with its proportions (``core.values``). What is
             left is black: ``start``, at the top and the left; ``centre``, on both sides. None: no other size is taken.
     """
 

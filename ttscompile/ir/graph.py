@@ -61,6 +61,10 @@ class TensorType:
         """The concrete shape for this number of streams."""
         return tuple(n.multiple * streams if isinstance(n, Batch) else n for n in self.shape)
 
+    def resized(self, size: Callable[[Batch], Size]) -> TensorType:
+        """With others in the place of the symbolic sizes."""
+        return replace(self, shape=tuple(size(n) if isinstance(n, Batch) else n for n in self.shape))
+
     def __str__(self) -> str:
         return f"{self.dtype}[{', '.join(map(str, self.shape))}]"
 
@@ -108,11 +112,17 @@ class Node:
 
     def renamed(self, rename: Callable[[str], str]) -> Node:
         """The same operation on other values; its own name is kept."""
-        return replace(
-            self,
-            args=tuple(_rename(a, rename) for a in self.args),
-            kwargs=tuple((k, _rename(a, rename)) for k, a in self.kwargs),
-        )
+        return self._mapped(lambda leaf: Ref(rename(leaf.name)) if isinstance(leaf, Ref) else leaf)
+
+    def resized(self, size: Callable[[Batch], Size]) -> Node:
+        """The same operation with others in the place of the symbolic sizes."""
+        node = self._mapped(lambda leaf: size(leaf) if isinstance(leaf, Batch) else leaf)
+        return replace(node, types=tuple(type_.resized(size) for type_ in self.types))
+
+    def _mapped(self, function: Callable[[Argument], Argument]) -> Node:
+        """With others in the place of ``leaves``."""
+        args = tuple(_map(a, function) for a in self.args)
+        return replace(self, args=args, kwargs=tuple((k, _map(a, function)) for k, a in self.kwargs))
 
     def __str__(self) -> str:
         args = [_show(a) for a in self.args] + [f"{k}={_show(a)}" for k, a in self.kwargs]
@@ -186,12 +196,10 @@ def _leaves(argument: Argument) -> Iterator[Argument]:
         yield argument
 
 
-def _rename(argument: Argument, rename: Callable[[str], str]) -> Argument:
-    if isinstance(argument, Ref):
-        return Ref(rename(argument.name))
+def _map(argument: Argument, function: Callable[[Argument], Argument]) -> Argument:
     if isinstance(argument, tuple):
-        return tuple(_rename(item, rename) for item in argument)
-    return argument
+        return tuple(_map(item, function) for item in argument)
+    return function(argument)
 
 
 def _show(argument: Argument) -> str:

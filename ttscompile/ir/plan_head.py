@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -33,3 +36,13 @@ def first_numbers(inputs: int, width: int, rank: int, steps: int, blocks: int) -
         "pruner.base": base,
         "pruner.mask": mask,
     }
+
+
+NAMES = frozenset(
+    f"pruner.{n}" for n in ("hidden.weight", "hidden.bias", "code.weight", "code.bias", "step", "block", "base")
+)
+
+
+def has_head(constants: Mapping[str, Any]) -> bool:
+    """Whether the pruner with these constants is the head that is known here."""
+    return set(constants) >= NAMES

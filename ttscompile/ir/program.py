@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -199,6 +199,11 @@ class Phase:
     def mapped(self, function: Callable[[Graph], Graph]) -> Self:
         """With another graph in place of every one, of the same names of inputs and outputs."""
         return replace(self, denoiser=function(self.denoiser))
+
+    @property
+    def carried(self) -> dict[str, Any]:
+        """Its fields, by name, for the phase that follows."""
+        return {each.name: getattr(self, each.name) for each in fields(Phase)}
 
     def flops_of(self, loop: str) -> int:
         """``dense_flops`` of a call in this loop."""

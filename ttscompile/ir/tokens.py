@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from .dataflow import reachable_from
 from .evaluate import evaluator
 from .flops import graph_flops, node_flops
 from .graph import GETITEM, Argument, Graph, Node, Ref, TensorType, backward_slice
@@ -46,7 +47,7 @@ class TokenStream:
 
 def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
     """The tokens of a tower; or why and where it is none that reads a picture patch by patch."""
-    types, observed = tower.types(), _reached(tower, tower.inputs)
+    types, observed = tower.types(), reachable_from(tower, tower.inputs)
     patches = [n for n in tower.nodes if n.name in observed and n.op.startswith("aten.conv")]
     if len(tower.inputs) != 1 or not patches:
         return "it cuts no picture into patches"
@@ -69,7 +70,7 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
     if len(placed) < LEAST_TOKENS:
         return f"%{entry} has {len(placed)} tokens, fewer than {LEAST_TOKENS}"
     stream = TokenStream(pixels, entry, len(placed), fixed, _axes(tower, entry, len(placed)))
-    total, behind = graph_flops(tower), _reached(tower, {entry})
+    total, behind = graph_flops(tower), reachable_from(tower, {entry})
     whole = [node for node in tower.nodes if node.name not in stream.axes]
     cutting = sum(node_flops(node, types) for node in whole if node.name not in behind)
     if cutting > MOST_WHOLE * total:
@@ -78,15 +79,6 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
         where = next(node for node in whole if stream.axes.keys() & set(node.refs()))
         return f"at %{where.name} ({where.op}) tokens come together otherwise than by attention"
     return stream
-
-
-def _reached(graph: Graph, names: Iterable[str]) -> set[str]:
-    """Values that depend on some of these, themselves among them."""
-    found = set(names)
-    for node in graph.nodes:
-        if not found.isdisjoint(node.refs()):
-            found.add(node.name)
-    return found
 
 
 def _not_patches(node: Node, types: Mapping[str, TensorType]) -> str | None:
@@ -103,7 +95,7 @@ def _not_patches(node: Node, types: Mapping[str, TensorType]) -> str | None:
 
 def _entry(tower: Graph, patches: str) -> str | None:
     """The one value through which all goes that moving and element-wise work makes of the patches."""
-    free, observed = {patches}, _reached(tower, {patches})
+    free, observed = {patches}, reachable_from(tower, {patches})
     for node in tower.nodes:
         read, row = observed & set(node.refs()), operation(node.op)
         joins = row.name in ("pad", "constant_pad_nd", "cat", "stack")
@@ -148,7 +140,7 @@ def _patches_of(tower: Graph, pixels: str, entry: str, weights: Weights) -> list
 
 def _axes(tower: Graph, entry: str, tokens: int) -> dict[str, int]:
     """In which axis each value has a row for each token; those that have not are left out."""
-    types, observed, axes = tower.types(), _reached(tower, {entry}), {entry: 1}
+    types, observed, axes = tower.types(), reachable_from(tower, {entry}), {entry: 1}
     for node in tower.nodes:
         read = [name for name in node.refs() if name in observed]
         if node.name == entry or not read or not axes.keys() >= set(read):

@@ -45,9 +45,10 @@ class GraphWriter:
             self._initializers.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
         return self._constants[key]
 
-    def default(self, name: str, value: Array) -> None:
-        """What an input of the model is if it is not given."""
+    def default(self, name: str, value: Array, shape: Sequence[int | str] | None = None) -> ValueInfoProto:
+        """An input of the model, and what it is if it is not given; of the value's shape if no other is said."""
         self._initializers.append(numpy_helper.from_array(value, name))
+        return tensor(name, value.dtype, value.shape if shape is None else shape)
 
     def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """A node of one output; its name."""

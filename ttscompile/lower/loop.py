@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from onnx import GraphProto, ModelProto
 
+from ..core.correction import INNER, MIDDLE, OUTER
 from ..ir.pieces import (
     ADVANCE,
     HISTORY,
@@ -47,25 +48,6 @@ GROUP = 6
 
 
 @dataclass(frozen=True)
-class Jumps:
-    """Names of values that jumps read (``core.correction``).
-
-    Attributes:
-        which: int64 [K]; the number of the jump that is added after a step, -1 for none.
-        inner: [J, N + 4 T D + 1, H]; with the condition itself.
-        middle: [J, H + 1, H].
-        outer: [J, H + 1, T D].
-        condition: [B, N]; None where a correction cannot read it.
-    """
-
-    which: str
-    inner: str
-    middle: str
-    outer: str
-    condition: str | None
-
-
-@dataclass(frozen=True)
 class LoopInputs:
     """Names of values that the loop reads; of all B streams, or of the S that follow one plan.
 
@@ -80,7 +62,10 @@ class LoopInputs:
         rows: rollout cache of all streams [R, A, C]; a row is the residual of one stream: A and C are the sizes before
             and after the axis of streams.
         index: int64 [K, N, B]; which row is the residual of a cell.
-        jumps: of the correction; None where it cannot have any.
+        jumps: int64 [K]; the number of the jump that is added after a step, -1 for none. None where the correction
+            cannot have any. Their layers are inputs of the model (``core.correction``): INNER [J, N + 4 T D + 1, H],
+            MIDDLE [J, H + 1, H], OUTER [J, H + 1, T D].
+        condition: what jumps read beside the history, [B, N]; None where a correction cannot read it.
     """
 
     initial: str
@@ -92,7 +77,8 @@ class LoopInputs:
     memory: str | None
     rows: str
     index: str
-    jumps: Jumps | None
+    jumps: str | None
+    condition: str | None
 
 
 @dataclass(frozen=True)
@@ -302,13 +288,14 @@ class DenoisingLoop:
         history = self._remembered(w, is_anchor, state.sample, prediction, state.history)
         return _State(sample, stream, history, tuple(memory))
 
-    def _jumped(self, w: GraphWriter, jumps: Jumps, offset: str, history: str, k: str) -> str:
+    def _jumped(self, w: GraphWriter, jumps: str, offset: str, history: str, k: str) -> str:
         """The offset of step k with the jump that ends there, if one does: ``Correction.jump`` in ONNX."""
         jumping, staying = w.inner(), w.inner()
-        j = w.op("Gather", jumps.which, k)
+        j = w.op("Gather", jumps, k)
         flat = jumping.op("Reshape", jumping.op("Transpose", history, perm=[1, 0, 2]), jumping.constant([0, -1]))
-        value = flat if jumps.condition is None else jumping.op("Concat", jumps.condition, flat, axis=1)
-        layers = [jumping.op("Gather", layer, j) for layer in (jumps.inner, jumps.middle, jumps.outer)]
+        condition = self._inputs.condition
+        value = flat if condition is None else jumping.op("Concat", condition, flat, axis=1)
+        layers = [jumping.op("Gather", layer, j) for layer in (INNER, MIDDLE, OUTER)]
         zero, last, end = (jumping.constant([n]) for n in (0, -1, 2**31 - 1))
 
         def affine(value: str, layer: str) -> str:

@@ -48,16 +48,18 @@ The outputs are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
-from onnx import ModelProto, helper
+from onnx import ModelProto, ValueInfoProto, helper
 
 from ..core.correction import (
     ANCHORS,
     CORRECTION,
     CORRECTION_BIAS,
     FEATURES,
+    HIDDEN,
     HISTORY,
     INNER,
     JUMPS,
@@ -66,21 +68,23 @@ from ..core.correction import (
     OUTER,
     READING,
     may_jump,
+    no_correction,
+    numbers_of,
 )
-from ..core.envelope import CENTER, ENVELOPE, FAR
+from ..core.envelope import CENTER, ENVELOPE, FAR, PLAIN
 from ..core.lattice import Source
 from ..core.spec import ORIGINAL, PolicySpec
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
+from ..ir.graph import Graph
 from ..ir.pieces import ADVANCE, PRUNER, USE_PRUNER, of_loop
 from ..ir.program import Program
-from .call_interface import condition_numbers, write_interface
 from .contexts import Contexts
-from .executed_plan import ExecutedPlans, write_executed_plans
-from .graph_writer import GraphWriter, Weights
-from .loop import Jumps, LoopInputs
+from .graph_writer import GraphWriter, Weights, tensor
+from .loop import LoopInputs
 from .onnx_model import opsets, own_model
-from .streams import Denoised, residual_sizes, write_streams
+from .plan import ExecutedPlans, write_executed_plans
+from .streams import residual_sizes, write_streams
 
 LARGEST = 2**31 - 1
 """Bytes of a file that protobuf reads."""
@@ -118,7 +122,6 @@ def lower_single_file(
     plans = write_executed_plans(main, "plan", "rollout_index", streams, lattice, pruner, far)
     update, plain = _update(main, spec)
     offset = _offset(main, spec, streams, condition, far)
-    jumps = Jumps(JUMPS, INNER, MIDDLE, OUTER, condition) if may_jump(spec.sample) else None
     history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
     count = main.op("Shape", "rollout_rows", start=0, end=1)
@@ -134,17 +137,17 @@ def lower_single_file(
         memory=memory,
         rows=rows,
         index=main.op("Transpose", "rollout_index", perm=[1, 2, 0]),
-        jumps=jumps,
+        jumps=JUMPS if may_jump(spec.sample) else None,
+        condition=condition,
     )
-    denoised = write_streams(main, program, models, weights, contexts, plans, values, "rollout_keep")
-    sample = denoised.sample
+    sample, *kept = write_streams(main, program, models, weights, contexts, plans, values, "rollout_keep")
     bound = spec.sampler.bound
     if bound is not None:  # without a correction no number is beyond it
         sample = main.op("Clip", sample, *(main.constant(end, np.float32) for end in (-bound, bound)))
     _write_actions(main, main.op("Add", sample, plans.broken), spec)
     main.rename(plans.executed, "executed_plan")
     main.rename(plans.legalised, "legalised")
-    _write_cache(main, plans, denoised, rows)
+    _write_cache(main, plans, rows, *kept)
     model = own_model(main.graph("ttscompile", outputs, inputs), opsets(models.values()))
     if (size := model.ByteSize()) > LARGEST:
         what = f"the single file would have {size / 1e9:.1f} GB; an ONNX file holds at most 2"
@@ -230,22 +233,105 @@ def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
     main.rename(main.op("Slice", predicted, *(main.constant([n]) for n in (chunk.start, chunk.stop, 1))), "action")
 
 
-def _write_cache(main: GraphWriter, plans: ExecutedPlans, denoised: Denoised, stored: str) -> None:
-    """The next call's rollout cache: rows that were ``stored`` and not computed anew, then those ``denoised``."""
+def _write_cache(main: GraphWriter, plans: ExecutedPlans, stored: str, new_rows: str, new_cells: str) -> None:
+    """The next call's rollout cache: rows that were ``stored`` and not computed anew, then the new ones."""
     anew = main.op("Equal", plans.executed, main.constant(Source.COMPUTE.value, np.int8))
     known = main.op("And", main.op("GreaterOrEqual", "rollout_index", main.constant(0)), main.op("Not", anew))
     old = main.op("And", known, "rollout_keep")
     flat = main.constant([-1])
     old_cells = main.op("Reshape", main.op("NonZero", main.op("Reshape", old, flat)), flat)
     old_rows = main.op("Gather", stored, main.op("Gather", main.op("Reshape", "rollout_index", flat), old_cells))
-    rows = main.op("Concat", old_rows, denoised.rows, axis=0)
+    rows = main.op("Concat", old_rows, new_rows, axis=0)
     row = main.op("Shape", "rollout_rows", start=1)
     shape = main.op("Concat", main.op("Shape", rows, start=0, end=1), row, axis=0)
     main.rename(main.op("Reshape", rows, shape, allowzero=1), "rollout_rows_next")
-    cells = main.op("Concat", old_cells, denoised.cells, axis=0)
+    cells = main.op("Concat", old_cells, new_cells, axis=0)
     numbers = main.op("Range", main.constant(0), main.op("Size", cells), main.constant(1))
     shape = main.op("Shape", "rollout_index")
     size = main.op("ReduceProd", shape, keepdims=1)
     nothing = main.op("Expand", main.constant([-1]), size)
     merged = main.op("ScatterElements", nothing, cells, numbers, axis=0)
     main.rename(main.op("Reshape", merged, shape), "rollout_index_next")
+
+
+Values = list[ValueInfoProto]
+
+
+def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tuple[Values, Values]:
+    """All inputs, those that may be left out with what they are then; and all outputs."""
+    spec, pieces = program.spec, program.pieces
+    observations = [tensor(key, each.dtype, ["B", *each.shape]) for key, each in spec.observations.items()]
+    inputs, outputs = _of_every_policy(program)
+    if pieces.pruner is not None:
+        inputs += _of_pruner(main, pieces.pruner, weights)
+    given = no_correction(spec.sampler.steps, spec.sample)
+    own = {ANCHORS: given.anchors, CORRECTION: given.weights, CORRECTION_BIAS: given.bias}
+    own[PLAIN] = np.zeros((spec.sampler.steps, len(program.blocks)), np.int8)
+    inputs += [main.default(name, array) for name, array in own.items()]
+    if numbers := condition_numbers(program):
+        inputs += _of_condition(main, spec, numbers)
+    if may_jump(spec.sample):
+        inputs += _of_jumps(main, spec, numbers)
+    if clash := sorted(set(spec.observations) & {value.name for value in (*inputs, *outputs)}):
+        what = f"the observations {clash} have names of the single file's own inputs or outputs"
+        raise LoweringError(f"{what}. Rename them, or convert without the single file.")
+    return [*observations, *inputs], outputs
+
+
+def condition_numbers(program: Program) -> int:
+    """N: how many numbers of one stream's condition a correction may read; 0 where there are too many."""
+    types = program.pieces.condition.types()
+    return numbers_of(types[name].at(1) for name in program.pieces.features)
+
+
+def _of_every_policy(program: Program) -> tuple[Values, Values]:
+    """What every policy has, beside its observations."""
+    spec, count = program.spec, len(program.blocks)
+    (horizon, channels), chunk, steps = spec.sample, spec.chunk, spec.sampler.steps
+    row = program.blocks[0].type.at(1)
+    inputs = [tensor("initial_noise", np.float32, ["B", horizon, channels])]
+    if spec.sampler.stochastic:
+        inputs.append(tensor("step_noise", np.float32, [steps, "B", horizon, channels]))
+    inputs += [
+        tensor("plan", np.int8, ["P", steps, count]),
+        tensor("rollout_rows", np.float32, ["R", *row]),
+        tensor("rollout_index", np.int64, ["B", steps, count]),
+        tensor("rollout_keep", np.bool_, [steps, count]),
+    ]
+    outputs = [
+        tensor("action", np.float32, ["B", chunk.stop - chunk.start, chunk.action_dim]),
+        tensor("action_pred", np.float32, ["B", horizon, chunk.action_dim]),
+        tensor("executed_plan", np.int8, ["B", steps, count]),
+        tensor("legalised", np.int64, ["B"]),
+        tensor("outside", np.float32, ["B"]),
+        tensor("rollout_rows_next", np.float32, ["R_next", *row]),
+        tensor("rollout_index_next", np.int64, ["B", steps, count]),
+    ]
+    return inputs, outputs
+
+
+def _of_pruner(main: GraphWriter, head: Graph, weights: Weights) -> Values:
+    """Whether the pruner makes the plan, and its weights: by default it does not, and they are those of the program."""
+    constants = {name: np.asarray(weights[name], type_.dtype) for name, type_ in head.constants.items()}
+    return [main.default(name, value) for name, value in {USE_PRUNER: np.array(False), **constants}.items()]
+
+
+def _of_condition(main: GraphWriter, spec: PolicySpec, numbers: int) -> Values:
+    """Those of a correction that reads N numbers of the condition; they read one that adds nothing by default."""
+    (horizon, dimensions), steps = spec.sample, spec.sampler.steps
+    return [
+        main.default(ENVELOPE, np.zeros((numbers, 1), np.float32), [numbers, "E"]),
+        main.default(CENTER, np.zeros(1, np.float32), ["E"]),
+        main.default(READING, np.zeros((numbers, 1), np.float32), [numbers, "F"]),
+        main.default(
+            OBSERVED, np.zeros((1, steps, dimensions, horizon), np.float32), ["F", steps, dimensions, horizon]
+        ),
+    ]
+
+
+def _of_jumps(main: GraphWriter, spec: PolicySpec, numbers: int) -> Values:
+    """Those of jumps that read N numbers of the condition; by default there are none."""
+    steps, chunk = spec.sampler.steps, math.prod(spec.sample)
+    layers = {INNER: (numbers + HISTORY * chunk + 1, HIDDEN), MIDDLE: (HIDDEN + 1, HIDDEN), OUTER: (HIDDEN + 1, chunk)}
+    inputs = [main.default(JUMPS, np.full(steps, -1, np.int64))]
+    return inputs + [main.default(n, np.zeros((1, *shape), np.float32), ["J", *shape]) for n, shape in layers.items()]

@@ -12,32 +12,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from onnx import GraphProto, ModelProto, TensorProto
 
 from ..ir.program import Program
 from .contexts import Contexts, StreamContexts
-from .executed_plan import ExecutedPlans
 from .graph_writer import GraphWriter, Weights, sequence, tensor
 from .loop import GROUP, DenoisingLoop, LoopInputs
-from .plan import INT64, lower_plan
-
-
-@dataclass(frozen=True)
-class Denoised:
-    """Names of values after the loop.
-
-    Attributes:
-        sample: [B, T, D].
-        rows: residuals that were computed and are to be kept, [new rows, A, C] as ``LoopInputs.rows``.
-        cells: int64 [new rows]; what each of them is of, as ``stream * K * N + k * N + b``.
-    """
-
-    sample: str
-    rows: str
-    cells: str
+from .plan import INT64, ExecutedPlans, lower_plan
 
 
 def write_streams(
@@ -49,18 +33,24 @@ def write_streams(
     plans: ExecutedPlans,
     inputs: LoopInputs,
     keep: str,
-) -> Denoised:
+) -> tuple[str, str, str]:
     """Write the loop over plans, with all that is in it.
 
-    ``keep`` is bool [K, N]: computed residuals that later calls may read.
+    Args:
+        keep: bool [K, N]: computed residuals that later calls may read.
+
+    Returns:
+        Names of values after the loop: the sample [B, T, D]; residuals that were computed and are to be kept, [new
+        rows, A, C] as ``LoopInputs.rows``; and int64 [new rows], what each of them is of, as
+        ``stream * K * N + k * N + b``.
     """
     count = main.op("Shape", plans.different, start=0, end=1)
     carried = [inputs.initial, main.op("SequenceEmpty"), main.op("SequenceEmpty", dtype=INT64)]
     body = _of_one_plan(main.inner(), program, models, weights, contexts, plans, inputs, keep)
     count = main.op("Reshape", count, main.constant(np.zeros(0)))
     sample, rows, cells = main.ops("Loop", [count, "", *carried], len(carried), body=body)
-    joined = (main.op("ConcatFromSequence", each, axis=0) for each in (rows, cells))
-    return Denoised(sample, *joined)
+    new_rows, new_cells = (main.op("ConcatFromSequence", each, axis=0) for each in (rows, cells))
+    return sample, new_rows, new_cells
 
 
 def _of_one_plan(
@@ -114,7 +104,7 @@ def _uncorrected(w: GraphWriter, inputs: LoopInputs, far: str) -> LoopInputs:
     """Without the matrices and jumps of a correction where streams are far outside; offsets are without already."""
     jumps = inputs.jumps
     if jumps is not None:
-        jumps = replace(jumps, which=w.op("Where", far, w.constant(-1), jumps.which))
+        jumps = w.op("Where", far, w.constant(-1), jumps)
     return replace(inputs, update=w.op("Where", far, inputs.plain, inputs.update), jumps=jumps)
 
 
@@ -124,9 +114,9 @@ def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:
     def of(value: str, axis: int) -> str:
         return w.op("Gather", value, members, axis=axis)
 
-    jumps, memory = inputs.jumps, inputs.memory
-    if jumps is not None and jumps.condition is not None:
-        jumps = replace(jumps, condition=of(jumps.condition, 0))
+    memory, condition = inputs.memory, inputs.condition if inputs.jumps is not None else None
+    if condition is not None:
+        condition = of(condition, 0)
     return replace(
         inputs,
         initial=of(inputs.initial, 0),
@@ -134,7 +124,7 @@ def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:
         history=of(inputs.history, 1),
         memory=None if memory is None else of(memory, 1),
         index=of(inputs.index, 2),
-        jumps=jumps,
+        condition=condition,
     )
 
 

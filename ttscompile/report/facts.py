@@ -21,7 +21,6 @@ from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
 _NOT_TOLD = ("plans", "precision", "sparsity", "flops_sparsity", "skipped", "other_noise", "told", "frontier")
-_ERRORS = ("error", "error_p90")
 
 
 def provenance(artifact: Artifact) -> Section:

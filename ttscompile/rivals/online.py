@@ -9,7 +9,7 @@ The feature is what the first ``always`` blocks add together, or the stream afte
 reused is the block's own last residual, so a decided plan is an ordinary plan of COMPUTE and TIMESTEP: it can be
 reported, counted and replayed.
 
-Source of the criteria: ``teacache`` and ``dbcache``. The number of computed cells differs from call to call, so the
+The criteria are those of ``teacache`` and ``dbcache``. The number of computed cells differs from call to call, so the
 budget is kept on average: the threshold is the lowest, found by bisection, with which the mean over some of the calls
 to learn from and two standard errors more are within it.
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import islice, repeat
+from itertools import islice, pairwise, repeat
 from typing import Any
 
 import numpy as np
@@ -33,8 +33,8 @@ from ..calibration.calls import Calls, FloatArray
 from ..calibration.execute import Executor, State, last
 from ..calibration.task import Array, Found, Task
 from ..core.lattice import BoolArray, PlanArray, Source
-from ..errors import ArtifactError, CalibrationFailedError, IllegalPlanError
-from .fixed import COMPARED, best_of
+from ..errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
+from .fixed import COMPARED, best_of, fixed
 
 HALVINGS, DOUBLINGS = 9, 20
 """How often the interval that the threshold is in is halved, and its upper end doubled before, at most."""
@@ -228,7 +228,7 @@ def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
             f"the time limit ended the search for a threshold of {proposed[0][0].name!r} before one kept the budget of"
             f" {task.budget} computed cells. The artifact is as it was. Allow more time, or lower the target."
         )
-    errors = [_error(task, decided, some) for _, decided in kept]
+    errors = [task.actions.errors(one.samples, some.targets, units=False).mean() for _, one in kept]
     best, decided = kept[int(np.argmin(errors))]
     near = max(best.threshold, 1e-6)
     best, decided = fit_threshold(task, best, more, near / 2, near, probes) or (best, decided)
@@ -238,12 +238,89 @@ def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
     return replace(chosen, notes=notes)
 
 
-def _error(task: Task, decided: Decided, calls: Calls) -> float:
-    """Mean error of the plans that were decided, normalised."""
-    return float(task.actions.errors(decided.samples, calls.targets, units=False).mean())
-
-
 def within(plans: PlanArray, budget: int) -> list[PlanArray]:
     """The different ones of ``plans [N, K, blocks]`` that are within the budget, in order."""
     computed = (plans == Source.COMPUTE).sum((1, 2))
     return list({plan.tobytes(): plan for plan in plans[computed <= budget]}.values())
+
+
+FIRST = (1, 2, 3)
+"""Blocks, not layers: a layer of a transformer decoder is three."""
+
+WARMUP = (8, 1)
+
+START = 0.5
+"""A relative change to begin with; theirs are 0.05 to 0.24."""
+
+
+@fixed
+def dbcache(task: Task) -> Found:
+    """DBCache: the first blocks are computed at every step, and the others where what those add has changed enough.
+
+    Source: cache-dit's DBCache, which generalises ParaAttention's first-block cache. The change is relative to the last
+    step that was computed whole. The user says there how many blocks come first (``Fn``) and how many steps are
+    computed whole at the beginning, 8 by default; here the calls to learn from decide. ``Bn``, blocks computed at the
+    end, is 0 as it is there by default.
+    """
+    return online(task, proposals(task))
+
+
+def proposals(task: Task) -> Sequence[tuple[Criterion, float]]:
+    """For each number of first blocks and of warm-up steps that the budget has room for, a criterion."""
+    steps, blocks = task.executor.model.steps, task.executor.model.blocks
+    if blocks < 2:
+        raise CalibrationError(
+            "strategy 'dbcache' decides about the blocks after the first; the policy has one block. Take teacache."
+        )
+    found = []
+    for always in FIRST:
+        for warmup in WARMUP:
+            least = always * steps + min(warmup, steps) * (blocks - always)
+            if always < blocks and (least <= task.budget or (always, warmup) == (1, 1)):
+                criterion = Criterion("dbcache", always, START, (1.0, 0.0), False, warmup, closes=False)
+                found.append((criterion, START))
+    return found
+
+
+DEGREE = 4
+
+DENSE_CALLS = 8
+"""Calls that the polynomial is fitted on."""
+
+
+@fixed
+def teacache(task: Task) -> Found:
+    """TeaCache: all blocks are skipped until the accumulated, estimated change of their output is large enough.
+
+    Source: Liu et al., Timestep Embedding Tells: It's Time to Cache for Video Diffusion Model, CVPR 2025 (arXiv
+    2411.19108). What is cheap to know at each step is the input of the first block; a polynomial of degree 4, fitted on
+    dense calls, turns its relative change from the step before into that of the output. First and last step are always
+    computed. The input is modulated by the timestep there; here it is the residual stream after the stem.
+    """
+    return online(task, proposal(task))
+
+
+def proposal(task: Task) -> Sequence[tuple[Criterion, float]]:
+    """The criterion, and a threshold to begin with."""
+    calls = task.some_calls(DENSE_CALLS)
+    before, after = dense_changes(task.executor, calls)
+    # A policy of fewer steps than coefficients has fewer pairs to fit.
+    degree = max(0, min(DEGREE, len(np.unique(before)) - 1))
+    polynomial = tuple(float(c) for c in np.linalg.lstsq(np.vander(before, degree + 1), after)[0])
+    total = float(np.maximum(np.polyval(polynomial, before), 0).sum()) / calls.count
+    start = max(total / max(1, task.budget // task.executor.model.blocks), 1e-3)
+    return [(Criterion("teacache", 0, start, polynomial, accumulates=True, warmup=1, closes=True), start)]
+
+
+def dense_changes(executor: Executor, calls: Calls) -> tuple[Array, Array]:
+    """Relative changes from step to step in dense calls: of the first block's input, and of the last one's output.
+
+    Returns:
+        Two arrays ``[(K - 1) * N]``.
+    """
+    seen = []
+    for stem, residuals in executor.dense_steps(calls):
+        seen.append([value.movedim(executor.axes[0], 0).cpu().numpy() for value in (stem, sum(residuals, stem))])
+    changes = [[relative_change(b, a) for a, b in zip(*pair, strict=True)] for pair in pairwise(seen)]
+    before, after = (np.concatenate([pair[i] for pair in changes]) for i in range(2))
+    return before, after

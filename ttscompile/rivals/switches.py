@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..calibration.calls import Calls, IntArray
-from ..calibration.pruner.head import NAMES
 from ..core.lattice import BoolArray, PlanArray, Source
 from ..ir.evaluate import Evaluator
 from ..ir.graph import Graph, Ref, backward_slice
-from .linear import Matrix
+from ..ir.plan_head import NAMES
+from .sensitivity import Matrix
 
 COMPONENTS = 8
 """Principal components of the features that a switch can depend on."""

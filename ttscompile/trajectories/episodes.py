@@ -21,11 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.coercion import integer
-from ..core.images import fitted
 from ..core.paths import require_path
 from ..core.spec import ObservationSpec
 from ..core.untrusted_json import parse_json
-from ..core.values import check_values
+from ..core.values import check_values, fitted
 from ..core.zip_files import open_zip
 from ..errors import TrajectoryError
 from .frames import Frames, few, observation_frames, one_error, require_proportion

@@ -71,7 +71,9 @@ def check_episodes(
     spec, draw = manifest.spec, np.random.default_rng(0)
     name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
     errors: Errors = {each: [] for each in (*manifest.plans, None)}
-    unpaired = None if _shares_noise(artifact, name) else Unpaired(name)
+    own = artifact.plans[name]
+    shared = own.otherwise is None and manifest.sampler_of(own.loop).takes_noise_as(spec.sampler)
+    unpaired = None if shared else Unpaired(name)
     for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
         rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
         if episodes:
@@ -135,12 +137,6 @@ class Unpaired:
     def distance(self) -> float:
         """Between the two, in units of what other noise changes."""
         return rooted(*np.mean(self._found, axis=0))
-
-
-def _shares_noise(artifact: Artifact, name: str) -> bool:
-    """Whether the noise of a plan's calls means the same as in the original."""
-    plan, original = artifact.plans[name], artifact.manifest.spec.sampler
-    return plan.otherwise is None and artifact.manifest.sampler_of(plan.loop).takes_noise_as(original)
 
 
 def _run(

@@ -26,9 +26,11 @@ from .calls import (
     DENSE_CALL,
     PLANS,
     RUNTIMES,
+    TOKENS,
     check_dense,
     check_plans,
     check_runtimes,
+    check_tokens,
 )
 from .engaged import ENGAGED, check_engaged
 from .episodes import SPARSITY, Progress, check_episodes, choose
@@ -36,7 +38,6 @@ from .network import BLOCK, EVALUATION, PREPROCESSING, check_blocks, check_evalu
 from .precision import PLANS_PRECISION, PRECISION, check_plans_precision, check_precision
 from .probe import Probe
 from .rung import FAILED, PASSED, ErrorMap, Rung, Verification
-from .tokens import TOKENS, check_tokens
 
 INTEGRITY = "integrity"
 

@@ -14,8 +14,8 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score, judge
+from ttscompile.calibration.kept import holding
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import start

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from tests.calibration import policies
-from ttscompile.artifact.block_weights import BlockWeights
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.stores import BlockWeights
+from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import prepare_calls
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.held import holding
+from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers.student import Array, Lesson, Student, trainable
 from ttscompile.calibration.proposers.weights import NAME, Weights
@@ -37,7 +38,7 @@ PLAN = Plan(cells=whole_steps_plan(policies.STEPS, 2 * policies.LAYERS, [0, 5]),
 
 def with_weights(trials: Trials, weights: dict[str, Array]) -> Executor:
     held = holding(trials, Proposal(NAME, PLAN, weights={NAME: BlockWeights(weights, {})}))
-    return Executor(held.view(PLAN))
+    return Executor(view_of(held.artifact, PLAN))
 
 
 def _student(trials: Trials) -> tuple[Student, Lesson]:

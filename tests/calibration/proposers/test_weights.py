@@ -22,12 +22,12 @@ from ttscompile.artifact.files import describe
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.artifact.view import View, view_of
-from ttscompile.calibration.fit_correction import fit_correction
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposers import student
 from ttscompile.calibration.proposers.weights import NAME, SAVED, Weights
 from ttscompile.calibration.result import CalibrationResult
+from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.calibration.state import FILE
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.correction import no_correction

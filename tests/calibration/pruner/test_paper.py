@@ -15,9 +15,8 @@ from tests.calibration.tasks import MakeTask, in_windows
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import judge, schedule
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.held import holding
 from ttscompile.calibration.judge import Score
-from ttscompile.calibration.kept import Kept
+from ttscompile.calibration.kept import Kept, holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.pruner.paper import Paper

@@ -14,12 +14,13 @@ that is a good deal nearer, however long a call of it takes: for tasks that forg
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from ...artifact.load import Artifact
+from ...artifact.view import view_of
 from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
 from ...core.spec import Noise
@@ -32,8 +33,7 @@ from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise
 from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
-from ..schedule import searched
-from ..search import open_search
+from ..schedule import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
 from ..trials import Trials
@@ -50,21 +50,8 @@ ANSWERING = 0.4
 """Share of a loop's time for the answers to learn from."""
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What calls of a loop take, in milliseconds.
-
-    Attributes:
-        one: with one computed step.
-        step: more for each further one.
-    """
-
-    one: float
-    step: float
-
-    def of(self, steps: int) -> float:
-        """With so many computed steps."""
-        return self.one + (steps - 1) * self.step
+Cost = tuple[float, float]
+"""What calls of a loop take, in milliseconds: with one computed step, and more for each further one."""
 
 
 class Loops:
@@ -76,7 +63,7 @@ class Loops:
         self._left_out: list[str] = []
         self._scores: dict[str, Score] = {}
         self._best: Proposal | None = None
-        self._fastest = float("inf")  # ms of the best one, by ``Cost``
+        self._fastest = float("inf")  # ms of the best one, by its ``Cost``
         self._nearest: Proposal | None = None  # of those within ``farthest``, where none is within the bound
 
     def applies(self, artifact: Artifact) -> str | None:
@@ -88,10 +75,10 @@ class Loops:
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``."""
         costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
-        order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop].one))
+        order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop][0]))
         for number, loop in enumerate(order):
             wanted = self._wanted(loop)
-            if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
+            if wanted >= self._bound and (reason := self._too_slow(costs[loop][0], self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
             if number and clock.left() <= 0:
@@ -101,7 +88,8 @@ class Loops:
             share = clock.left() / (len(order) - number)
             own = self._opened(trials, loop, share)
             if loop != ORIGINAL:
-                whole = judge(own, _full(own, loop))
+                every = Plan(loop, dense_plan(own.executor.model.steps, own.executor.model.blocks), repair=True)
+                whole = judge(own, every)
                 if whole.interval[0] > self._farthest:
                     told = f"{loop} is {whole.distance:.3g} from the original with every step computed"
                     self._left_out.append(told)
@@ -110,12 +98,12 @@ class Loops:
                     wanted = self._farthest
             ends = clock.until(min(1.0, (clock.elapsed() + share) / clock.limit))
             yield from self._of_loop(own, loop, ends, costs[loop], wanted)
-        self._best = self._best or self._nearest
-        if self._best is None:
+        best, found = self._best or self._nearest, "fastest that is near enough" if self._best else "nearest"
+        if best is None:
             raise CalibrationFailedError(self._none())
-        yield self._best
+        yield best
         left = f"; left out: {', '.join(self._left_out)}" if self._left_out else ""
-        self.told = f"{self._best.name} is the fastest that is near enough{left}"
+        self.told = f"{best.name} is the {found}{left}"
 
     def _wanted(self, loop: str) -> float:
         """How near a plan of a loop has to be for the search to end there."""
@@ -133,21 +121,21 @@ class Loops:
         counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
         apart = other_noise(own)
         for number, count in enumerate(counts):
-            if number and (clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
+            if number and (clock.left() <= 0 or self._too_slow(of_steps(cost, count), fastest)):
                 break
             quick = crowded.best(count, f"{loop}, {count} steps", TRIED)
             if quick is None and number:
                 clock.cut = True
                 break
             hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
-            if quick is not None and quick.error > hopeless and count != counts[-1]:
+            if quick is not None and quick[1] > hopeless and count != counts[-1]:
                 continue
             proposal = self._searched(own, task, loop, count)
             yield proposal
             name = proposal.name
             alone = replace(proposal, beside=False, margin=float("inf"))
-            if near(self._scores[name], self._bound) and cost.of(count) < self._fastest:
-                self._best, self._fastest = alone, cost.of(count)
+            if near(self._scores[name], self._bound) and of_steps(cost, count) < self._fastest:
+                self._best, self._fastest = alone, of_steps(cost, count)
             if near(self._scores[name], self._farthest) and self._is_nearest(name):
                 self._nearest = alone
             reached = near(self._scores[name], wanted) and self._deadline is None  # with a deadline as many as keep it
@@ -210,7 +198,7 @@ class Loops:
             trials.state.save()
         with trials.state.reading():
             one, step = known[loop]
-            return Cost(float(one), float(step))
+            return float(one), float(step)
 
     def _measured(self, trials: Trials, loop: str) -> tuple[float, float]:
         artifact, record = trials.artifact, trials.artifact.manifest.precision
@@ -220,10 +208,15 @@ class Loops:
         for precision in ({}, *([dict.fromkeys(record.kept, record.name)] if record is not None else [])):
             plans = [Plan(loop, uniform_plan(steps, blocks, n), precision=precision) for n in (1, more)]
             runtime = open_runtime(artifact, "onnxruntime", self._request.threads, None, plans[0])
-            noise = trials.noise(trials.view(plans[0]).manifest.spec, [(0, 0, 0, 0)])
+            noise = trials.noise(view_of(artifact, plans[0]).manifest.spec, [(0, 0, 0, 0)])
             one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
             found.append((one, max(most - one, 0.0) / max(more - 1, 1)))
         return min(found)
+
+
+def of_steps(cost: Cost, steps: int) -> float:
+    """What a call takes with so many computed steps."""
+    return cost[0] + (steps - 1) * cost[1]
 
 
 def too_far(name: str, score: Score, bound: float) -> str:
@@ -239,8 +232,3 @@ def _call(runtime: Runtime, obs: Observation, noise: Noise, plan: Plan) -> None:
     """A call that computes all of its frames."""
     runtime.reset()
     runtime.predict(obs, noise, plan)
-
-
-def _full(own: Trials, loop: str) -> Plan:
-    model = own.executor.model
-    return Plan(loop, dense_plan(model.steps, model.blocks), repair=True)

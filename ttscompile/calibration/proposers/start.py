@@ -17,8 +17,8 @@ from ...core.plan import Plan
 from ...core.start import rest_of
 from ...errors import CalibrationFailedError, SpecError
 from ..clock import Clock
-from ..held import holding
 from ..judge import further, judge
+from ..kept import holding
 from ..proposer import Proposal, Proposals, Request
 from ..trials import LEARNED, Trials, base_of
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ...artifact.block_weights import BlockWeights
 from ...artifact.load import Artifact
+from ...artifact.stores import BlockWeights
+from ...artifact.view import view_of
 from ...core.lattice import Source, whole_steps_plan
 from ...core.plan import ORIGINAL, Plan
 from ...errors import CalibrationError, CalibrationFailedError
@@ -20,9 +21,9 @@ from ...ir.pieces import is_block
 from ...lower.precision import quantize_model
 from ..clock import Clock
 from ..execute import Executor
-from ..fit_correction import fit_correction
-from ..held import holding
+from ..kept import holding
 from ..proposer import Proposal, Proposals, Request
+from ..sparse_loop import fit_correction
 from ..trials import Trials
 from .student import Student, trainable
 
@@ -66,7 +67,7 @@ class Weights:
             yield Proposal(trials.name, replace(plan, correction=first.correction))
         held = holding(trials, Proposal(NAME, first, weights={NAME: BlockWeights(original, {})}))
         student = Student(
-            Executor(held.view(first.exact), trials.device), first, self._rank, trials.seed, self._updates
+            Executor(view_of(held.artifact, first.exact), trials.device), first, self._rank, trials.seed, self._updates
         )
         self._train(student, trials, clock.until(TRAINING))
         self.told = f"{len(names)} matrices of blocks were trained in {student.done} updates"

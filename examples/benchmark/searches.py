@@ -1,0 +1,282 @@
+"""Plans that strategies find now, to take part in a comparison; what was found is kept, so that it can go on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ttscompile.calibration.budget import cells_of, goal_of
+from ttscompile.calibration.calls import Calls, digest_of
+from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.compare import Entrant, Joining
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.schedule import open_search, search_plan
+from ttscompile.calibration.state import StateFile
+from ttscompile.calibration.strategies import strategy_of
+from ttscompile.calibration.targets import executor_elsewhere, where
+from ttscompile.calibration.task import Found, Task
+from ttscompile.calibration.trials import Trials
+from ttscompile.core.correction import FEATURES, Correction
+from ttscompile.core.lattice import check_plan
+from ttscompile.errors import CalibrationError
+from ttscompile.pool import Work, opened_pool
+
+LEARNED = 256
+"""Calls that strategies learn from, at most. ``calibrate`` takes more: its corrections are better."""
+
+Outcome = dict[str, tuple[Found, bool] | str]
+"""By series: what was found and whether the time cut that short, or why there is nothing."""
+
+Wish = tuple[str, int]
+"""A strategy, and how many cells its plan may compute."""
+
+How = tuple[int | None, float, bool]
+"""Intervals at most, seconds of a search, and whether its plan takes part with a correction too."""
+
+_FIELDS = tuple(field.name for field in fields(Correction))
+
+
+class ComparisonState(StateFile):
+    """What a comparison has done so far, in the directory of the artifact; nothing is kept where that cannot be.
+
+    Attributes:
+        warning: why nothing is kept; empty where something is.
+    """
+
+    WORK, AGAIN = "comparison", "Compare"
+
+    def __init__(self, artifact: Path, settings: Mapping[str, Any]) -> None:
+        super().__init__(artifact if artifact.is_dir() else None, settings)
+        self.warning = "" if artifact.is_dir() else "its artifact is no directory"
+
+    def save(self) -> None:
+        """Write everything, at once or not at all; where that fails nothing is kept from here on."""
+        try:
+            super().save()
+        except CalibrationError as error:
+            self.warning, self._path = str(error), None
+
+
+class Searches:
+    """What is known before a search begins, and what it finds.
+
+    Args:
+        state: of the comparison.
+        shape: K and number of blocks.
+
+    Raises:
+        CalibrationError: what is there is damaged.
+    """
+
+    def __init__(self, state: StateFile, shape: tuple[int, int]) -> None:
+        self._state, self._shape = state, shape
+        with state.reading():
+            self._told: dict[str, Any] = state.progress.setdefault("searches", {})
+            if not isinstance(self._told, dict) or not all(isinstance(each, dict) for each in self._told.values()):
+                raise ValueError("expected searches by name")
+
+    def known(self, strategy: str, cells: int) -> Outcome | None:
+        """What a search found before; None if it was not done."""
+        key, outcome = f"{strategy} {cells}", Outcome()
+        with self._state.reading():
+            told = self._told.get(key)
+            if told is None:
+                return None
+            for series, one in told.items():
+                if isinstance(one, str):
+                    outcome[series] = one
+                    continue
+                arrays = self._state.get(f"{key}/{series}")
+                correction = Correction(*(arrays[name] for name in _FIELDS)) if _FIELDS[0] in arrays else None
+                schedule = check_plan(arrays["schedule"], *self._shape, 1)[0]
+                outcome[series] = (
+                    Found(schedule, dict(one["notes"]), correction, error=float(one["error"])),
+                    bool(one["cut"]),
+                )
+        return outcome
+
+    def keep(self, strategy: str, cells: int, outcome: Outcome) -> None:
+        """Keep what a search found."""
+        key, told = f"{strategy} {cells}", dict[str, Any]()
+        for series, one in outcome.items():
+            if isinstance(one, str):
+                told[series] = one
+                continue
+            found, cut = one
+            told[series] = {"notes": dict(found.notes), "error": found.error, "cut": cut}
+            correction = {} if found.correction is None else {name: getattr(found.correction, name) for name in _FIELDS}
+            self._state.put(f"{key}/{series}", {"schedule": found.schedule, **correction})
+        self._told[key] = told
+        self._state.save()
+
+
+class Searching:
+    """Has each strategy find a plan for each sparsity, and lets these take part: see ``calibration.compare.Joining``.
+
+    Args:
+        path: the artifact; what is done is kept in its directory until ``forget``.
+        strategies: names.
+        sparsities: shares of the cells to reuse.
+        learned: calls that strategies learn from, at most.
+        intervals: of a search, at most; None for the strategy's own number.
+        max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
+            has no plan within the budget by then is left out.
+        correct: let the plans of strategies that fit no correction take part a second time, with one that is fitted to
+            them, where that is better. Their series are called ``STRATEGY, corrected``.
+        ray: address of a Ray cluster that answers the dense calls and does the searches, or ``local``, see
+            ``ttscompile.calibrate``. None does everything here.
+        resume: go on after the searches that an interrupted comparison had done, with the same arguments but for
+            strategies, sparsities, other artifacts and held-out calls; begins anew if none was.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        strategies: Sequence[str],
+        sparsities: Sequence[float],
+        *,
+        learned: int = LEARNED,
+        intervals: int | None = None,
+        max_minutes: float = 3.0,
+        correct: bool = False,
+        ray: str | None = None,
+        resume: bool = False,
+    ) -> None:
+        self._path, self._ray, self._resume = path, ray, resume
+        self._strategies, self._sparsities = [strategy_of(name) for name in strategies], sparsities
+        self._learned, self._minutes, self._how = learned, max_minutes, (intervals, 60 * max_minutes, correct)
+        self._state: ComparisonState | None = None
+
+    def forget(self) -> None:
+        """Keep nothing any more: the comparison is done."""
+        if self._state is not None:
+            self._state.remove()
+
+    def __call__(self, trials: Trials, progress: Progress) -> Joining:
+        """The plans.
+
+        Raises:
+            ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
+            CalibrationError: a sparsity that nothing reaches, or nothing to resume with these arguments.
+        """
+        intervals, _, correct = self._how
+        settings = {
+            "model": trials.artifact.manifest.model_identity[:16],
+            "trajectories": digest_of(trials.episodes),
+            "seed": trials.seed,
+            "learned": self._learned,
+            "intervals": intervals,
+            "max_minutes": self._minutes,
+            "correct": correct,
+        }
+        state = self._state = ComparisonState(self._path, settings)
+        manifest = trials.executor.view.manifest
+        budgets = {one: cells_of(goal_of(target_sparsity=one), manifest, False) for one in self._sparsities}
+        with opened_pool(self._ray) as pool:
+            trials = replace(trials, state=state, pool=pool, limits=(self._learned, self._learned))
+            if not (self._resume and state.load()):
+                state.remove()
+            searches = Searches(state, (manifest.steps, len(manifest.blocks)))
+            wished = [(one.name, sparsity) for one in self._strategies for sparsity in budgets]
+            names = {(strategy, budgets[sparsity]): f"{strategy} {sparsity:g}" for strategy, sparsity in wished}
+            missing = [wish for wish in names if searches.known(*wish) is None]
+            if missing:
+                progress("dense calls to learn from", 0, 1)
+                task = _of_schedules(trials.executor, trials.calls, trials.seed)
+                given = *where(trials.executor), trials.calls, trials.seed, self._how
+                outcomes = pool.map(Work(partial(_searched, task, self._how), _searched_elsewhere, given), missing)
+                for number, wish in enumerate(missing, len(names) - len(missing)):
+                    progress(f"search: {names[wish]}", number, len(names))
+                    searches.keep(*wish, next(outcomes))
+                progress("search", len(names), len(names))
+            assert len(trials.held_out.calls)  # answered by the pool, and kept
+        entrants, skipped, cut = list[Entrant](), dict[str, str](), list[str]()
+        for strategy, sparsity in wished:
+            for series, found in (searches.known(strategy, budgets[sparsity]) or {}).items():
+                if isinstance(found, str):
+                    skipped[f"{series} {sparsity:g}"] = found
+                    continue
+                plan, short = found
+                made = replace(trials.base, cells=plan.schedule, correction=plan.correction)
+                entrants.append(Entrant(series, f"{sparsity:g}", trials, made))
+                cut += [f"{series} {sparsity:g}"] * short
+        warnings = [f"nothing was kept for --resume: {state.warning}."] if missing and state.warning else []
+        if cut:
+            limit = f"the limit of {self._minutes:g} minutes"
+            warnings.append(f"{limit} cut the search short of {', '.join(cut)}: see --max-minutes.")
+        warnings += self._remarks(manifest.steps, FEATURES * manifest.spec.sample[0])
+        return Joining(entrants, skipped, warnings)
+
+    def _remarks(self, steps: int, features: int) -> list[str]:
+        """What a reader has to know of the strategies that take part."""
+        found = []
+        if self._strategies and not self._sparsities:
+            found.append(f"no strategy takes part: no share of the cells was given for K = {steps}.")
+        if pruning := [one.name for one in self._strategies if one.uses_pruner]:
+            found.append(
+                f"{', '.join(pruning)}: one plan for all calls takes part, of independent calls. What depends on the"
+                " observation is found by 'calibrate', after which it is among the plans of the artifact."
+            )
+        fitted = [one.name for one in self._strategies if one.fits_correction]
+        if fitted and self._learned < features:
+            found.append(
+                f"{', '.join(fitted)} fits corrections of {features} features from at most {self._learned} calls: its"
+                " points are far worse than they would be after a calibration. Let it learn from more."
+            )
+        return found
+
+
+def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float = math.inf) -> tuple[Found, bool]:
+    """What a strategy finds, whether or not it is any better than the uniform schedule.
+
+    Args:
+        name: the name of the strategy.
+        task: see ``Task``; its clock is not used.
+        intervals: how many at most; None for the strategy's own number.
+        seconds: after which nothing more is begun that can be left out.
+
+    Returns:
+        What was found, and whether the time cut the search short.
+
+    Raises:
+        CalibrationError: there is no such strategy, or it cannot keep the budget.
+        CalibrationFailedError: the time was up before there was a plan within the budget.
+    """
+    clock = Clock(seconds)
+    found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
+    return found, stopped == "time limit"
+
+
+def _searched(task: Task, how: How, wish: Wish) -> Outcome:
+    """What a strategy finds for so many cells."""
+    (strategy, cells), (intervals, seconds, correct) = wish, how
+    try:
+        found, short = plan_of(strategy, replace(task, budget=cells), intervals, seconds)
+    except CalibrationError as error:
+        return {strategy: str(error)}
+    outcome: Outcome = {strategy: (found, short)}
+    if correct and not strategy_of(strategy).fits_correction:
+        try:
+            outcome[f"{strategy}, corrected"] = task.corrected(found), False
+        except CalibrationError as error:
+            outcome[f"{strategy}, corrected"] = str(error)
+    return outcome
+
+
+def _searched_elsewhere(
+    path: str, identity: str, loop: str, calls: Calls, seed: int, how: How
+) -> Callable[[Wish], Outcome]:
+    return partial(_searched, _of_schedules(executor_elsewhere(path, identity, loop), calls, seed), how)
+
+
+def _of_schedules(executor: Executor, calls: Calls, seed: int) -> Task:
+    """What strategies are given, but for the budget.
+
+    Without constants of a pruner nobody spends time on plans that depend on the observation.
+    """
+    return replace(Task.of(executor, calls, 0, seed), pruner={})
