@@ -35,7 +35,7 @@ def main() -> None:
 
 # In the order in which they are used; a line each, short enough for a terminal of 80 columns.
 for _command, _what in (
-    (doctor, "What stands in the way on this machine."),
+    (doctor, "What stands in the way: machine, checkpoint, recordings."),
     (build, "From a checkpoint to a fast policy, in one command."),
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),

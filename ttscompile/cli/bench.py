@@ -19,6 +19,7 @@ from ttscompile.cli.options import (
     LOOP_OPTIONS,
     artifact_argument,
     count_option,
+    encoders_option,
     json_option,
     loop_options,
     names_option,
@@ -29,7 +30,7 @@ from ttscompile.cli.options import (
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import Section, SectionedCommand
-from ttscompile.cli.types import FOLDER, PATH, PICTURE, RATE, SECONDS, TEXT
+from ttscompile.cli.types import PATH, PICTURE, RATE, SECONDS, TEXT
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
@@ -90,11 +91,7 @@ SECTIONS = (
     help="Time the checkpoint that DIRECTORY was made from, in PyTorch: in the loop that it was saved with, and in the"
     " artifact's if that is another.",
 )
-@click.option(
-    "--encoders",
-    type=FOLDER,
-    help="Folder that 'ttscompile convert' was given by the same name, if it was.",
-)
+@encoders_option
 @number_option(
     "--control-hz",
     RATE,

@@ -118,9 +118,11 @@ def convert(
         def on_stage(name: str, notes: tuple[str, ...]) -> None:
             stages.append({"stage": name, "notes": list(notes)})
             status.update(f"compiling: after {name}")
-            if explain:
-                for i, note in enumerate(notes or ("nothing to do",)):
-                    say(console, f"{name if i == 0 else '':<22}{note}")
+            if name == "examine":
+                say(console, *(f"warning: {note}" for note in notes))
+            elif explain:
+                first, *more = notes or ("nothing to do",)
+                say(console, f"{name:<22}{first}", *(f"{'':<22}{note}" for note in more))
 
         ttscompile.convert(
             checkpoint,

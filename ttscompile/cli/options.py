@@ -62,16 +62,18 @@ def together(*options: Decorator) -> Decorator:
     return with_options
 
 
+encoders_option = click.option(
+    "--encoders",
+    type=FOLDER,
+    help="Find config.json of CLIP or of the language model (and tokenizer.json) in this folder, if they are not in or"
+    " beside the checkpoint. Nothing is downloaded.",
+)
+
 lerobot_options = together(
     click.option(
         "--task", type=ANY_TEXT, help="Compile this instruction in; without it, its tokens are an observation."
     ),
-    click.option(
-        "--encoders",
-        type=FOLDER,
-        help="Find config.json of CLIP or of the language model (and tokenizer.json, for --task) in this folder, if"
-        " they are not in or beside CHECKPOINT. Nothing is downloaded.",
-    ),
+    encoders_option,
     click.option(
         "--without-camera",
         "without_cameras",

@@ -10,8 +10,8 @@ from itertools import pairwise
 from math import floor
 from pathlib import Path
 
+from ..core.finding import Finding, Level
 from ..measure.machine import X86, cpuinfo
-from .finding import Finding, Level
 
 _X86 = {
     "avx2": "AVX2",

@@ -134,6 +134,18 @@ def _read(
     return episodes
 
 
+def recorded_names(path: Path) -> tuple[list[str], bool]:
+    """Names of the arrays of a recording, and whether its rows are frames rather than calls.
+
+    Raises:
+        TrajectoryError: it is no recording.
+    """
+    require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
+    other = _other_format(path)
+    held, frames = _npz(path) if other is None else (sandboxed_frames(path, other, []), True)
+    return list(held.names), frames
+
+
 def _npz(path: Path) -> tuple[Frames, bool]:
     """What an ``.npz`` holds, and whether its rows are frames rather than calls."""
     arrays = read_npz(path)
@@ -233,6 +245,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:
             told += " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
+        elif spec.image and array.shape[1:] == (*shape[:-3], *shape[-2:], shape[-3]):
+            told += " Its channels are last: use np.moveaxis(image, -1, -3)."
         raise TrajectoryError(told)
     wanted = np.dtype(spec.dtype)
     allowed = "fiu" if wanted.kind == "f" else wanted.kind if wanted.kind not in "iu" else "iu"
