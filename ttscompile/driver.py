@@ -132,8 +132,7 @@ def convert(
             origin["base_licence"] = fetched.licence
     options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None, base)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
-    doubts = [one for one in examine(Path(checkpoint), spec, encoders) if one.remedy]
-    for one in doubts:
+    for one in (doubts := [one for one in examine(Path(checkpoint), spec, encoders) if one.remedy]):
         if one.level is Level.PROBLEM:  # what the robot is told would mean nothing
             warnings.warn(one.told, stacklevel=2)
     if notes := tuple(one.told for one in doubts if one.level is not Level.PROBLEM):

@@ -39,10 +39,10 @@ def test_a_checkpoint_and_its_recordings_as_json_and_as_text(checkpoint: Path, t
     told = json.loads(result.stdout)
     by_name = {one["what"]: one for one in told["findings"]}
     assert (result.exit_code, told["problems"]) == (1, 1)
-    assert by_name["range of observation.state"]["level"] == "problem"
+    assert by_name["range of 'observation.state'"]["level"] == "problem"
     assert by_name["normaliser of observation.state"]["level"] == "warning"
     text = CliRunner().invoke(main, words, catch_exceptions=False).stdout
-    assert "PROBLEM range of observation.state" in text and "  -> Look: " in text and "1 problem, " in text
+    assert "PROBLEM range of 'observation.state'" in text and "  -> Look at" in text and "1 problem, " in text
 
 
 def test_recordings_are_held_against_an_artifact_too(toy_compiled: Path, tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def sound(tmp_path: Path) -> Path:
 def test_a_sound_checkpoint_has_no_warning_and_says_what_it_takes(sound: Path) -> None:
     said = found(sound)
     assert not [one for one in said.values() if one.remedy]
-    assert said["cameras"].found == f"1, in this order: {FRONT} 24x24"
+    assert said["cameras"].found == f"1, in this order: {FRONT} [2, 3, 24, 24]"
     assert said["action"].found == f"{DA} numbers; 4 of 8 predicted steps are executed"
 
 
@@ -131,7 +131,7 @@ def test_pictures_of_another_size_than_those_of_the_statistics(sound: Path) -> N
     steps = json.loads((sound / "policy_preprocessor.json").read_text())["steps"]
     steps[-1]["config"]["features"][FRONT]["shape"] = [3, 48, 24]
     change_json(sound / "policy_preprocessor.json", steps=steps)
-    assert found(sound)[f"size of {FRONT}"].found.startswith("[3, 24, 24] in config.json, and [3, 48, 24]")
+    assert found(sound)[f"size of {FRONT}"].found.startswith("[3, 24, 24] in config.json, and [3, 48, 24] in the data")
 
 
 def test_more_steps_to_execute_than_are_predicted(sound: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_tokenizer_has_no_more_tokens_than_the_model_knows(sound: Path, words:
     model = {"type": "WordLevel", "vocab": {f"w{n}": n for n in range(words)}, "unk_token": "w0"}
     write_json(sound / "tokenizer.json", {"version": "1.0", "added_tokens": [], "model": model})
     one = found(sound)["tokenizer"]
-    assert one.level is level and f"{words} tokens, of 20 that are known" in one.found
+    assert one.level is level and f"{words} tokens; 20 are known" in one.found
 
 
 def test_affine_normalisers_are_judged_alike(tmp_path: Path) -> None:

@@ -23,11 +23,7 @@ MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PR
 
 
 def examine(target: Path | str | None = None, **more: Any) -> list[Finding]:
-    """Everything that is found, in the order of the report.
-
-    Args:
-        target: an artifact or a checkpoint; None for neither.
-        more: recordings and what is needed to read them, see ``target_findings``.
+    """Everything that is found, in the order of the report; see ``target_findings`` for the arguments.
 
     Returns:
         Findings; none raises. What stops an artifact from running has the level ``PROBLEM``.

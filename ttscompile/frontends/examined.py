@@ -5,91 +5,153 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from ..core.finding import Finding, Level
-from ..core.spec import PolicySpec
-from .lerobot_config import ACTION
-from .lerobot_examined import PART, REPEAT, examine_lerobot, saved_statistics
-from .lerobot_processors import Statistics
+from ..core.spec import Affine, PolicySpec
+from ..core.tokenizer import Tokenizer, find_tokenizer
+from ..errors import CheckpointError
+from .instruction import encoder_folders
+from .lerobot_config import ACTION, CONFIG
+from .lerobot_policy import TOKENS
+from .lerobot_processors import NORMALIZE, PREPROCESSOR, Features, Processors, Statistics, read_processors
+from .saved_weights import read_tensors
+from .settings import read_json
 
+PART = "checkpoint"
 _LEAST = 1e-6
 """A range or deviation below this share of its place is none: of a joint that never moved."""
+_REPEAT = "Compute the statistics again on the data that the policy was trained with, and save it with them."
 
 
 def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None = None) -> list[Finding]:
-    """Look at a checkpoint that was loaded.
-
-    Args:
-        path: of the checkpoint.
-        spec: what loading it gave.
-        encoders: folder where the tokenizer is, if it is neither in nor beside the checkpoint.
-    """
-    judged = [_judged(key, one, spec) for key, one in statistics(path, spec).items()]
-    return [*_inputs(spec), *judged, *(examine_lerobot(path, spec, encoders) if _of_lerobot(spec) else [])]
-
-
-def statistics(path: Path, spec: PolicySpec) -> Mapping[str, Statistics]:
-    """What the observations of a checkpoint are normalised by, under the robot's names, and ``action``."""
-    if _of_lerobot(spec):
-        return saved_statistics(path)
-    affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
-    ends = {
-        key: [torch.from_numpy((end - one.offset) / one.scale) for end in (-1, 1)]
-        for key, one in affine.items()
-        if one is not None
-    }
-    return {key: Statistics("MIN_MAX", low, high, eps=1e-8) for key, (low, high) in ends.items()}
-
-
-def _of_lerobot(spec: PolicySpec) -> bool:
-    return spec.source.get("format") == "lerobot"
-
-
-def _inputs(spec: PolicySpec) -> list[Finding]:
-    """What the policy takes and gives, to be compared with the robot."""
-    cameras, others = [], []
-    for key, one in spec.observations.items():
-        size = f"{one.shape[-1]}x{one.shape[-2]}" + " from any size" * (one.fit is not None) if one.image else ""
-        (cameras if size else others).append(f"{key} {size or list(one.shape)}")
+    """Look at a checkpoint that was loaded with this specification; see ``convert`` for ``encoders``."""
+    cameras = [f"{key} {list(one.shape)}" for key, one in spec.observations.items() if one.image]
+    others = [f"{key} {list(one.shape)}" for key, one in spec.observations.items() if not one.image]
     executed = spec.chunk.stop - spec.chunk.start
     chunk = f"{spec.chunk.action_dim} numbers; {executed} of {spec.sample[0]} predicted steps are executed"
     remedy = "The robot waits for a call at every step. Raise n_action_steps."
-    return [
-        Finding(PART, "cameras", f"{len(cameras)}, in this order: {'; '.join(cameras)}" if cameras else "none"),
-        Finding(PART, "other inputs", "; ".join(others) or "none"),
+    found = [
+        Finding(PART, "cameras", f"{len(cameras)}, in this order: {', '.join(cameras) or 'none'}"),
+        Finding(PART, "other inputs", ", ".join(others) or "none"),
         Finding.judged(PART, ACTION, chunk, executed == 1 < spec.sample[0], remedy),
     ]
+    if spec.source.get("format") != "lerobot":
+        affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
+        return found + [_judged(key, _ends(one)) for key, one in affine.items() if one is not None]
+    try:
+        return found + _of_lerobot(path, spec, encoders)
+    except CheckpointError as error:  # of what the policy does not read
+        return [*found, Finding(PART, "files", str(error), Level.NOTE)]
 
 
-def _judged(key: str, one: Statistics, spec: PolicySpec) -> Finding:
+def _ends(one: Affine) -> Statistics:
+    low, high = (torch.from_numpy((end - one.offset) / one.scale) for end in (-1, 1))
+    return Statistics("MIN_MAX", low, high, eps=1e-8)
+
+
+def _judged(key: str, one: Statistics) -> Finding:
     """Whether statistics do what they are for."""
-    by_mean = one.mode == "MEAN_STD"
-    what, of = f"normaliser of {key}", "deviation" if by_mean else "range"
     first, second = one.first.flatten(), one.second.flatten()
-    width = second if by_mean else second - first
+    (of, width, place, size) = ("range", second - first, -1, 2)
+    if one.mode == "MEAN_STD":
+        (of, width, place, size) = ("deviation", second, 0, 1)
     inert = width.abs() <= _LEAST * first.abs().clamp(min=1e-3)
+    level, told, remedy = Level.OK, f"{of} of {len(width)} numbers", ""
     if (inverted := (width < 0) & ~inert).any():
-        told = f"inverted: its {of} is below zero in {_columns(inverted)}"
-        return Finding(PART, what, told, Level.PROBLEM, f"Minimum and maximum are exchanged, or damaged. {REPEAT}")
-    if inert.all():
-        return Finding(PART, what, f"inert: its {of} is 0 everywhere", Level.PROBLEM, REPEAT)
-    if inert.any() and key == ACTION:
-        return Finding(PART, what, f"the policy always gives the same in {_columns(inert)}", Level.NOTE)
-    if inert.any():
-        told = f"its {of} is 0 in {_columns(inert)}: another value there becomes millions"
+        level, told = Level.PROBLEM, f"inverted: its {of} is below zero in {_columns(inverted)}"
+        remedy = f"Minimum and maximum are exchanged, or damaged. {_REPEAT}"
+    elif inert.all():
+        level, told, remedy = Level.PROBLEM, f"inert: its {of} is 0 everywhere", _REPEAT
+    elif inert.any() and key == ACTION:
+        level, told = Level.NOTE, f"the policy always gives the same in {_columns(inert)}"
+    elif inert.any():
+        level, told = Level.WARNING, f"its {of} is 0 in {_columns(inert)}: another value there becomes millions"
         remedy = "Hold these still, as in training; if the robot moves them, train on data in which they move."
-        return Finding(PART, what, told, Level.WARNING, remedy)
-    place, size = (0, 1) if by_mean else (-1, 2)
-    image = key in spec.observations and spec.observations[key].image
-    identity = not image and bool(((first == place) & (width == size)).all())
-    told = f"{of} of {len(width)} numbers" + ", which is the identity" * identity
-    remedy = f"Was the data of this size already? If not, these statistics are a placeholder. {REPEAT}"
-    return Finding.judged(PART, what, told, identity, remedy)
+    elif ((first == place) & (width == size)).all():
+        level, told = Level.WARNING, f"the identity, for {told}"
+        remedy = f"Was the data of this size already? If not, these statistics are a placeholder. {_REPEAT}"
+    return Finding(PART, f"normaliser of {key}", told, level, remedy)
 
 
 def _columns(which: torch.Tensor) -> str:
     """For people: the first of the columns that are true, and of how many."""
     found = which.nonzero().flatten().tolist()
     return f"column {', '.join(map(str, found[:8]))}{', ..' * (len(found) > 8)} of {len(which)}"
+
+
+def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
+    """What lerobot saves beside a network: what is absent of it, or belongs to something else."""
+    entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
+    both = {**entries["input_features"], **entries["output_features"]}
+    features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
+    found = read_processors(directory, features)
+    step: dict[str, Any] = {"config": {}} | next(one for one in steps if one.get("registry_name") == NORMALIZE)
+    doubts, action = [], {} if found.action is None else {ACTION: found.action}
+    for key, (kind, _) in features.items():
+        mode, name = step["config"].get("norm_map", {}).get(kind, "IDENTITY"), found.renamed.get(key, key)
+        one = (action if key == ACTION else found.normalizers).get(key)
+        if key != ACTION and name not in spec.observations:
+            continue
+        if one is not None:
+            doubts.append(_judged(name, one))
+        elif mode != "IDENTITY" or kind in ("STATE", "ACTION"):
+            told = f"there are no statistics of {key}, so it is not normalised ({mode} is configured)"
+            level = Level.WARNING if mode == "IDENTITY" else Level.PROBLEM
+            remedy = f"Was it trained so? lerobot says nothing. {_REPEAT}"
+            doubts.append(Finding(PART, f"normaliser of {name}", told, level, remedy))
+    wanted, executed = entries.get("n_action_steps"), spec.chunk.stop - spec.chunk.start
+    if isinstance(wanted, int) and wanted > executed:
+        told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
+        remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
+        doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
+    return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, found, spec, encoders)]
+
+
+def _cameras(directory: Path, features: Features, step: Mapping[str, Any]) -> list[Finding]:
+    """Names and sizes in the data that are not the policy's: lerobot passes over a picture that it does not know."""
+    doubts, known = [], [key for key, (kind, _) in features.items() if kind == "VISUAL"]
+    file = step.get("state_file")
+    measured = {name.rpartition(".")[0] for name in read_tensors(directory / file)} if file else set()
+    foreign = sorted(key for key in measured if key.startswith("observation.images.") and key not in known)
+    if foreign:
+        told = (
+            f"the data had {', '.join(foreign)}, which the policy does not read; it reads {', '.join(known) or 'none'}"
+        )
+        pairs = ", ".join(f'"{a}": "{b}"' for a, b in zip(foreign, known, strict=False))
+        remedy = f"It may never have seen them. Train again with lerobot's rename_map, such as {{{pairs}}}."
+        doubts.append(Finding(PART, "names of cameras", told, Level.WARNING, remedy))
+    of_data = {key: one for key, one in step["config"].get("features", {}).items() if isinstance(one, dict)}
+    for key in known:
+        shape = of_data.get(key, {}).get("shape")
+        if not isinstance(shape, list) or tuple(shape) == features[key][1]:
+            continue
+        told = f"{list(features[key][1])} in {CONFIG}, and {shape} in the data"
+        doubts.append(Finding(PART, f"size of {key}", told, Level.WARNING, "Show the policy pictures of that size."))
+    return doubts
+
+
+def _tokenizer(
+    directory: Path, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
+) -> list[Finding]:
+    """Of a policy that reads an instruction: whether the tokenizer is of its language model."""
+    one, name = spec.observations.get(TOKENS), str(found.tokenizer.get("tokenizer_name", "none"))[:200]
+    if one is None or one.bounds is None:
+        return []
+    near = encoder_folders(encoders, directory)
+    places = [place for each in near for place in (each / name, each / Path(name).name, each)]
+    file = next((path for place in places if (path := find_tokenizer(place)) is not None), None)
+    level, told, remedy = Level.NOTE, f"{name:.100}, which is not on this machine, and so was not tried", ""
+    if (length := found.tokenizer.get("max_length", one.shape[0])) != one.shape[0]:
+        level, told = Level.WARNING, f"makes {length!s:.20} tokens of an instruction; {one.shape[0]} are read"
+        remedy = f"Correct max_length in {PREPROCESSOR}."
+    elif file is not None:
+        try:
+            size, known = Tokenizer(file, CheckpointError).size, round(one.bounds[1][0]) + 1  # type: ignore[index]
+            level, told = Level.PROBLEM if size > known else Level.OK, f"{file}: {size} tokens; {known} are known"
+            remedy = "It is of another model: take the policy's own." * (size > known)
+        except CheckpointError as error:
+            level, told, remedy = Level.WARNING, str(error), "Copy it again from the model's repository."
+    return [Finding(PART, "tokenizer", told, level, remedy)]

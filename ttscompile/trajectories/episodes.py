@@ -135,11 +135,7 @@ def _read(
 
 
 def recorded_names(path: Path) -> tuple[list[str], bool]:
-    """Names of the arrays of a recording, and whether its rows are frames rather than calls.
-
-    Raises:
-        TrajectoryError: it is no recording.
-    """
+    """Names of the arrays of a recording, and whether its rows are frames rather than calls."""
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
     other = _other_format(path)
     held, frames = _npz(path) if other is None else (sandboxed_frames(path, other, []), True)
@@ -245,8 +241,9 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:
             told += " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
-        elif spec.image and array.shape[1:] == (*shape[:-3], *shape[-2:], shape[-3]):
-            told += " Its channels are last: use np.moveaxis(image, -1, -3)."
+        elif spec.image:
+            last = array.shape[1:] == (*shape[:-3], *shape[-2:], shape[-3])
+            told += " Its channels are last: use np.moveaxis(image, -1, -3)." if last else " Is it another camera's?"
         raise TrajectoryError(told)
     wanted = np.dtype(spec.dtype)
     allowed = "fiu" if wanted.kind == "f" else wanted.kind if wanted.kind not in "iu" else "iu"
