@@ -11,7 +11,7 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.frontier import print_frontier
-from ttscompile.cli.options import json_option, lerobot_options, number_option, threads_option
+from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import LEROBOT, SectionedCommand
@@ -32,12 +32,7 @@ from ttscompile.report.summary import document
     "Choose, of the plans that keep up with a control loop of this rate in Hz, the one that is nearest to the original."
     " Without a deadline the fastest is chosen.",
 )
-@number_option(
-    "--policy-hz",
-    RATE,
-    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
-    " --control-hz.",
-)
+@policy_hz_option
 @number_option(
     "--latency-ms",
     MILLISECONDS,

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ttscompile.cli.options import encoders_option, json_option
+from ttscompile.cli.options import json_option
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json
 from ttscompile.cli.recordings import FilesCommand, require_recordings, trajectories_options
 from ttscompile.cli.types import PathOrHub
@@ -17,7 +17,6 @@ from ttscompile.doctor import diagnosis as examination
 @click.command(cls=FilesCommand)
 @click.argument("target", required=False, type=PathOrHub(exists=True))
 @trajectories_options(required=False, what="See whether these recorded episodes fit TARGET.")
-@encoders_option
 @json_option
 @click.pass_context
 def doctor(

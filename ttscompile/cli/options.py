@@ -126,20 +126,15 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
     return click.option(name, type=ANY_TEXT, default=default, show_default=True, callback=parsed, help=help)
 
 
+policy_hz_option = number_option(
+    "--policy-hz",
+    RATE,
+    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
+    " --control-hz.",
+)
 loop_options = together(
-    number_option(
-        "--policy-hz",
-        RATE,
-        "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
-        " --control-hz.",
-    ),
-    count_option(
-        "--horizon",
-        "Execute so many actions from one call to the next. Without this option it is as many as the policy executes of"
-        " a chunk.",
-        default=None,
-    ),
+    policy_hz_option,
     count_option("--margin-ticks", "Have each chunk come so many control ticks before it is needed.", least=0),
 )
-LOOP_OPTIONS = ("policy_hz", "horizon", "margin_ticks")
+LOOP_OPTIONS = ("policy_hz", "margin_ticks")
 """Of commands that run an artifact in a control loop, and their parameters, which ``ExecutorSettings`` has too."""

@@ -60,7 +60,6 @@ def checked(
     identity: str,
     trajectories: Sequence[Path],
     sources: Sources,
-    threads: int,
     progress: Callable[[str], None],
 ) -> tuple[bool, Section]:
     """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
@@ -73,7 +72,6 @@ def checked(
             directory,
             trajectories,
             sources=sources,
-            threads=threads,
             progress=lambda what: progress(f"verifying: {what}"),
         )
         if found.identity not in (None, identity):
