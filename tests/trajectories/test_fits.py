@@ -102,8 +102,9 @@ def test_pictures_of_another_size_may_be_another_cameras(tmp_path: Path) -> None
 
 def test_channels_that_are_last_in_calls_are_said(tmp_path: Path) -> None:
     path = tmp_path / "calls.npz"
-    windows = {key: np.zeros((6, 2, 4, 5, 3), np.float32) for key in (FRONT, WRIST)}
-    np.savez(path, episode_ends=np.array([3, 6]), **{STATE: np.zeros((6, 2, 4), np.float32)}, **windows)
+    arrays: dict[str, Any] = {key: np.zeros((6, 2, 4, 5, 3), np.float32) for key in (FRONT, WRIST)}
+    arrays[STATE] = np.zeros((6, 2, 4), np.float32)
+    np.savez(path, episode_ends=np.array([3, 6]), **arrays)
     (one,) = [each for each in examine_recordings([path], policy(), {}) if each.what == "load"]
     assert one.level is Level.PROBLEM and "np.moveaxis(image, -1, -3)" in one.found
 

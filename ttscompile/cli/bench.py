@@ -149,8 +149,14 @@ def bench(
         judged = None if loop is None else loop.judge(entered, measured)
         error = _precision_error(artifact, plans, ways[0])
     how = {"runtime": ways[0].runtime, "device": ways[0].device, "threads": ways[0].threads}
-    record = artifact.manifest.calibration or {"seed": 0}  # of the same seed: the same episodes are held out
-    asked: dict[str, Any] = {"observation": sources, "plans": plans, "calls": calls, "seed": record["seed"], **how}
+    record = artifact.manifest.calibration or {}  # of the same seed: the same episodes are held out
+    asked: dict[str, Any] = {
+        "observation": sources,
+        "plans": plans,
+        "calls": calls,
+        "seed": record.get("seed", 0),
+        **how,
+    }
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
     report = BenchReport(measured, default, calls, by_threads, error, judged, compared)

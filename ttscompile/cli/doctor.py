@@ -20,7 +20,7 @@ from ttscompile.doctor import diagnosis as examination
 @json_option
 @click.pass_context
 def doctor(
-    context: click.Context, target: Path | str | None, trajectories: tuple[Path, ...], as_json: bool, **how: Any
+    context: click.Context, /, target: Path | str | None, trajectories: tuple[Path, ...], as_json: bool, **how: Any
 ) -> None:
     """Look at Python, packages, processor, cores, memory and clock; with TARGET, also at that.
 
