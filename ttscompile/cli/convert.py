@@ -23,10 +23,7 @@ from ttscompile.frontends.families import FAMILIES, SAMPLERS
 from ttscompile.report.facts import precision as told_precision
 from ttscompile.report.summary import document
 
-SECTIONS = (
-    Section("Another denoising loop", ("sampler", "steps")),
-    LEROBOT,
-)
+SECTIONS = (Section("Another denoising loop", ("sampler", "steps")), LEROBOT)
 
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)

@@ -30,8 +30,7 @@ class LoopReport:
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        plans = {label: one.to_json() for label, one in self.judged.items()}
-        return {"control_hz": self.control_hz, "plans": plans}
+        return {"control_hz": self.control_hz, "plans": {label: one.to_json() for label, one in self.judged.items()}}
 
     def print(self, output: Console) -> None:
         """The verdicts with their arithmetic."""

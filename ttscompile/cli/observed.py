@@ -14,11 +14,10 @@ from ttscompile.errors import ObservationError, RuntimeUnavailableError
 from ttscompile.trajectories.episodes import read_npz
 
 Array = npt.NDArray[Any]
-Specs = Mapping[str, ObservationSpec]
 
 
 def observed(
-    specs: Specs, pictures: Mapping[str, Path], state: Array | None, archive: Path | None
+    specs: Mapping[str, ObservationSpec], pictures: Mapping[str, Path], state: Array | None, archive: Path | None
 ) -> tuple[dict[str, Array], list[str]]:
     """The observation as ``predict_action`` takes it, one stream; and the keys of which one frame fills the window.
 
@@ -46,7 +45,7 @@ def observed(
     return {key: array for key, (array, _) in whole.items()}, [key for key, (_, one) in whole.items() if one]
 
 
-def _camera(name: str, specs: Specs) -> str:
+def _camera(name: str, specs: Mapping[str, ObservationSpec]) -> str:
     """The camera of this name, or the one whose key ends with it."""
     cameras = [key for key, one in specs.items() if one.image]
     found = [key for key in cameras if key == name] or [key for key in cameras if key.endswith(f".{name}")]

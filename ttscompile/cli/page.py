@@ -69,10 +69,7 @@ def checked(
     """
     try:
         found = ttscompile.verify(
-            directory,
-            trajectories,
-            sources=sources,
-            progress=lambda what: progress(f"verifying: {what}"),
+            directory, trajectories, sources=sources, progress=lambda it: progress(f"verifying: {it}")
         )
         if found.identity not in (None, identity):
             raise ArtifactChangedError(f"{directory}: was replaced meanwhile. Inspect it again.")

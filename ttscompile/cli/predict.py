@@ -10,7 +10,7 @@ import numpy as np
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.observed import observed
-from ttscompile.cli.options import artifact_argument, json_option, seed_option
+from ttscompile.cli.options import MOST_SEED, artifact_argument, count_option, json_option
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
 from ttscompile.errors import ObservationError
@@ -55,7 +55,7 @@ def _numbers(_: click.Context, __: click.Parameter, value: str | None) -> Any:
 )
 @click.option("--plan", type=TEXT, help="Compute this plan. Without this option it is the default plan.")
 @click.option("--plot", "picture", type=PICTURE, help="Draw the chunk into this file (.png, .svg or .pdf).")
-@seed_option("Seed of the noise that the actions are made of.")
+@count_option("--seed", "Seed of the noise that the actions are made of.", default=0, least=0, most=MOST_SEED)
 @json_option
 def predict(
     directory: Path,
@@ -87,17 +87,17 @@ def predict(
     report, executed = policy.last_report, range(spec.chunk.start, spec.chunk.stop)
     assert report is not None  # a call was made
     notes = [f"{key}: one frame stands for all {spec.observations[key].frames} that are read" for key in repeated]
-    told = f"plan {report.plan_name!r}, seed {seed}"
+    told, identity = f"plan {report.plan_name!r}, seed {seed}", artifact.manifest.identity
     if as_json:
         how = {"plan": report.plan_name, "seed": seed, "executed": [executed.start, executed.stop], "notes": notes}
-        print_json({"identity": artifact.manifest.identity, **how, "actions": chunk.tolist()})
+        print_json({"identity": identity, **how, "actions": chunk.tolist()})
     else:
         say(output := results(), f"{'step':<15}{''.join(f'{number:>10}' for number in range(chunk.shape[1]))}")
         for step, action in enumerate(chunk):
             numbers = "".join(f"{number:>10.4g}" for number in action)
             say(output, f"{step:>4} {'executed' * (step in executed):<10}{numbers}")
         say(output, f"{told}: {len(chunk)} steps of {chunk.shape[1]} numbers", *notes)
-        print_identity(artifact.manifest.identity, output)
+        print_identity(identity, output)
     if picture is not None:
         plot_chunk(chunk, executed, picture, told)
         say(progress(), f"wrote {picture}")

@@ -24,6 +24,7 @@ def target_findings(
     try:
         from ..artifact.archive import is_checkpoint
         from ..artifact.load import load_artifact
+        from ..trajectories.fits import examine_recordings
 
         if isinstance(target, str) or is_checkpoint(target):
             found, spec = _checkpoint(target)
@@ -32,11 +33,7 @@ def target_findings(
             if not recordings or any(one.what == "load" for one in found):
                 return found
             spec = load_artifact(target).manifest.spec
-        if recordings:
-            from ..trajectories.fits import examine_recordings
-
-            found += examine_recordings(recordings, spec, sources or {})
-        return found
+        return [*found, *(examine_recordings(recordings, spec, sources or {}) if recordings else [])]
     except ModuleNotFoundError as error:
         told = f"not tried: {(error.name or '').partition('.')[0]} is not installed"
         return [Finding(PART, "load", told, Level.PROBLEM, "Run: pip install 'ttscompile[compile]'.")]

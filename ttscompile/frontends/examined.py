@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..core.finding import Finding, Level
-from ..core.spec import Affine, PolicySpec
+from ..core.spec import PolicySpec
 from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
 from .instruction import encoder_folders
@@ -32,24 +33,20 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
     others = [f"{key} {list(one.shape)}" for key, one in spec.observations.items() if not one.image]
     executed = spec.chunk.stop - spec.chunk.start
     chunk = f"{spec.chunk.action_dim} numbers; {executed} of {spec.sample[0]} predicted steps are executed"
-    remedy = "The robot waits for a call at every step. Raise n_action_steps."
     found = [
         Finding(PART, "cameras", f"{len(cameras)}, in this order: {', '.join(cameras) or 'none'}"),
         Finding(PART, "other inputs", ", ".join(others) or "none"),
-        Finding.judged(PART, ACTION, chunk, executed == 1 < spec.sample[0], remedy),
+        Finding.judged(PART, ACTION, chunk, executed == 1 < spec.sample[0], "Raise n_action_steps: it calls at each."),
     ]
     if spec.source.get("format") != "lerobot":
         affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
-        return found + [_judged(key, _ends(one)) for key, one in affine.items() if one is not None]
+        ends = {key: [one.unnormalize(np.float32([end])) for end in (-1, 1)] for key, one in affine.items() if one}
+        made = {key: Statistics("MIN_MAX", *map(torch.from_numpy, two), 1e-8) for key, two in ends.items()}
+        return found + [_judged(key, one) for key, one in made.items()]
     try:
         return found + _of_lerobot(path, spec, encoders)
     except CheckpointError as error:  # of what the policy does not read
         return [*found, Finding(PART, "files", str(error), Level.NOTE)]
-
-
-def _ends(one: Affine) -> Statistics:
-    low, high = (torch.from_numpy((end - one.offset) / one.scale) for end in (-1, 1))
-    return Statistics("MIN_MAX", low, high, eps=1e-8)
 
 
 def _judged(key: str, one: Statistics) -> Finding:

@@ -101,10 +101,8 @@ def _read(
     path: Path, observations: Mapping[str, ObservationSpec], action_steps: int, sources: Mapping[str, Sequence[str]]
 ) -> list[Episode]:
     """Episodes of one file."""
-    require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
-    other = _other_format(path)
     used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
-    held, frames = _npz(path) if other is None else (sandboxed_frames(path, other, sorted(used)), True)
+    other, held, frames = _opened(path, sorted(used))
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
@@ -136,10 +134,15 @@ def _read(
 
 def recorded_names(path: Path) -> tuple[list[str], bool]:
     """Names of the arrays of a recording, and whether its rows are frames rather than calls."""
+    _, held, frames = _opened(path, [])
+    return list(held.names), frames
+
+
+def _opened(path: Path, wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
+    """What a file is that is no ``.npz``, what it holds, and whether that is frames."""
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
     other = _other_format(path)
-    held, frames = _npz(path) if other is None else (sandboxed_frames(path, other, []), True)
-    return list(held.names), frames
+    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted), True))
 
 
 def _npz(path: Path) -> tuple[Frames, bool]:

@@ -17,13 +17,12 @@ from .lerobot_dataset import MAX_INFO
 from .ranges import judged, placed
 
 PART = "recordings"
-Sources = Mapping[str, Sequence[str]]
 
 _BLIND_SECONDS = 3.0
 """For which a chunk is executed without looking, from which on a robot misses what happens."""
 
 
-def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Sources) -> list[Finding]:
+def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping[str, Sequence[str]]) -> list[Finding]:
     """Look at recordings, which are given as to ``load_trajectories``, as the policy would observe them."""
     found, renamed = list[Finding](), dict(sources)
     with warnings.catch_warnings(record=True) as said:
@@ -33,8 +32,7 @@ def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Sources
                 found += [*_names(path, spec, renamed), *_rate(path, spec)]
             episodes = load_trajectories(paths, spec.observations, spec.chunk.stop - spec.chunk.start, renamed)
         except TrajectoryError as error:
-            remedy = "As the message says; nothing else was tried."
-            return [*found, Finding(PART, "load", str(error), Level.PROBLEM, remedy)]
+            return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
     found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in said]
     found.append(Finding(PART, "calls", f"{sum(each.calls for each in episodes)} in {len(episodes)} episodes"))
     return [*found, *map(judged, placed(episodes, spec))]

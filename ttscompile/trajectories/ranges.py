@@ -28,11 +28,7 @@ LITTLE = 0.05
 
 @dataclass(frozen=True)
 class Placed:
-    """Recorded numbers of one key, ``[N, D]``, and what maps the range of the training data to -1..1.
-
-    Attributes:
-        some: share of numbers outside that is worth a warning.
-    """
+    """Recorded numbers ``[N, D]`` of a key, what maps the training data's range to -1..1, and the share to warn at."""
 
     key: str
     values: npt.NDArray[np.float32]
@@ -87,10 +83,8 @@ def judged(one: Placed) -> Finding:
         f"{outside.sum()} of {outside.size} recorded numbers ({share:.0%}) lie outside of what the policy's normaliser"
         f" maps to -1..1, by up to {np.abs(one.seen.normalize(one.values)).max():.3g} times; columns {columns}"
     )
-    remedy = (
-        "Look at their unit (degrees, radians), at the order of the columns, and at --observation. If all are right"
-    )
-    remedy += " the statistics are of another data set, and what the policy answers to these means nothing."
+    remedy = "Look at their unit (degrees, radians), the order of the columns, and --observation. If these are right,"
+    remedy += " the statistics are of another data set, and what the policy answers means nothing."
     if exchanged := one.in_place_of():
         told += "; " + ", ".join(f"column {a} is as {b} was" for a, b in exchanged.items())
         level, remedy = Level.PROBLEM, "The columns look permuted: give them in the order of the training data."
