@@ -40,9 +40,9 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
     ]
     if spec.source.get("format") != "lerobot":
         affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
-        ends = {key: [one.unnormalize(np.float32([end])) for end in (-1, 1)] for key, one in affine.items() if one}
-        made = {key: Statistics("MIN_MAX", *map(torch.from_numpy, two), 1e-8) for key, two in ends.items()}
-        return found + [_judged(key, one) for key, one in made.items()]
+        both = np.array([[-1], [1]], np.float32)
+        ends = {key: torch.from_numpy(one.unnormalize(both)) for key, one in affine.items() if one is not None}
+        return found + [_judged(key, Statistics("MIN_MAX", low, high, 1e-8)) for key, (low, high) in ends.items()]
     try:
         return found + _of_lerobot(path, spec, encoders)
     except CheckpointError as error:  # of what the policy does not read
