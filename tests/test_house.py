@@ -39,7 +39,7 @@ MAY_IMPORT = {
     "capture": BASE | {"frontends", "ir"},
     "artifact": BASE | {"ir"},
     "runtimes": BELOW_ARTIFACT | {"hub"},
-    "doctor": BELOW_ARTIFACT | {"runtimes"},
+    "doctor": BELOW_ARTIFACT | {"frontends", "hub", "runtimes", "trajectories"},
     "verification": BELOW_ARTIFACT | {"frontends", "runtimes", "trajectories"},
     "pool": BASE | {"artifact"},
     "calibration": BELOW_ARTIFACT | {"lower", "pool", "runtimes", "trajectories", "verification"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +17,14 @@ from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, needed, unneeded
 from .core.coercion import integer
+from .core.finding import Level
 from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, INT8, ORIGINAL, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
 from .frontends.copies import own_copy
 from .frontends.encoded import parts
+from .frontends.examined import examine
 from .frontends.families import LoadOptions
 from .hub import fetch_checkpoint
 from .ir.dataflow import reachable_from
@@ -129,6 +132,11 @@ def convert(
             origin["base_licence"] = fetched.licence
     options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None, base)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
+    for one in (doubts := [one for one in examine(Path(checkpoint), spec, encoders) if one.remedy]):
+        if one.level is Level.PROBLEM:  # what the robot is told would mean nothing
+            warnings.warn(one.told, stacklevel=2)
+    if notes := tuple(one.told for one in doubts if one.level is not Level.PROBLEM):
+        explain("examine", notes)
     spec = replace(spec, source={**spec.source, **origin})
     beside = files_beside(checkpoint, spec)
     if spec.source.get("format") == "lerobot" and not beside:

@@ -19,12 +19,12 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import NAMES
 from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
 from ttscompile.cli.options import (
+    MOST_SEED,
     artifact_argument,
     count_option,
     json_option,
     names_option,
     ray_option,
-    seed_option,
     threads_option,
 )
 from ttscompile.cli.output import print_json, progress, results, run, say
@@ -86,7 +86,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     help="Let plans of strategies that fit no correction take part a second time, with one that is fitted to them.",
 )
 @count_option("--intervals", "End each search after so many intervals; for a quick look.", default=None)
-@seed_option("Seed of the split, the noise and the searches.")
+@count_option("--seed", "Seed of the split, the noise and the searches.", default=0, least=0, most=MOST_SEED)
 @ray_option
 @click.option("--resume", is_flag=True, help="Go on after the searches that an interrupted run had done.")
 @click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")

@@ -288,7 +288,7 @@ def test_the_split_is_by_episode(count: int, fraction: float) -> None:
 def test_a_strategy_that_fits_corrections_is_not_asked_to(compiled: Path, recording: Path, tmp_path: Path) -> None:
     directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
     before = contents(directory)
-    with pytest.raises(CalibrationError, match="strategy 'tts' fits a correction of its own. Leave --correct out"):
+    with pytest.raises(CalibrationError, match="strategy 'tts' fits a correction of its own. Leave correct out"):
         quick(directory, recording, correct=True)
     assert contents(directory) == before
 

@@ -127,7 +127,7 @@ def test_a_loop_that_ends_in_no_numbers_gets_no_correction(make_task: MakeTask, 
 def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, plan: PlanArray) -> None:
     rollout = plan.copy()
     rollout[1, 0] = Source.ROLLOUT
-    with pytest.raises(CalibrationError, match="reads residuals of earlier calls.* Leave --correct out"):
+    with pytest.raises(CalibrationError, match="reads residuals of earlier calls.* Leave correct out"):
         make_task(calls=20).corrected(Found(rollout))
 
 

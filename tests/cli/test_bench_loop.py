@@ -33,7 +33,6 @@ def test_it_says_what_is_feasible_with_the_arithmetic(toy_compiled: Path) -> Non
     assert dense["needed"] == pytest.approx(0.2 + 2 * dense["latency"])
     assert dense["latency"] * 1e3 == pytest.approx(max(timed["times_ms"]))
     assert dense["latency"] * 1e3 >= timed["median_ms"]
-    assert document["loop"]["jitter"] is None
 
 
 def test_what_is_not_feasible_is_exit_status_1(toy_compiled: Path) -> None:
@@ -43,23 +42,12 @@ def test_what_is_not_feasible_is_exit_status_1(toy_compiled: Path) -> None:
     assert "ms > 400 ms = 2 actions at 5 Hz" in out
 
 
-def test_jitter_is_measured_and_printed(toy_compiled: Path) -> None:
-    code, out, _ = run(toy_compiled, "--control-hz", 10, "--margin-ticks", 0, "--calls", 2, "--jitter", 0.3)
-    assert code == 0
-    assert "200 Hz loop" in out
-    assert "alone" in out
-    assert "beside plan 'dense'" in out
-
-
 @pytest.mark.compiles
-def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path, tmp_path: Path) -> None:
+def test_the_baseline_is_named_as_one(toy_compiled: Path, tmp_path: Path) -> None:
     calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
     plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one
     store_schedules(calibrated, None, plans, "schedule", {"strategy": "tts"})
-    loop = ("--control-hz", 10, "--margin-ticks", 0, "--calls", 3, "--jitter", 0.1)
-    assert "beside plan 'schedule'" in run(calibrated, *loop)[1]
-    told = run(calibrated, *loop, "--plan", "uniform")[1]
-    assert "beside plan 'uniform'" in told
+    told = run(calibrated, "--control-hz", 10, "--margin-ticks", 0, "--calls", 3, "--plan", "uniform")[1]
     assert "uniform (baseline) " in told and "Not for a robot." in told
 
 
@@ -68,9 +56,7 @@ def test_jitter_is_measured_beside_the_plan_that_a_robot_runs(toy_compiled: Path
     [
         (["--control-hz", 25, "--policy-hz", 10], "no multiple of policy_hz"),
         (["--control-hz", 10, "--plan", "quick"], "no plan 'quick'"),
-        (["--control-hz", 10, "--horizon", 9], "Give at most 2"),
         (["--margin-ticks", 1], "--margin-ticks is for --control-hz: give it too"),
-        (["--jitter", 1], "--jitter is for --control-hz: give it too"),
     ],
 )
 def test_bad_usage_is_exit_status_2(toy_compiled: Path, arguments: list[object], message: str) -> None:

@@ -14,11 +14,12 @@ from click.testing import CliRunner
 
 from tests.plans import store_schedules
 from ttscompile.cli import main
+from ttscompile.core.finding import Finding, Level
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor
 from ttscompile.doctor import machine as doctor_machine
 from ttscompile.doctor import packages as doctor_packages
-from ttscompile.doctor.finding import Finding, Level
+from ttscompile.doctor.artifact import artifact_findings
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +189,7 @@ def test_int8_without_integer_dot_products_is_a_warning(calibrated: Path, monkey
 
     monkeypatch.setattr(machine, "has_integer_dot_product", lambda: False)
     monkeypatch.setattr(Manifest, "precision_name", "int8")
-    finding = found("precision", doctor.artifact_findings(calibrated))
+    finding = found("precision", artifact_findings(calibrated))
     assert finding.level is Level.WARNING
     assert "'NAME@fp32'" in finding.remedy
 
@@ -197,4 +198,4 @@ def test_too_little_memory_is_a_problem(calibrated: Path, monkeypatch: pytest.Mo
     from ttscompile.doctor import artifact as doctor_artifact
 
     monkeypatch.setattr(doctor_artifact, "available_bytes", lambda: 1000)
-    assert found("memory", doctor.artifact_findings(calibrated)).level is Level.PROBLEM
+    assert found("memory", artifact_findings(calibrated)).level is Level.PROBLEM

@@ -66,7 +66,7 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["bench", "out", "--plot", "f.png"], "--plot is for --trajectories: give it too"),
         (["bench", "out", "--runtime", "tensorrt"], "'tensorrt' is not one of onnxruntime, torch"),
         (["bench", "out", "--runtime", ""], "--runtime: nothing was given"),
-        (["bench", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
+        (["predict", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
         (["serve", "out"], "give --control-hz HZ to drive one robot, or --copies N to answer many"),
         (["serve", "out", "--control-hz", "10", "--wait-ms", "1"], "--wait-ms is for --copies: give it too"),
         (["inspect", "out", "-o", "page.pdf"], "ends in .html"),
@@ -95,7 +95,7 @@ def test_a_target_that_cannot_be(toy_compiled: Path) -> None:
     [
         ["convert", "-o", "out", "no.ckpt"],
         ["convert", "here.ckpt", "-o", "."],
-        ["calibrate", "--trajectories", "here.ckpt", "--seed", "1", "nowhere"],
+        ["calibrate", "--trajectories", "here.ckpt", "--max-minutes", "1", "nowhere"],
         ["calibrate", "compiled", "--trajectories", "no.npz"],
         ["bench", "compiled", "-t", "no.npz"],
     ],

@@ -90,14 +90,6 @@ def test_a_precision_that_there_is_not_is_a_usage_error(tmp_path: Path) -> None:
     assert "'int4' is not one of 'fp32', 'int8'" in result.stderr
 
 
-def test_a_part_cannot_stay_fp32_beside_fp32(tmp_path: Path) -> None:
-    (tmp_path / "empty.ckpt").touch()
-    result = run("convert", tmp_path / "empty.ckpt", "-o", tmp_path / "compiled", "--keep-fp32", "prologue")
-    assert result.exit_code == 2
-    assert "'prologue' stays fp32, as does everything in precision 'fp32'" in " ".join(result.stderr.split())
-    assert not (tmp_path / "compiled").exists()
-
-
 @pytest.mark.slow
 def test_bench_times_the_dense_plan_in_fp32_and_names_the_precision(converted: tuple[Path, dict[str, Any]]) -> None:
     result = run("bench", converted[0], "--calls", 2, "--json")

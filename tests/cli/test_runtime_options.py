@@ -60,7 +60,6 @@ def test_a_loop_is_judged_on_torch(toy_compiled: Path) -> None:
         (("bench", "--plan", "dense@fp4"), "has no plan 'dense@fp4'"),
         (("bench", "--runtime", "tensorrt"), "'tensorrt' is not one of"),
         (("calibrate", "--trajectories", "CALLS", "--device", "abacus"), "device 'abacus' cannot be had"),
-        (("inspect", "-o", "page.html", "--runtime", "torch", "--device", "abacus"), "device 'abacus'"),
     ],
 )
 def test_what_cannot_be_had_is_bad_usage(

@@ -181,3 +181,9 @@ def test_a_host_that_is_no_address_is_refused(word: str) -> None:
     result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], f"--host={word}"])
     assert (result.exit_code, result.stdout) == (2, "")
     assert "expected an IP address of this machine" in result.stderr
+
+
+def test_all_commands_together_have_at_most_a_hundred_options() -> None:
+    """What only authors of a method need is in the Python interface."""
+    options = [one for command in main.commands.values() for one in command.params if isinstance(one, click.Option)]
+    assert 90 < len(options) <= 100

@@ -238,14 +238,6 @@ def test_the_action_is_normalised_whatever_the_features_say(tmp_path: Path) -> N
     assert found.scale.tolist() == expected.scale.tolist()
 
 
-def test_missing_statistics_are_said(tmp_path: Path) -> None:
-    """Without statistics lerobot does not normalise, and neither do we; it is worth a warning."""
-    directory = save_policy(tmp_path)
-    _weights(lambda w: [w.pop(k) for k in list(w) if k.startswith(STATE)], "before")(directory)
-    with pytest.warns(UserWarning, match=r"no statistics of observation\.state"):
-        load_checkpoint_policy(directory)
-
-
 @pytest.mark.parametrize(
     "kind", ["act", "groot", "xvla", "evo1", "vla_jepa", "wall_x", "eo1", "molmoact2", "pi0_fast", "something_new"]
 )

@@ -61,6 +61,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "inspect a zip": ("inspect", "A.zip", "--json"),
     "inspect --plot": ("inspect", "A", "--plot", "OUT/plan.png"),
     "verify": ("verify", "V", "--json"),
+    "predict": ("predict", "A", "--state", "0.5,-1", "--plot", "OUT/chunk.png"),
     "bench": ("bench", "A", "--calls", "1"),
     "bench --control-hz": ("bench", "A", "--control-hz", "1", "--margin-ticks", "0", "--calls", "1"),
     "inspect -o": ("inspect", "A", "-o", "OUT/page.html"),

@@ -291,7 +291,6 @@ def command(toy_compiled: Path) -> list[str]:
             "expected a certificate and its",
         ),
         (["--tls", "certificate.pem", "key.pem", "ca.pem"], None, "its key if that is in another file; found 3"),
-        (["--max-clients", "129"], None, "--max-clients is at most 128 with --control-hz; found 129"),
     ],
 )
 def test_the_command_refuses_before_anything_is_loaded(

@@ -48,14 +48,24 @@ def test_a_true_recording_with_a_few_outliers_passes() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (true_recording()[..., ::-1], r"'obs': 199 of 400 recorded numbers \(50%\) .*columns 3 \(100%\), 2 \(99%\)"),
         (np.concatenate([true_recording()[:46], 2 * true_recording()[46:]]), "of 400 recorded numbers"),
+        (true_recording() + np.array([0, 0, 0, 1]), r"'obs': 100 of 400 recorded numbers \(25%\) .*columns 3 \(100%\)"),
     ],
 )
 def test_some_outside_are_a_warning_with_counts(values: np.ndarray, message: str) -> None:
     with pytest.raises(UserWarning, match=message):
         check(values)
     check(values, ranged=False)  # as many are outside of one deviation of what is normalised by that
+
+
+def test_permuted_columns_are_refused_and_named() -> None:
+    like = policies.spec()
+    normalizer = Affine(np.array([2, 2], np.float32), np.array([-1, -21], np.float32))  # 0..1 and 10..11
+    spec = PolicySpec((8, 2), {"obs": ObservationSpec((1, 2), normalizer)}, like.sampler, ChunkSpec(2, 0, 4))
+    values = np.random.default_rng(0).uniform([10, 0], [11, 1], (20, 1, 2)).astype(np.float32)
+    with pytest.raises(TrajectoryError, match=r"column 0 is as 1 was, column 1 is as 0 was.*look permuted"):
+        check_ranges([Episode("calls[0]", {"obs": values})], spec)
+    check_ranges([Episode("calls[0]", {"obs": values[..., ::-1]})], spec)
 
 
 @pytest.mark.parametrize(

@@ -21,10 +21,8 @@ def run(*arguments: object) -> Result:
 
 
 @pytest.mark.slow
-def test_a_sound_artifact_gives_status_0_and_a_picture(quick: Path, recording: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "errors.png"
-    arguments = ("--trajectories", recording, "--calls", 5, "--plot", picture, "--json")
-    result = run("verify", quick, *arguments)
+def test_a_sound_artifact_gives_status_0(quick: Path, recording: Path) -> None:
+    result = run("verify", quick, "--trajectories", recording, "--calls", 5, "--json")
     assert result.exit_code == 0, result.stdout
     found = json.loads(result.stdout)
     assert found["passed"] is True
@@ -32,34 +30,28 @@ def test_a_sound_artifact_gives_status_0_and_a_picture(quick: Path, recording: P
     assert found["identity"] == read_manifest(quick).identity
     assert {rung["status"] for rung in found["rungs"]} == {"passed"}
     assert found["machine"]["cores"] >= 1
-    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
-def test_a_broken_one_gives_status_1_and_says_where_and_what_to_do(artifact: Path, tmp_path: Path) -> None:
+def test_a_broken_one_gives_status_1_and_says_where_and_what_to_do(artifact: Path) -> None:
     with edited(artifact, "plans") as arrays:
         arrays["schedule"] = policy.shifted(arrays["schedule"])
     with edited(artifact, "weights") as arrays:
         arrays["narrow.1.weight"] *= 1.1
-    result = run("verify", artifact, "--plot", tmp_path / "errors.svg")
+    result = run("verify", artifact)
     assert result.exit_code == 1
     assert "FAILED at block (step 0, block 3)" in result.stdout
     assert "Convert the checkpoint again" in result.stdout
     assert "What fails above it may only follow from it: evaluation, dense call" in result.stdout
     assert "warning: sparsity error was skipped: " in result.stderr
-    drawn = (tmp_path / "errors.svg").read_text()
-    assert drawn.startswith("<?xml")
 
 
-def test_a_damaged_one_gives_status_1_drawn_or_not(artifact: Path, tmp_path: Path) -> None:
+def test_a_damaged_one_gives_status_1(artifact: Path) -> None:
     (artifact / "stem.onnx").unlink()
     result = run("verify", artifact, "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["first_failure"] == "integrity"
-    result = run("verify", artifact, "--plot", tmp_path / "errors.png")
-    assert result.exit_code == 1
-    assert "FAILED at integrity" in result.stdout
-    assert "there is nothing to draw" in result.stderr
+    assert "FAILED at integrity" in run("verify", artifact).stdout
 
 
 @pytest.mark.parametrize(("name", "reason"), [("nowhere", "does not exist"), (".", "not an artifact")])

@@ -166,6 +166,6 @@ def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) 
         if one.manifest.plans and (held_out is None or tuple(held_out) != split.validation):
             found.append(
                 f"{name}: its calibration held out the episodes {held_out}, and this comparison"
-                f" {list(split.validation)}: its plans may have been learned from them. Give the same files and --seed."
+                f" {list(split.validation)}: its plans may have been learned from them. Give the same files and seed."
             )
     return found

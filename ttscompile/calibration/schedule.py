@@ -57,7 +57,7 @@ class Schedule:
                 " this strategy a target_sparsity, a target_flops or a latency_ms."
             )
         if self._request.correct and self._strategy.fits_correction:
-            return f"strategy {self._strategy.name!r} fits a correction of its own. Leave --correct out."
+            return f"strategy {self._strategy.name!r} fits a correction of its own. Leave correct out."
         try:
             if goal.kind not in (LATENCY, ERROR):
                 cells = cells_of(goal, view.manifest, self._may_prune(view))

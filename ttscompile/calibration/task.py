@@ -107,7 +107,7 @@ class Task:
         if self.calls.window == 1 and (found.schedule == Source.ROLLOUT.value).any():
             raise CalibrationError(
                 "a correction is fitted to a schedule on calls of their own; this one reads residuals of earlier calls."
-                " Leave --correct out, or take another strategy."
+                " Leave correct out, or take another strategy."
             )
         correction = self.whole.correction_of(found.schedule)
         notes = {**found.notes, "corrected": correction is not None, **_of_correction(correction)}

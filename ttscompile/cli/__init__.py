@@ -16,6 +16,7 @@ from ttscompile.cli.convert import convert
 from ttscompile.cli.doctor import doctor
 from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
+from ttscompile.cli.predict import predict
 from ttscompile.cli.push import push
 from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
@@ -35,12 +36,13 @@ def main() -> None:
 
 # In the order in which they are used; a line each, short enough for a terminal of 80 columns.
 for _command, _what in (
-    (doctor, "What stands in the way on this machine."),
+    (doctor, "What stands in the way: machine, checkpoint, recordings."),
     (build, "From a checkpoint to a fast policy, in one command."),
     (convert, "Compile a checkpoint into an artifact."),
     (calibrate, "Learn from recorded episodes what an artifact may leave out."),
     (inspect, "What is in an artifact: tables, a picture, a page."),
     (verify, "Does it do what the original did, and do its plans engage?"),
+    (predict, "What does it answer to one observation?"),
     (bench, "How fast are calls, do they keep up, how far are they off?"),
     (push, "Upload an artifact with a model card to the hub."),
     (serve, "Drive a robot, or answer many, over a WebSocket."),

@@ -19,17 +19,17 @@ from ttscompile.cli.options import (
     LOOP_OPTIONS,
     artifact_argument,
     count_option,
+    encoders_option,
     json_option,
     loop_options,
     names_option,
     number_option,
-    seed_option,
     several_threads_option,
 )
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import Section, SectionedCommand
-from ttscompile.cli.types import FOLDER, PATH, PICTURE, RATE, SECONDS, TEXT
+from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
@@ -45,7 +45,7 @@ COMPARED = 8
 
 SECTIONS = (
     Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
-    Section("In a control loop", ("control_hz", *LOOP_OPTIONS, "jitter"), ("control_hz",)),
+    Section("In a control loop", ("control_hz", *LOOP_OPTIONS), ("control_hz",)),
     Section("Action error, on recorded episodes", ("trajectories", "sources", "picture"), ("trajectories",)),
 )
 
@@ -82,7 +82,6 @@ SECTIONS = (
     " is done with the first."
 )
 @count_option("--calls", "Count so many calls of each plan.", default=20, most=MOST_CALLS)
-@seed_option("Seed of observations and noise, and of which episodes are held out: take that of the calibration.")
 @json_option
 @click.option(
     "--checkpoint",
@@ -90,22 +89,13 @@ SECTIONS = (
     help="Time the checkpoint that DIRECTORY was made from, in PyTorch: in the loop that it was saved with, and in the"
     " artifact's if that is another.",
 )
-@click.option(
-    "--encoders",
-    type=FOLDER,
-    help="Folder that 'ttscompile convert' was given by the same name, if it was.",
-)
+@encoders_option
 @number_option(
     "--control-hz",
     RATE,
     "Say which plans keep up with a control loop of this rate in Hz. The exit status is 1 if none does.",
 )
 @loop_options
-@number_option(
-    "--jitter",
-    SECONDS,
-    "Also run a loop of 200 Hz for so many seconds, alone and then beside the default plan, and say how late it wakes.",
-)
 @trajectories_options(
     required=False, what="Hold the actions of the plans against those of the dense policy on these recorded episodes."
 )
@@ -121,12 +111,10 @@ def bench(
     device: str | None,
     threads: tuple[int, ...],
     calls: int,
-    seed: int,
     as_json: bool,
     checkpoint: Path | None,
     encoders: Path | None,
     control_hz: float | None,
-    jitter: float | None,
     trajectories: tuple[Path, ...],
     sources: Sources,
     picture: Path | None,
@@ -145,7 +133,7 @@ def bench(
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
     ways = [_way(one, runtime, device, number) for one in runtime for number in threads]
-    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings), jitter)
+    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings))
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
         if loop is not None:
@@ -156,13 +144,19 @@ def bench(
     if default == DENSE:
         say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
     with console.status("timing") as status:
-        measured = measure(entered, calls, seed, lambda done, of: status.update(f"timing: round {done} of {of}"))
+        measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
         status.update("judging")
-        driven = plans if plans and default not in plans else (default,)
-        judged = None if loop is None else loop.judge(entered, measured, driven)
+        judged = None if loop is None else loop.judge(entered, measured)
         error = _precision_error(artifact, plans, ways[0])
     how = {"runtime": ways[0].runtime, "device": ways[0].device, "threads": ways[0].threads}
-    asked: dict[str, Any] = {"observation": sources, "plans": plans, "calls": calls, "seed": seed, **how}
+    record = artifact.manifest.calibration or {}  # of the same seed: the same episodes are held out
+    asked: dict[str, Any] = {
+        "observation": sources,
+        "plans": plans,
+        "calls": calls,
+        "seed": record.get("seed", 0),
+        **how,
+    }
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
     report = BenchReport(measured, default, calls, by_threads, error, judged, compared)

@@ -11,8 +11,8 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.frontier import print_frontier
-from ttscompile.cli.options import json_option, lerobot_options, number_option, threads_option
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results
+from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import LEROBOT, SectionedCommand
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
@@ -32,12 +32,7 @@ from ttscompile.report.summary import document
     "Choose, of the plans that keep up with a control loop of this rate in Hz, the one that is nearest to the original."
     " Without a deadline the fastest is chosen.",
 )
-@number_option(
-    "--policy-hz",
-    RATE,
-    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
-    " --control-hz.",
-)
+@policy_hz_option
 @number_option(
     "--latency-ms",
     MILLISECONDS,
@@ -81,6 +76,8 @@ def build(
 
         def explain(stage: str, notes: tuple[str, ...]) -> None:
             status.update(f"compiling: after {stage}")
+            if stage == "examine":
+                say(console, *(f"warning: {note}" for note in notes))
             if stage == "write":
                 status.stop()  # the search has a bar of its own
 

@@ -14,12 +14,10 @@ from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
 from ttscompile.cli.ending import Status
 from ttscompile.cli.options import (
     artifact_argument,
-    count_option,
     json_option,
     names_option,
     number_option,
     ray_option,
-    seed_option,
     threads_option,
 )
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
@@ -41,11 +39,6 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     "--target-sparsity",
     SHARE,
     "Reuse this share of the cells. Without any budget it is 0.95, or what leaves five steps to compute.",
-)
-@number_option(
-    "--target-flops",
-    SHARE,
-    "Save this share of the FLOPs of a dense call, prologue and pruner counted, in place of --target-sparsity.",
 )
 @number_option(
     "--latency-ms",
@@ -74,14 +67,6 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     show_default=True,
     help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
-@click.option(
-    "--correct",
-    is_flag=True,
-    help="Fit a correction of the sampler to the schedule of a strategy that fits none: fair comparisons with tts.",
-)
-@count_option("--rank", "Rank of the low-rank update to each weight matrix, for weights.", default=16)
-@count_option("--updates", "Train weights with so many updates.", default=600)
-@seed_option("Seed of the split, the noise and the training.")
 @click.option(
     "--max-minutes",
     cls=NumberOption,

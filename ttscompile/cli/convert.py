@@ -15,32 +15,20 @@ from ttscompile.cli.options import count_option, json_option, lerobot_options
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.sections import LEROBOT, Section, SectionedCommand
 from ttscompile.cli.summary import print_summary
-from ttscompile.cli.types import ANY_TEXT, NEW_FILE, PATH, PATH_OR_HUB
+from ttscompile.cli.types import NEW_FILE, PATH, PATH_OR_HUB
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, SPACINGS
+from ttscompile.frontends.families import FAMILIES, SAMPLERS
 from ttscompile.report.facts import precision as told_precision
 from ttscompile.report.summary import document
 
-SECTIONS = (
-    Section("Another denoising loop", ("sampler", "steps", "spacing")),
-    Section("Precision", ("precision", "keep_fp32")),
-    LEROBOT,
-)
+SECTIONS = (Section("Another denoising loop", ("sampler", "steps")), LEROBOT)
 
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)
 @click.argument("checkpoint", type=PATH_OR_HUB)
 @click.option("-o", "--output", "directory", required=True, type=PATH, help="Write the artifact into this folder.")
-@click.option(
-    "--format",
-    type=click.Choice(FORMATS),
-    default="auto",
-    show_default=True,
-    help="Read CHECKPOINT as this format; auto finds out which it is. "
-    + " ".join(f"{each.name}: {each.reads}." for each in FAMILIES),
-)
 @click.option(
     "--sampler",
     type=click.Choice(SAMPLERS),
@@ -52,14 +40,6 @@ SECTIONS = (
     "Take so many denoising or integration steps, in place of the checkpoint's own. rk4 evaluates the network four"
     " times a step: K is four times this.",
     default=None,
-)
-@click.option(
-    "--spacing",
-    type=click.Choice(SPACINGS),
-    help="Rule for the timesteps that fewer steps visit, in place of the checkpoint's own. leading starts below the"
-    " last one, where pure noise is not what the network expects; trailing and linspace start at it, which needs a"
-    " bound on the sample. Without this option dpmsolver++ in place of another sampler takes trailing, and ddim"
-    " leading.",
 )
 @lerobot_options
 @count_option(
@@ -77,13 +57,6 @@ SECTIONS = (
     " 'ttscompile calibrate --learn precision' measures what it does, and leaves out the parts where that is much.",
 )
 @click.option(
-    "--keep-fp32",
-    type=ANY_TEXT,
-    multiple=True,
-    help="Leave this part in fp32 beside int8: blocks; prologue, or a piece of it (frame_00, condition, step). May be"
-    " repeated.",
-)
-@click.option(
     "--single-file",
     type=NEW_FILE,
     help="Write one ONNX file of the whole call too, for programs that have onnxruntime and no ttscompile.",
@@ -95,13 +68,12 @@ def convert(
     directory: Path,
     prediction_horizon: int | None,
     precision: str,
-    keep_fp32: tuple[str, ...],
     single_file: Path | None,
     explain: bool,
     as_json: bool,
-    **of_checkpoint: Any,  # the format and the options of families: ttscompile.convert takes them by the same names
+    **of_checkpoint: Any,  # the options of families: ttscompile.convert takes them by the same names
 ) -> None:
-    """Compile CHECKPOINT, a trained policy of one of the formats below. Nothing in it is executed.
+    """Compile CHECKPOINT, a trained policy of Diffusion Policy or LeRobot. Nothing in it is executed.
 
     It is a path, or hf://ORGANISATION/NAME[@REVISION][/PATH] on the Hugging Face hub.
 
@@ -118,16 +90,17 @@ def convert(
         def on_stage(name: str, notes: tuple[str, ...]) -> None:
             stages.append({"stage": name, "notes": list(notes)})
             status.update(f"compiling: after {name}")
-            if explain:
-                for i, note in enumerate(notes or ("nothing to do",)):
-                    say(console, f"{name if i == 0 else '':<22}{note}")
+            if name == "examine":
+                say(console, *(f"warning: {note}" for note in notes))
+            elif explain:
+                first, *more = notes or ("nothing to do",)
+                say(console, f"{name:<22}{first}", *(f"{'':<22}{note}" for note in more))
 
         ttscompile.convert(
             checkpoint,
             directory,
             prediction_horizon=prediction_horizon,
             precision=precision,
-            keep_fp32=keep_fp32,
             single_file=single_file,
             explain=on_stage,
             **of_checkpoint,

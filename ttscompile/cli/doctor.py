@@ -1,31 +1,43 @@
-"""``ttscompile doctor``: what of this machine and installation stands in the way of running artifacts."""
+"""``ttscompile doctor``: what stands in the way of a machine, an artifact, a checkpoint and recordings."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from ttscompile.cli.options import json_option
-from ttscompile.cli.output import identity_of, print_json
-from ttscompile.cli.types import PathName
+from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json
+from ttscompile.cli.recordings import FilesCommand, require_recordings, trajectories_options
+from ttscompile.cli.types import PathOrHub
 from ttscompile.doctor import diagnosis as examination
 
 
-@click.command()
-@click.argument("directory", required=False, type=PathName(exists=True))
+@click.command(cls=FilesCommand)
+@click.argument("target", required=False, type=PathOrHub(exists=True))
+@trajectories_options(required=False, what="See whether these recorded episodes fit TARGET.")
 @json_option
 @click.pass_context
-def doctor(context: click.Context, directory: Path | None, as_json: bool) -> None:
-    """Look at Python, packages, processor, cores, memory and clock; with DIRECTORY, also try that artifact here.
+def doctor(
+    context: click.Context, /, target: Path | str | None, trajectories: tuple[Path, ...], as_json: bool, **how: Any
+) -> None:
+    """Look at Python, packages, processor, cores, memory and clock; with TARGET, also at that.
 
-    Every warning and problem comes with its remedy. The exit status is 1 if something stops artifacts from running.
-    Where the command line itself does not start, python -m ttscompile.doctor says why.
+    TARGET is an artifact, which is tried here; or a checkpoint as 'ttscompile convert' takes it, which is searched for
+    what goes wrong on robots without an error: cameras, normalisers, tokenizer, chunk.
+
+    Every warning and problem comes with its remedy. The exit status is 1 if there is a problem. Where the command line
+    itself does not start, python -m ttscompile.doctor says why.
     """
-    found = examination.examine(directory)
+    if trajectories and target is None:
+        raise click.UsageError("--trajectories is for TARGET: give a checkpoint or an artifact too.")
+    require_recordings(trajectories)
+    with only_results_on_stdout():
+        found = examination.examine(target, recordings=trajectories, **how)
     if as_json:
         opened = any(finding.what == "identity" for finding in found)
-        of = {"identity": identity_of(directory)} if directory is not None and opened else {}
+        of = {"identity": identity_of(target)} if isinstance(target, Path) and opened else {}
         print_json(of | examination.document(found))
     else:
         click.echo(examination.text(found))

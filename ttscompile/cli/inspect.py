@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.cli.options import artifact_argument, json_option, runtime_options, threads_option
+from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
 from ttscompile.cli.page import checked, require_page, write_page
 from ttscompile.cli.recordings import Sources, trajectories_options
@@ -30,7 +30,7 @@ SCHEDULE = "schedule"
 SECTIONS = (
     Section("What a page or a picture shows of an episode", ("trajectories", "sources"), ("output", "picture")),
     Section("What a picture shows", ("name",), ("picture",)),
-    Section("What a page shows", ("verifies", "threads", "runtime", "device"), ("output",)),
+    Section("What a page shows", ("verifies",), ("output",)),
 )
 
 
@@ -49,8 +49,6 @@ SECTIONS = (
     "--plan", "name", type=TEXT, help="Draw this plan. Without this option it is the default plan of the artifact."
 )
 @click.option("--verify", "verifies", is_flag=True, help="Run the checks of 'ttscompile verify', which take minutes.")
-@threads_option("Threads that the timed calls compute with.")
-@runtime_options
 @json_option
 @click.pass_context
 def inspect(
@@ -62,9 +60,6 @@ def inspect(
     sources: Sources,
     name: str | None,
     verifies: bool,
-    threads: int,
-    runtime: str,
-    device: str | None,
     as_json: bool,
 ) -> None:
     """Show what the artifact DIRECTORY holds: the policy, its blocks, what they cost, its plans and calibration.
@@ -80,11 +75,9 @@ def inspect(
     if output is not None:
         with only_results_on_stdout(), console.status("loading") as status:
             if verifies:
-                passed, section = checked(
-                    directory, artifact.manifest.identity, trajectories, sources, threads, status.update
-                )
-            policy = open_policy(artifact, runtime, threads, seed=0, device=device)
-            told = write_page(output, artifact, policy, Given(episode, section, threads), status.update)
+                passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
+            policy = open_policy(artifact, seed=0)
+            told = write_page(output, artifact, policy, Given(episode, section, 1), status.update)
         say(console, told)
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)

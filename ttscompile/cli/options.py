@@ -62,16 +62,18 @@ def together(*options: Decorator) -> Decorator:
     return with_options
 
 
+encoders_option = click.option(
+    "--encoders",
+    type=FOLDER,
+    help="Find config.json of CLIP or of the language model (and tokenizer.json) in this folder, if they are not in or"
+    " beside the checkpoint. Nothing is downloaded.",
+)
+
 lerobot_options = together(
     click.option(
         "--task", type=ANY_TEXT, help="Compile this instruction in; without it, its tokens are an observation."
     ),
-    click.option(
-        "--encoders",
-        type=FOLDER,
-        help="Find config.json of CLIP or of the language model (and tokenizer.json, for --task) in this folder, if"
-        " they are not in or beside CHECKPOINT. Nothing is downloaded.",
-    ),
+    encoders_option,
     click.option(
         "--without-camera",
         "without_cameras",
@@ -99,11 +101,6 @@ runtime_options = together(
 """Of commands that run an artifact in a runtime of choice."""
 
 
-def seed_option(help: str) -> Decorator:
-    """``--seed``."""
-    return count_option("--seed", help, default=0, least=0, most=MOST_SEED)
-
-
 ray_option = click.option(
     "--ray",
     type=ANY_TEXT,
@@ -124,20 +121,15 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
     return click.option(name, type=ANY_TEXT, default=default, show_default=True, callback=parsed, help=help)
 
 
+policy_hz_option = number_option(
+    "--policy-hz",
+    RATE,
+    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
+    " --control-hz.",
+)
 loop_options = together(
-    number_option(
-        "--policy-hz",
-        RATE,
-        "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
-        " --control-hz.",
-    ),
-    count_option(
-        "--horizon",
-        "Execute so many actions from one call to the next. Without this option it is as many as the policy executes of"
-        " a chunk.",
-        default=None,
-    ),
+    policy_hz_option,
     count_option("--margin-ticks", "Have each chunk come so many control ticks before it is needed.", least=0),
 )
-LOOP_OPTIONS = ("policy_hz", "horizon", "margin_ticks")
+LOOP_OPTIONS = ("policy_hz", "margin_ticks")
 """Of commands that run an artifact in a control loop, and their parameters, which ``ExecutorSettings`` has too."""

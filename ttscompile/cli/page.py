@@ -60,7 +60,6 @@ def checked(
     identity: str,
     trajectories: Sequence[Path],
     sources: Sources,
-    threads: int,
     progress: Callable[[str], None],
 ) -> tuple[bool, Section]:
     """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
@@ -70,11 +69,7 @@ def checked(
     """
     try:
         found = ttscompile.verify(
-            directory,
-            trajectories,
-            sources=sources,
-            threads=threads,
-            progress=lambda what: progress(f"verifying: {what}"),
+            directory, trajectories, sources=sources, progress=lambda it: progress(f"verifying: {it}")
         )
         if found.identity not in (None, identity):
             raise ArtifactChangedError(f"{directory}: was replaced meanwhile. Inspect it again.")

@@ -26,19 +26,15 @@ from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.server_options import FLEET_CLIENTS, ROBOT_CLIENTS, SERVER_OPTIONS, ServerOptions, server_options
 from ttscompile.cli.types import ANY_TEXT, RATE, TEXT, Number
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.executor.settings import INTERPOLATIONS, SEAMS
 from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, Plans, ray_copies
 from ttscompile.runtimes.server.executor_server import ExecutorServer
 from ttscompile.runtimes.server.limits import ServerLimits
-
-MOST_ROBOT_CLIENTS = 128
-"""A socket each, and threads that wait for actions; a process may have 1024 files open where nothing else is said."""
 
 BATCHES_WAITING = 16
 """Requests of a fleet that may be under way, in full batches of every copy; further ones are refused at once."""
 
 SECTIONS = (
-    Section("One robot", (*LOOP_OPTIONS, "max_hold", "seam", "interpolation", "runtime", "device"), ("control_hz",)),
+    Section("One robot", (*LOOP_OPTIONS, "max_hold", "runtime", "device"), ("control_hz",)),
     Section("Many robots", ("ray", "wait_ms"), ("copies",)),
     Section("Who may connect", SERVER_OPTIONS),
 )
@@ -63,20 +59,6 @@ SECTIONS = (
 @loop_options
 @count_option(
     "--max-hold", "Repeat the last action for so many control ticks when there is no other.", default=3, least=0
-)
-@click.option(
-    "--seam",
-    type=click.Choice(SEAMS),
-    default="replace",
-    show_default=True,
-    help="Way in which a chunk of actions joins the one before it.",
-)
-@click.option(
-    "--interpolation",
-    type=click.Choice(INTERPOLATIONS),
-    default="hold",
-    show_default=True,
-    help="Way from one action to the next, where the control loop is faster than the policy.",
 )
 @runtime_options
 @click.option(
@@ -129,16 +111,13 @@ def _serve_robot(
     directory: Path, server: ServerOptions, control_hz: float, settings: ExecutorSettings, how: dict[str, Any]
 ) -> None:
     """In a control loop, with a policy that is loaded so; statistics follow at the end."""
-    clients = server.max_clients or ROBOT_CLIENTS
-    if clients > MOST_ROBOT_CLIENTS:
-        raise click.UsageError(f"--max-clients is at most {MOST_ROBOT_CLIENTS} with --control-hz; found {clients}.")
     console = progress()
     with console.status("loading and measuring"):
         policy = ttscompile.load(directory, **how)
         executor = AsyncExecutor(policy, control_hz, settings)
     server.warn(console)
     with executor:
-        limits = ServerLimits.of(policy.info.observation, clients)
+        limits = ServerLimits.of(policy.info.observation, ROBOT_CLIENTS)
         asyncio.run(server.serve(ExecutorServer(executor, limits, server.lock), policy.info.identity))
     click.echo(json.dumps({"statistics": executor.statistics().to_json()}, allow_nan=False))
 
@@ -150,7 +129,7 @@ def _serve_fleet(
     console, artifact = progress(), load_artifact(directory)
     Plans.of(artifact, plan)  # before copies are started, which takes a while
     output, identity = sys.stdout, artifact.manifest.identity
-    limits = ServerLimits.of(artifact.manifest.spec.observations, server.max_clients or FLEET_CLIENTS)
+    limits = ServerLimits.of(artifact.manifest.spec.observations, FLEET_CLIENTS)
     with (
         only_results_on_stdout(),  # Ray writes what its processes say there
         console.status("starting copies") as status,

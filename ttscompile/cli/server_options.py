@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ROBOT_CLIENTS, FLEET_CLIENTS = 8, 256
-"""That may be connected where nothing is said."""
+"""That may be connected."""
 
 TOKEN_VARIABLE = "TTSCOMPILE_TOKEN"  # noqa: S105
 """Of the environment; the example client reads it too."""
 
 
-SERVER_OPTIONS = ("host", "port", "token_file", "tls", "insecure", "max_clients")
+SERVER_OPTIONS = ("host", "port", "token_file", "tls", "insecure")
 """Parameters of ``server_options``."""
 
 
@@ -75,15 +75,8 @@ server_options = together(
         help="Listen beyond this machine without a token or a certificate: whoever reaches the port can drive the"
         " robot.",
     ),
-    count_option(
-        "--max-clients",
-        f"Let so many clients connect. Without this option it is {ROBOT_CLIENTS} with --control-hz, and {FLEET_CLIENTS}"
-        " with --copies.",
-        default=None,
-        most=4096,
-    ),
 )
-"""Where to listen, the lock, and how many may come."""
+"""Where to listen, and the lock."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +85,11 @@ class ServerOptions:
 
     Attributes:
         port: 0 for any that is free.
-        max_clients: that may be connected; None for what is usual.
     """
 
     host: str
     port: int
     lock: Lock
-    max_clients: int | None
 
     @classmethod
     def taken(cls, options: dict[str, Any], console: Console) -> ServerOptions:
@@ -118,7 +109,7 @@ class ServerOptions:
         lock = Lock(token_hash, tls_context(*papers) if papers else None, options.pop("insecure"))
         if host != "localhost":  # that name's addresses are looked at when it listens
             lock.require(host)
-        return cls(host, options.pop("port"), lock, options.pop("max_clients"))
+        return cls(host, options.pop("port"), lock)
 
     def warn(self, console: Console) -> None:
         """Say it where whoever comes is let in."""

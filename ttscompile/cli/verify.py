@@ -12,9 +12,7 @@ from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.options import artifact_argument, count_option, json_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
-from ttscompile.cli.types import PICTURE
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.plots.maps import plot_errors
 from ttscompile.report.verified import figure
 
 
@@ -23,12 +21,6 @@ from ttscompile.report.verified import figure
 @trajectories_options(required=False, what="Check what the plans do on these recorded episodes, too.")
 @count_option("--calls", "Check so many recorded calls at least; whole episodes are taken.", default=24)
 @threads_option("Threads that onnxruntime computes with.")
-@click.option(
-    "--plot",
-    "picture",
-    type=PICTURE,
-    help="Draw the error of every block at every step into this file (.png, .svg or .pdf).",
-)
 @json_option
 @click.pass_context
 def verify(
@@ -38,7 +30,6 @@ def verify(
     sources: Sources,
     calls: int,
     threads: int,
-    picture: Path | None,
     as_json: bool,
 ) -> None:
     """Check the artifact DIRECTORY against the answers of the original network that it holds.
@@ -62,22 +53,8 @@ def verify(
         print_json({"machine": fingerprint(), "threads": threads, **found.to_json()})
     else:
         _print(found, results())
-    if picture is not None:
-        say(console, _draw(found, picture))
     if not found.passed:
         context.exit(1)
-
-
-def _draw(found: ttscompile.Verification, picture: Path) -> str:
-    """Draw, and say so."""
-    errors = found.map
-    if errors is None:
-        return f"warning: {picture}: there is nothing to draw: the residuals were not looked at."
-    title = f"{Path(found.path).resolve().name}, identity {abbreviated(found.identity or '')}"
-    plot_errors(
-        errors.errors, errors.steps.tolist(), errors.kinds, errors.tolerance, picture, title, errors.cells, errors.plan
-    )
-    return f"wrote {picture}"
 
 
 def _print(found: ttscompile.Verification, output: Console) -> None:

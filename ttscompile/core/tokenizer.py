@@ -49,6 +49,11 @@ class Tokenizer:
         made.no_truncation()
         return made
 
+    @property
+    def size(self) -> int:
+        """How many tokens there are, added ones counted."""
+        return int(self._tokenizer.get_vocab_size())
+
     def __call__(self, text: str) -> list[int]:
         """The tokens of a text, all of them, with those that the tokenizer adds."""
         try:

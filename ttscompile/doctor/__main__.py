@@ -1,4 +1,4 @@
-"""``python -m ttscompile.doctor [DIR]``."""
+"""``python -m ttscompile.doctor [TARGET]``."""
 
 from __future__ import annotations
 

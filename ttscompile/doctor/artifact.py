@@ -6,8 +6,8 @@ import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.finding import Finding, Level
 from ..errors import NonFiniteActionsError, TtscompileError
-from .finding import Finding, Level
 from .machine import available_bytes
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """What of this machine and installation stands in the way of running artifacts, and what to do about it.
 
-Needs the standard library alone, so that it can say that numpy is missing: ``python -m ttscompile.doctor [DIR]`` works
-where the command line does not. Nothing is sent anywhere, and nothing is changed.
+Needs the standard library alone, so that it can say that numpy is missing: ``python -m ttscompile.doctor [TARGET]``
+works where the command line does not. Nothing is sent anywhere, and nothing is changed.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from .artifact import artifact_findings
-from .finding import Finding, Level
+from ..core.finding import Finding, Level
+from .checkpoint import target_findings
 from .machine import machine_findings
 from .packages import package_findings
 
 MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PROBLEM"}
 
 
-def examine(directory: Path | None = None) -> list[Finding]:
-    """Everything that is found, in the order of the report.
+def examine(target: Path | str | None = None, **more: Any) -> list[Finding]:
+    """Everything that is found, in the order of the report; see ``target_findings`` for the arguments.
 
     Returns:
         Findings; none raises. What stops an artifact from running has the level ``PROBLEM``.
     """
-    of_artifact = [] if directory is None else artifact_findings(directory)
-    return [*package_findings(), *machine_findings(), *of_artifact]
+    of_target = [] if target is None else target_findings(target, **more)
+    return [*package_findings(), *machine_findings(), *of_target]
 
 
 def problems(found: Sequence[Finding]) -> int:
-    """How many findings stop an artifact from running."""
+    """How many findings stop an artifact from running, or from meaning anything."""
     return sum(finding.level is Level.PROBLEM for finding in found)
 
 
@@ -64,13 +64,13 @@ def text(found: Sequence[Finding]) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """``python -m ttscompile.doctor [DIR] [--json]``; returns the exit status, see ``ttscompile doctor``."""
+    """``python -m ttscompile.doctor [TARGET] [--json]``; returns the exit status, see ``ttscompile doctor``."""
     paths = [Path(argument) for argument in arguments if argument != "--json"]
     if len(paths) > 1 or any(argument.startswith("-") for argument in arguments if argument != "--json"):
-        sys.stderr.write("usage: python -m ttscompile.doctor [DIR] [--json]\n")
+        sys.stderr.write("usage: python -m ttscompile.doctor [TARGET] [--json]\n")
         return 2
     if paths and not paths[0].exists():
-        sys.stderr.write(f"error: {paths[0]}: does not exist. Give the directory that 'ttscompile convert' wrote.\n")
+        sys.stderr.write(f"error: {paths[0]}: does not exist. Give what 'ttscompile convert' takes or wrote.\n")
         return 2
     found = examine(*paths)
     sys.stdout.write((json.dumps(document(found), indent=2) if "--json" in arguments else text(found)) + "\n")

@@ -10,8 +10,8 @@ from itertools import pairwise
 from math import floor
 from pathlib import Path
 
+from ..core.finding import Finding, Level
 from ..measure.machine import X86, cpuinfo
-from .finding import Finding, Level
 
 _X86 = {
     "avx2": "AVX2",
@@ -130,7 +130,7 @@ def _clock(root: Path) -> list[Finding]:
         latenesses.append(1e3 * (time.monotonic() - started) - 1)
     late = statistics.median(latenesses)
     told = f"{late:.2f} ms late in the median, of 20 sleeps of 1 ms"
-    remedy = "A control loop will jitter: look with ttscompile bench DIR --control-hz HZ --jitter 10."
+    remedy = "A control loop will jitter: look at late and held actions in the statistics of the executor."
     return [*found, Finding.judged(part, "sleep", told, late > _LATE_MS, remedy)]
 
 

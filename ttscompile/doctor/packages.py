@@ -10,8 +10,8 @@ import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import NamedTuple
 
+from ..core.finding import Finding, Level
 from ..measure.versions import release
-from .finding import Finding, Level
 
 PYTHON = (3, 11)
 PROJECT = "ttscompile"

@@ -5,7 +5,6 @@ Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +21,16 @@ from .settings import Settings, read_json
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
-_RENAME, _TOKENIZE, _NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
+_RENAME, _TOKENIZE, NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
 PROMPT = "pi05_prepare_state_tokenizer_processor_step"
 _RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, _NORMALIZE, *_NEW_LINE, PROMPT, _RELATIVE}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, PROMPT, _RELATIVE}),
     POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE}),
 }
-_ONCE = frozenset({_RENAME, _TOKENIZE, _NORMALIZE, _UNNORMALIZE})
+_ONCE = frozenset({_RENAME, _TOKENIZE, NORMALIZE, _UNNORMALIZE})
 
 
 Features = Mapping[str, tuple[str, tuple[int, ...]]]
@@ -146,7 +145,7 @@ def read_processors(directory: Path, features: Features) -> Processors:
     before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
     return Processors(
         renamed=_renamed(directory, before, features),
-        normalizers=_statistics(directory, before, _NORMALIZE, features),
+        normalizers=_statistics(directory, before, NORMALIZE, features),
         action=_statistics(directory, after, _UNNORMALIZE, features).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
@@ -187,7 +186,7 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     if twice:
         found = f"found {order.count(twice[0])} of {twice[0]}"
         raise CheckpointError(f"{path}: expected at most one step of a kind; {found}. Combine them into one.")
-    if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (_NORMALIZE, _TOKENIZE)):
+    if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (NORMALIZE, _TOKENIZE)):
         raise CheckpointError(
             f"{path}: expected {_RENAME} before the other steps, as lerobot saves them; found {', '.join(order)}."
             " Save the pipeline again in that order."
@@ -212,7 +211,7 @@ def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -
 def _statistics(
     directory: Path, steps: list[dict[str, Any]], registered: str, features: Features
 ) -> dict[str, Statistics]:
-    """Statistics of each feature that a normalising step changes."""
+    """Statistics of each feature that a normalising step changes; without any lerobot changes nothing."""
     step = next((step for step in steps if step["registry_name"] == registered), None)
     if step is None:
         raise CheckpointError(f"{directory}: expected one step {registered}; found none.")
@@ -240,8 +239,6 @@ def _statistics(
             raise settings.refusal("norm_map", f"one of IDENTITY, {', '.join(STATISTICS)} for {kind}")
         names = [f"{key}.{name}" for name in STATISTICS[mode]]
         if not any(name.rpartition(".")[0] == key for name in tensors):
-            told = f"has no statistics of {key}, so it is not normalised ({mode} is configured); lerobot does the same."
-            warnings.warn(f"{directory}: {registered} {told}", stacklevel=6)
             continue
         missing = [name for name in names if name not in tensors]
         if missing:

@@ -100,10 +100,8 @@ def _read(
     path: Path, observations: Mapping[str, ObservationSpec], action_steps: int, sources: Mapping[str, Sequence[str]]
 ) -> list[Episode]:
     """Episodes of one file."""
-    require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
-    other = _other_format(path)
     used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
-    held, frames = _npz(path) if other is None else (sandboxed_frames(path, other, sorted(used)), True)
+    other, held, frames = _opened(path, sorted(used))
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
@@ -131,6 +129,19 @@ def _read(
             part = {key: _windows(array, observations[key].frames, action_steps) for key, array in part.items()}
         episodes.append(Episode(f"{path.name}[{number}]", part))
     return episodes
+
+
+def recorded_names(path: Path) -> tuple[list[str], bool]:
+    """Names of the arrays of a recording, and whether its rows are frames rather than calls."""
+    _, held, frames = _opened(path, [])
+    return list(held.names), frames
+
+
+def _opened(path: Path, wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
+    """What a file is that is no ``.npz``, what it holds, and whether that is frames."""
+    require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
+    other = _other_format(path)
+    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted), True))
 
 
 def _npz(path: Path) -> tuple[Frames, bool]:
@@ -232,6 +243,9 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:
             told += " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
+        elif spec.image:
+            last = array.shape[1:] == (*shape[:-3], *shape[-2:], shape[-3])
+            told += " Its channels are last: use np.moveaxis(image, -1, -3)." if last else " Is it another camera's?"
         raise TrajectoryError(told)
     wanted = np.dtype(spec.dtype)
     allowed = "fiu" if wanted.kind == "f" else wanted.kind if wanted.kind not in "iu" else "iu"

@@ -1,4 +1,4 @@
-"""One thing that the doctor found."""
+"""One thing that was looked at: by the doctor, and by ``convert``. Standard library alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Level(enum.Enum):
     OK = "ok"
     NOTE = "note"  # worth knowing
     WARNING = "warning"  # slower, or less certain, than it could be
-    PROBLEM = "problem"  # stops artifacts from running
+    PROBLEM = "problem"  # stops artifacts from running, or makes what they answer mean nothing
 
 
 @dataclass(frozen=True)
@@ -39,3 +39,8 @@ class Finding:
     ) -> Finding:
         """Of this level and with this remedy if it is wrong, else ``OK`` and without."""
         return cls(part, what, found, level, remedy) if wrong else cls(part, what, found)
+
+    @property
+    def told(self) -> str:
+        """In a line, for where there is no table."""
+        return f"{self.what}: {self.found.rstrip('.')}. {self.remedy}"

@@ -1,0 +1,95 @@
+"""The doctor on a checkpoint and on recordings, and what ``convert`` says of the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import ttscompile
+from tests.frontends.lerobot_tiny import DS, save_policy
+from ttscompile import driver
+from ttscompile.cli import main
+from ttscompile.doctor.checkpoint import target_findings
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """Its last number of the state never changed."""
+    return save_policy(tmp_path)
+
+
+def recorded(path: Path, state: np.ndarray) -> Path:
+    count = len(state)
+    tokens = np.zeros((count, 9), np.int64)
+    ends, meta = np.array([count // 2, count]), np.array('{"frames": true}')
+    rest = {"observation.language.tokens": tokens, "observation.language.attention_mask": tokens == 0}
+    np.savez(path, episode_ends=ends, meta=meta, **{"observation.state": state}, **rest)
+    return path
+
+
+def test_a_checkpoint_and_its_recordings_as_json_and_as_text(checkpoint: Path, tmp_path: Path) -> None:
+    bad = recorded(tmp_path / "bad.npz", np.full((20, DS), 1e4, np.float32))
+    words = ["doctor", str(checkpoint), "-t", str(bad)]
+    result = CliRunner().invoke(main, [*words, "--json"], catch_exceptions=False)
+    told = json.loads(result.stdout)
+    by_name = {one["what"]: one for one in told["findings"]}
+    assert (result.exit_code, told["problems"]) == (1, 1)
+    assert by_name["range of 'observation.state'"]["level"] == "problem"
+    assert by_name["normaliser of observation.state"]["level"] == "warning"
+    text = CliRunner().invoke(main, words, catch_exceptions=False).stdout
+    assert "PROBLEM range of 'observation.state'" in text and "  -> Look at" in text and "1 problem, " in text
+
+
+def test_recordings_are_held_against_an_artifact_too(toy_compiled: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", pose=np.zeros((4, 2), np.float32), episode_ends=np.array([2, 4]))
+    found = {one.what: one for one in target_findings(toy_compiled, [tmp_path / "other.npz"])}
+    assert "call" in found and "lacks " in found["other.npz"].found
+
+
+def test_what_is_no_policy_is_a_problem_with_the_message_of_convert(tmp_path: Path) -> None:
+    (tmp_path / "policy.ckpt").write_text("nothing")
+    (one,) = target_findings(tmp_path / "policy.ckpt")
+    assert one.what == "load" and "policy.ckpt" in one.found and one.remedy
+
+
+def test_recordings_without_a_target_are_bad_usage(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "a.npz", np.zeros((4, DS), np.float32))
+    result = CliRunner().invoke(main, ["doctor", "-t", str(path)])
+    assert result.exit_code == 2 and "give a checkpoint or an artifact too" in result.stderr
+
+
+def test_convert_says_the_same_and_goes_on(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "_compile", lambda *_: None)
+    stages: dict[str, tuple[str, ...]] = {}
+    ttscompile.convert(checkpoint, tmp_path / "out", explain=lambda name, notes: stages.update({name: notes}))
+    (note,) = stages["examine"]
+    assert note.startswith("normaliser of observation.state: its range is 0 in column 4 of 5") and "Hold these" in note
+
+
+def test_what_makes_answers_meaningless_is_a_warning_of_convert(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(driver, "_compile", lambda *_: None)
+    steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())
+    del steps["steps"][-1]["state_file"]
+    (checkpoint / "policy_preprocessor.json").write_text(json.dumps(steps))
+    with pytest.warns(UserWarning, match=r"no statistics of observation\.state"):
+        ttscompile.convert(checkpoint, tmp_path / "out")
+
+
+def test_the_command_prints_it_on_standard_error(
+    checkpoint: Path, toy_compiled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def convert(_: Path, directory: Path, *, explain: driver.Explain, **__: object) -> None:
+        explain("examine", ("chunk: too long. Shorten it.",))
+        shutil.copytree(toy_compiled, directory)
+
+    monkeypatch.setattr(ttscompile, "convert", convert)
+    result = CliRunner().invoke(main, ["convert", str(checkpoint), "-o", str(tmp_path / "out")], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert result.stderr.startswith("warning: chunk: too long. Shorten it.\n")
