@@ -13,13 +13,14 @@ from typing import Any
 from torch import nn
 
 from ..core.spec import PolicySpec
-from . import lerobot_diffusion, lerobot_multi_task_dit, lerobot_pi, lerobot_smolvla
+from . import lerobot_act, lerobot_diffusion, lerobot_multi_task_dit, lerobot_pi, lerobot_smolvla
 from .families import LoadOptions
 from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
 from .settings import read_json
 
 TYPES: Mapping[str, Callable[[Path, Mapping[str, Any], LoadOptions], tuple[nn.Module, PolicySpec]]] = {
+    "act": lerobot_act.load,
     "diffusion": lerobot_diffusion.load,
     "multi_task_dit": lerobot_multi_task_dit.load,
     "pi0": lerobot_pi.load,

@@ -62,13 +62,15 @@ def read_lerobot_config(
     n_action_steps: int,
     environment: bool = False,
     chunked: bool = False,
+    stateless: bool = False,
 ) -> LeRobotConfig:
     """Check what all types have.
 
     Args:
         environment: whether this type reads the state of the environment; if not, it is no observation.
         chunked: whether the horizon is called ``chunk_size``, one frame is observed, and every camera has a shape of
-            its own: vision-language-action models, which resize images themselves.
+            its own: vision-language-action models and ``act``.
+        stateless: whether this type can do without the robot's state.
     """
     settings = Settings(
         entries, f"{directory / CONFIG}: ", "The file was changed, or is of another version of lerobot."
@@ -79,7 +81,7 @@ def read_lerobot_config(
     others = {key: shape for key, (kind, shape) in features.items() if kind == "ENV" and environment}
     if list(actions) != [ACTION] or len(actions[ACTION]) != 1:
         raise settings.error(f"output_features are {features!s:.300}; expected one vector, 'action'")
-    if STATE not in features or len(features[STATE][1]) != 1:
+    if not (stateless and STATE not in features) and len(features.get(STATE, ("", ()))[1]) != 1:
         raise settings.error(f"input_features have no vector {STATE!r}, which this policy needs")
     if others and (list(others) != [ENVIRONMENT] or len(others[ENVIRONMENT]) != 1):
         raise settings.error(f"input_features of the environment are {others!s:.300}; expected one, {ENVIRONMENT!r}")
@@ -95,7 +97,7 @@ def read_lerobot_config(
     config = LeRobotConfig(
         directory=directory,
         settings=settings,
-        features={key: features[key] for key in (STATE, *cameras, *others, ACTION)},
+        features={key: features[key] for key in (STATE, *cameras, *others, ACTION) if key in features},
         n_obs_steps=1 if chunked else settings.number("n_obs_steps", 2, MOST_STEPS),
         horizon=settings.number("chunk_size" if chunked else "horizon", horizon, MOST_STEPS),
         n_action_steps=settings.number("n_action_steps", n_action_steps, MOST),

@@ -41,14 +41,14 @@ class Measured(nn.Module):
         self.normalizers = nn.ModuleList(Normalizer(processors.normalizers.get(key)) for key in self.names)
 
     def measured(self, observations: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """By the policy's names: vectors ``[B, To, D]``, and of each camera ``[B * To, 3, *geometry.size]``."""
+        """By the policy's names: vectors ``[B, To, D]``, and of each camera ``[B * To, 3, H, W]``, cropped."""
         found = {}
         for (key, name), normalizer in zip(self.names.items(), self.normalizers, strict=True):
             value = observations[name]
             if key in self.cameras:
-                assert self.geometry is not None
+                value = value.flatten(0, 1)
                 # Normalised after the crop: pixels that nobody sees need no arithmetic.
-                value = self.geometry(value.flatten(0, 1))
+                value = value if self.geometry is None else self.geometry(value)
             found[key] = normalizer(value)
         return found
 
