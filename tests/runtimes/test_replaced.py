@@ -234,6 +234,24 @@ def test_without_proc_exchanged_there_and_back_is_seen(
             ttscompile.load(places[0], runtime)
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_nothing_of_a_small_artifact_is_mapped(
+    places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, runtime: str
+) -> None:
+    """What is written in place, which empties a file first, would end a process that reads it by a map."""
+
+    def none_is_mapped() -> None:
+        assert str(places[0]) not in Path("/proc/self/maps").read_text()
+
+    with around_sessions(monkeypatch, none_is_mapped, none_is_mapped):
+        loaded = ttscompile.load(places[0], runtime)
+    right = answer(loaded, read_manifest(places[1]).spec)
+    none_is_mapped()
+    for path in places[0].iterdir():
+        path.write_bytes(b"")
+    assert answer(loaded, read_manifest(places[1]).spec) == right
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("way", CHANGES)
 def test_loads_while_another_process_changes_the_artifact(way: str, tmp_path: Path) -> None:
