@@ -158,9 +158,13 @@ class Sessions:
 
 
 def _contents(view: View) -> dict[str, bytes]:
-    """Small files with weights, by name: what onnxruntime is given in memory it does not map."""
-    small = {name: record.bytes for name, record in view.manifest.acting.items() if record.bytes < MAPPED}
-    return {name: read_file(view.files / name, size) for name, size in small.items() if name.endswith(".safetensors")}
+    """Files with weights, by name, if they are small: what onnxruntime is given in memory it does not map.
+
+    None otherwise: it is given all that its models name, or nothing.
+    """
+    sizes = {name: record.bytes for name, record in view.manifest.acting.items() if name.endswith(".safetensors")}
+    small = sum(sizes.values()) < MAPPED
+    return {name: read_file(view.files / name, size) for name, size in sizes.items()} if small else {}
 
 
 def _open_file(view: View, file: str, options: Any) -> Any:
@@ -198,7 +202,8 @@ def _options(threads: int, spin: bool, careful: bool, contents: Mapping[str, byt
         problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
         raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
     options = ort.SessionOptions()
-    if give := getattr(options, "add_external_initializers_from_files_in_memory", None):  # from onnxruntime 1.24 on
+    give = getattr(options, "add_external_initializers_from_files_in_memory", None)  # from onnxruntime 1.24 on
+    if contents and give is not None:
         give(list(contents), list(contents.values()), [len(content) for content in contents.values()])
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL

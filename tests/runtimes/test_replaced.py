@@ -23,6 +23,7 @@ from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactChangedError, ArtifactError
 from ttscompile.runtimes import load as loading
 from ttscompile.runtimes import open as opening
+from ttscompile.runtimes.onnxruntime import sessions
 
 from .replaced import CHANGES, COMMANDS, answer, load_often, prepared, prepared_by_commands, reuse
 from .toys import toy_program, written_artifact
@@ -250,6 +251,14 @@ def test_nothing_of_a_small_artifact_is_mapped(
     for path in places[0].iterdir():
         path.write_bytes(b"")
     assert answer(loaded, read_manifest(places[1]).spec) == right
+
+
+def test_an_artifact_with_a_large_file_beside_small_ones_is_loaded(
+    places: tuple[Path, Path], expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """onnxruntime is given all files that models name, or none."""
+    monkeypatch.setattr(sessions, "MAPPED", (places[0] / "weights.safetensors").stat().st_size)
+    assert is_whole(ttscompile.load(places[0]), expected, places[0])
 
 
 @pytest.mark.slow
