@@ -97,8 +97,8 @@ class RayPool:
                 ray.init(address=LOCAL, num_cpus=cores, include_dashboard=False, log_to_driver=False)
             else:
                 ray.init(address=address, log_to_driver=False)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            first = str(error).splitlines()[0][:200]
+        except Exception as error:  # a node that does not start in time raises a bare one
+            first = f"{error or type(error).__name__}".splitlines()[0][:200]
             raise ClusterError(
                 f"--ray {address}: no cluster can be reached ({first}). Start it, or give {LOCAL!r}."
             ) from error

@@ -1,11 +1,13 @@
 """How far from the original are plans where an observation is unlike all that was recorded?
 
     python examples/evaluation/departures.py DIR --trajectories calls.npz
+    python examples/evaluation/record.py DIR -o wandered.npz --wander
+    python examples/evaluation/departures.py DIR --trajectories calls.npz --other wandered.npz --summary
 
 Every departure changes recorded observations, and the plans of an artifact answer what comes of them. Each is compared
 with the plan that computes every cell, with the same noise, in units of what other noise changes in what was recorded.
 Beside a plan stands what it would be if nobody looked how far outside a call is, and even steps without a correction.
-Images and instructions stay as they are.
+Images and instructions stay as they are. With --summary there is one row a plan, with what is worst of its departures.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ from ttscompile.trajectories import load_trajectories
 
 BATCH = 32
 """Calls that are computed together."""
+ALLOWED = 0.1
+"""Of other noise: how much further than even steps a plan may be."""
 
 Observation = dict[str, npt.NDArray[Any]]
 
@@ -56,8 +60,10 @@ class Distances:
     even: float
 
 
-def departures(values: FloatArray, rng: np.random.Generator) -> Iterator[tuple[str, FloatArray]]:
-    """Changed observations ``[n, ..., Do]`` by what was done to them."""
+def departures(
+    values: FloatArray, rng: np.random.Generator, other: FloatArray | None = None
+) -> Iterator[tuple[str, FloatArray]]:
+    """Changed observations ``[n, ..., Do]`` by what was done to them, and those of another task, if there are any."""
     axes = tuple(range(values.ndim - 1))
     low, high = values.min(axes), values.max(axes)
     middle, width = (low + high) / 2, high - low
@@ -74,6 +80,8 @@ def departures(values: FloatArray, rng: np.random.Generator) -> Iterator[tuple[s
     yield "random in the range", rng.uniform(low, high, values.shape).astype(np.float32)
     yield "columns reversed", values[..., ::-1]
     yield "times 100", 100 * values
+    if other is not None:
+        yield "another task", other
 
 
 class Calls:
@@ -114,7 +122,9 @@ def apart(one: FloatArray, other: FloatArray) -> float:
     return float(np.sqrt(np.square(one - other, dtype=np.float64).mean(1)).mean())
 
 
-def measured(artifact: Artifact, names: Sequence[str], recorded: Observation, count: int) -> Iterator[Distances]:
+def measured(
+    artifact: Artifact, names: Sequence[str], recorded: Observation, other_task: Observation | None, count: int
+) -> Iterator[Distances]:
     """Distances of plans from the one that computes everything."""
     full = artifact.plan(full_plan(artifact.path))
     runtime, unbounded = (open_runtime(one, plan=full) for one in (artifact, replace(artifact, envelope=None)))
@@ -122,7 +132,9 @@ def measured(artifact: Artifact, names: Sequence[str], recorded: Observation, co
     other = apart(*(one.answers(runtime, full, recorded)[0] for one in (calls, Calls(artifact, count, 1))))
     blocks = len(artifact.manifest.groups)
     changing = {
-        key: departures(recorded[key], rng) for key in recorded if vector(artifact.manifest.spec.observations[key])
+        key: departures(recorded[key], rng, (other_task or {}).get(key))
+        for key in recorded
+        if vector(artifact.manifest.spec.observations[key])
     }
     for changed in zip(*changing.values(), strict=False):
         observation = recorded | {
@@ -148,20 +160,56 @@ def vector(spec: ObservationSpec) -> bool:
 @click.argument("directory", type=click.Path(path_type=Path))
 @click.option("-t", "--trajectories", multiple=True, required=True, type=click.Path(path_type=Path))
 @click.option("--plan", "names", multiple=True, help="Plans; without it all that have a correction.")
+@click.option("--other", multiple=True, type=click.Path(path_type=Path), help="Recorded while something else was done.")
+@click.option("--summary", is_flag=True, help="One row a plan.")
 @click.option("--calls", default=64, show_default=True, help="Recorded calls.")
 @json_option
-def main(directory: Path, trajectories: tuple[Path, ...], names: tuple[str, ...], calls: int, as_json: bool) -> None:
-    """Compare plans of the artifact DIRECTORY with the original where nothing was recorded."""
+def main(
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    names: tuple[str, ...],
+    other: tuple[Path, ...],
+    summary: bool,
+    calls: int,
+    as_json: bool,
+) -> None:
+    """Compare plans of the artifact DIRECTORY with the original where nothing was recorded.
+
+    Exit status 1: a plan is further from the original than even steps by more than a tenth of other noise.
+    """
     artifact = load_artifact(directory)
+    recorded = some_calls(artifact, trajectories, calls)
+    count = len(next(iter(recorded.values())))
+    others = some_calls(artifact, other, count) if other else None
+    corrected = [name for name, plan in artifact.plans.items() if plan.correction is not None]
+    found = list(measured(artifact, names or corrected, recorded, others, count))
+    show(found, summary, as_json)
+    if max(one.distance - one.even for one in found) > ALLOWED:
+        raise SystemExit(1)
+
+
+def some_calls(artifact: Artifact, paths: Sequence[Path], calls: int) -> Observation:
+    """So many calls of recordings, drawn at random."""
     spec = artifact.manifest.spec
-    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start)
+    episodes = load_trajectories(paths, spec.observations, spec.chunk.stop - spec.chunk.start)
     every = {key: np.concatenate([one.observations[key] for one in episodes]) for key in spec.observations}
     chosen = np.random.default_rng(0).permutation(len(next(iter(every.values()))))[:calls]
-    recorded = {key: value[chosen] for key, value in every.items()}
-    corrected = [name for name, plan in artifact.plans.items() if plan.correction is not None]
-    found = list(measured(artifact, names or corrected, recorded, len(chosen)))
+    return {key: value[chosen] for key, value in every.items()}
+
+
+def show(found: Sequence[Distances], summary: bool, as_json: bool) -> None:
+    """Print them all, or what is worst of each plan."""
     if as_json:
         print(json.dumps([asdict(one) for one in found]))
+        return
+    if summary:
+        table = Table("plan", "as recorded", "even steps", "worst, beside even steps", "at", box=None)
+        for name in dict.fromkeys(one.plan for one in found):
+            own = [one for one in found if one.plan == name]
+            worst = max(own, key=lambda one: one.distance - one.even)
+            figures = (own[0].distance, own[0].even, worst.distance - worst.even)
+            table.add_row(name, *(f"{each:.2f}" for each in figures), worst.departure)
+        results_console().print(table)
         return
     table = Table("departure", "plan", "without correction", "distance", "if nobody looked", "even steps", box=None)
     for one in found:

@@ -2,12 +2,15 @@
 
     python examples/evaluation/record.py build/pusht/flow/compiled -o build/pusht/flow/calls.npz --episodes 16
 
+With --wander the robot goes to random places instead, which is another task in the same world: ``departures.py``.
+
 The seeds start at 0; evaluation starts at 100000, so that no policy is judged on episodes it was calibrated on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,24 @@ def save_trajectories(path: Path, episodes: Sequence[Mapping[str, Array]]) -> No
     np.savez(path, **arrays, episode_ends=ends.astype(np.int64))
 
 
+class Wanderer:
+    """Goes to another place within the range of the actions at every call, whatever it sees.
+
+    Args:
+        policy: whose observations it reads, and whose actions have this range.
+    """
+
+    def __init__(self, policy: Any) -> None:
+        self.info, self.reset = policy.info, policy.reset
+
+    def predict_action(self, windows: Mapping[str, Array], noise: Any, plan: str | None) -> dict[str, Array]:
+        """Actions ``[B, Ta, Da]``, all of a chunk the same: where its noise says."""
+        action = self.info.action
+        places = np.tanh(noise.initial[:, :1, : action.action_dim])
+        chunks = np.repeat(places, action.stop - action.start, axis=1)
+        return {"action": action.normalizer.unnormalize(chunks.astype(np.float32))}
+
+
 @click.command()
 @click.argument("artifact")
 @environment_option
@@ -41,6 +62,7 @@ def save_trajectories(path: Path, episodes: Sequence[Mapping[str, Array]]) -> No
 @click.option("--episodes", default=16, show_default=True, type=click.IntRange(1))
 @click.option("--first-seed", default=0, show_default=True, type=click.IntRange(0), help="Seeds count up from here.")
 @click.option("--batch", default=8, show_default=True, type=click.IntRange(1), help="Episodes in lockstep.")
+@click.option("--wander", is_flag=True, help="Go to random places, and ask no policy.")
 @runtime_option
 @threads_option
 def main(
@@ -50,12 +72,15 @@ def main(
     episodes: int,
     first_seed: int,
     batch: int,
+    wander: bool,
     runtime: str,
     threads: int,
 ) -> None:
     """Drive the robot with the policy in ARTIFACT, in the loop that it was converted to, and write its observations."""
     make = environment_class(environment)
     variant = open_variant(f"{artifact}:{full_plan(artifact)}", runtime, threads)
+    if wander:
+        variant = replace(variant, policy=Wanderer(variant.policy))
     seeds = range(first_seed, first_seed + episodes)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("recording episodes", total=episodes)

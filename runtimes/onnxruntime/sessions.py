@@ -26,7 +26,9 @@ from weakref import WeakSet
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.artifact.files import read_file
 from ttscompile.artifact.manifest import PieceRecord
+from ttscompile.artifact.tensors import MAPPED
 from ttscompile.artifact.view import View
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
@@ -82,6 +84,7 @@ class Sessions:
         self.threads = threads
         self._known: dict[tuple[str, int, bool], Any] = {}
         self._careful: dict[str, bool] = {}
+        self._contents: dict[str, bytes] = {}
 
     def of(self, view: View, blocks: bool = True) -> dict[str, Any]:
         """What runs each ONNX piece of a view, by name: an ``InferenceSession``, or a ``JointBlock``.
@@ -101,7 +104,9 @@ class Sessions:
         others = set(filter(is_of_loop, manifest.pieces))
         sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
         sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
-        return sessions | self._of_blocks(view) if blocks else sessions
+        sessions |= self._of_blocks(view) if blocks else {}
+        self._contents.clear()
+        return sessions
 
     def of_blocks(self, view: View) -> dict[str, Any]:
         """What runs single blocks, by name, some time after the artifact was loaded.
@@ -146,21 +151,29 @@ class Sessions:
             precision = view.precision.get(str(part_of(piece)), FP32)
             if precision not in self._careful:
                 self._careful[precision] = needs_care(precision)
-            session = _open_file(view, file, threads, spins, self._careful[precision])
+            self._contents = self._contents or _contents(view)
+            session = _open_file(view, file, _options(threads, spins, self._careful[precision], self._contents))
             self._known[file, threads, spins] = session
         return self._known[file, threads, spins]
 
 
-def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool) -> Any:
-    try:
-        import onnxruntime as ort
-    except ImportError as error:
-        problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
-        raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
+def _contents(view: View) -> dict[str, bytes]:
+    """Files with weights, by name, if they are small: what onnxruntime is given in memory it does not map.
+
+    None otherwise: it is given all that its models name, or nothing.
+    """
+    sizes = {name: record.bytes for name, record in view.manifest.acting.items() if name.endswith(".safetensors")}
+    small = sum(sizes.values()) < MAPPED
+    return {name: read_file(view.artifact.files / name, size) for name, size in sizes.items()} if small else {}
+
+
+def _open_file(view: View, file: str, options: Any) -> Any:
+    import onnxruntime as ort
+
     if os.environ.get(CONFIG_FROM_MODEL) not in (None, "", "0"):
         problem = f"the environment variable {CONFIG_FROM_MODEL} has onnxruntime ignore the threads and options that"
         raise RuntimeUnavailableError(f"{problem} a policy is loaded with. Unset it.")
-    path, options = view.artifact.files / file, _options(ort, threads, spins, careful)
+    path = view.artifact.files / file
     try:
         session = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
     except Exception as error:  # onnxruntime's own classes are derived from Exception
@@ -176,13 +189,22 @@ def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool) 
             f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
             f" artifact asks for (>= {view.manifest.requires.onnxruntime}), or convert the checkpoint again."
         ) from error
-    if threads > 1:
+    if options.intra_op_num_threads > 1:
         _threaded.add(session)
     return session
 
 
-def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
+def _options(threads: int, spin: bool, careful: bool, contents: Mapping[str, bytes]) -> Any:
+    """Options of a session. ``contents`` have to live until it is open."""
+    try:
+        import onnxruntime as ort
+    except ImportError as error:
+        problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
+        raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
     options = ort.SessionOptions()
+    give = getattr(options, "add_external_initializers_from_files_in_memory", None)  # from onnxruntime 1.24 on
+    if contents and give is not None:
+        give(list(contents), list(contents.values()), [len(content) for content in contents.values()])
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.intra_op_num_threads = threads

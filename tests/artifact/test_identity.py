@@ -1,6 +1,7 @@
 """Two artifacts with one identity compute the same: every name is hashed with what it names."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +11,17 @@ import numpy as np
 import onnx
 import pytest
 
+import ttscompile
 from tests.artifact.updates import PLAN, update
-from tests.hostile.forged import rehash
+from tests.hostile.forged import forge, rehash
+from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.codec import decode, encode, identities
 from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.write import identified, update_plans
 from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError
+from ttscompile.runtimes.random_calls import random_calls
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -53,6 +57,22 @@ def test_contents_of_two_files_exchanged(trained: Path) -> None:
     )
     assert identities(other)[0] != manifest.identity
     assert identities(other)[1] != manifest.model_identity
+
+
+def test_weights_of_another_policy_show_in_the_identity_alone(tmp_path: Path) -> None:
+    """Of one shape, with all hashes made anew: it loads and answers, and nothing else tells.
+
+    ``verify`` compares with the original's record, which whoever forges can take from there as well.
+    """
+    one, other = (written_artifact(toy_program(seed=seed), tmp_path / str(seed)) for seed in (0, 1))
+    ((obs, noise),) = random_calls(one.manifest.spec, 1, seed=0)
+    before = ttscompile.load(one.path).predict_action(obs, noise=noise)["action"]
+    shutil.copy(other.path / "weights.safetensors", one.path / "weights.safetensors")
+    forge(one.path)
+    forged = ttscompile.load(one.path)
+    assert forged.info.identity != one.manifest.identity
+    after = forged.predict_action(obs, noise=noise)["action"]
+    assert np.isfinite(after).all() and np.abs(after - before).max() > 0.01
 
 
 @pytest.mark.parametrize("one", ["weights.safetensors", "block_00.onnx", "program.json"])

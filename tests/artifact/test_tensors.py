@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save
 
 from ttscompile.artifact import tensors
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactChangedError, ArtifactError
 
 DTYPES = [np.bool_, np.uint8, np.int8, np.int16, np.int32, np.int64, np.float16, np.float32, np.float64]
 
@@ -52,6 +53,43 @@ def test_arrays_are_read_only_views(tmp_path: Path) -> None:
     path.write_bytes(tensors.serialize({"a": np.zeros(3, np.float32)}))
     with pytest.raises(ValueError, match="read-only"):
         tensors.read(path)["a"][0] = 1
+
+
+def is_mapped(array: Any) -> bool:
+    """Whether it is a view of a file."""
+    while isinstance(array, np.ndarray) and not isinstance(array, np.memmap):
+        array = array.base
+    return isinstance(array, np.memmap)
+
+
+def test_only_large_files_are_mapped_and_of_them_what_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mapped file that ends before it is read ends the process."""
+    path, values = tmp_path / "t.safetensors", {"table/a": np.arange(6.0), "w": np.arange(4.0), "none": np.zeros(0)}
+    tensors.write(path, values)
+    for limit, views in ((path.stat().st_size + 1, []), (path.stat().st_size, ["w"])):
+        monkeypatch.setattr(tensors, "MAPPED", limit)
+        found = tensors.read(path, lambda name: name == "w")
+        assert [name for name in found if is_mapped(found[name])] == views
+        for name, value in values.items():
+            np.testing.assert_array_equal(found[name], value)
+        assert not any(map(is_mapped, tensors.read(path).values()))
+
+
+def test_a_file_that_ends_early_by_now_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "t.safetensors"
+    tensors.write(path, {"a": np.zeros(100_000), "b": np.zeros(100_000)})
+    header = tensors._header
+
+    def shortened(*given: Any) -> Any:
+        found = header(*given)
+        path.write_bytes(b"")
+        return found
+
+    monkeypatch.setattr(tensors, "_header", shortened)
+    with pytest.raises(ArtifactChangedError, match="the file was changed while it was being read"):
+        tensors.read(path)
 
 
 def test_a_dtype_that_numpy_lacks_is_not_written() -> None:

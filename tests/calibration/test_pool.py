@@ -6,9 +6,11 @@ import importlib.util
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -41,6 +43,19 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def identity(folder: Path) -> str:
     return ttscompile.load(folder).info.identity
+
+
+def test_a_cluster_that_does_not_start_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray raises a bare Exception where a node takes too long, as on a busy machine."""
+
+    def init(**options: Any) -> None:
+        raise Exception("The current node timed out during startup.\nMore.")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    with pytest.raises(
+        ClusterError, match=r"no cluster can be reached \(The current node timed out during startup\.\)"
+    ):
+        RayPool("local")
 
 
 @pytest.fixture

@@ -1,10 +1,13 @@
 """The recorded file is a trajectory file."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from record import save_trajectories
+from record import Wanderer, save_trajectories
+
+from ttscompile import Affine, ChunkSpec, Noise
 
 
 def episode(calls: int, start: int) -> dict[str, Any]:
@@ -29,3 +32,14 @@ def test_the_same_episodes_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
         save_trajectories(tmp_path / name, [episode(2, 5)])
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_wanderer_goes_where_its_noise_says_and_never_out_of_range() -> None:
+    chunk = ChunkSpec(2, 1, 5, Affine(np.array([0.01, 0.02], np.float32), np.array([-1, -2], np.float32)))
+    wanderer = Wanderer(SimpleNamespace(info=SimpleNamespace(action=chunk), reset=lambda: None))
+    initial = np.random.default_rng(0).standard_normal((3, 8, 2)).astype(np.float32) * 9
+    action = wanderer.predict_action({}, Noise(initial, None), "dense")["action"]
+    assert action.shape == (3, 4, 2)
+    assert (action == action[:, :1]).all()
+    assert (np.abs(chunk.normalizer.normalize(action)) <= 1).all()
+    np.testing.assert_allclose(action[:, 0], (np.tanh(initial[:, 0]) + np.array([1, 2])) / [0.01, 0.02], rtol=1e-5)

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,18 @@ def test_without_ray_it_says_what_to_install(planned: Path, monkeypatch: pytest.
     result = CliRunner().invoke(main, ["serve", str(planned), "--copies", "1"])
     assert (result.exit_code, result.stdout) == (2, "")
     assert "pip install 'ttscompile[ray,serve]'" in " ".join(result.stderr.split())
+
+
+def test_a_cluster_that_does_not_start_is_one_error(planned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray raises a bare Exception where a node takes too long, as on a busy machine."""
+
+    def init(**options: Any) -> None:
+        raise Exception("The current node timed out during startup.\nMore.")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init, serve=None))
+    result = CliRunner().invoke(main, ["serve", str(planned), "--copies", "1", "--port", "0"])
+    assert (result.exit_code, result.stdout) == (2, ""), result.output
+    assert "no cluster can be reached (The current node timed out during startup.)" in " ".join(result.stderr.split())
 
 
 @contextmanager

@@ -33,6 +33,7 @@ SIZES = (
     "4096",
 )
 OPERATIONS = ("Identity", "Reshape", "Add", "MatMul", "ConstantOfShape", "Loop", "If", "RandomNormal", "Tile", "Gather")
+OPERATIONS += ("Scan", "SequenceMap", "NonZero", "Unique", "Resize", "TopK", "Expand", "Pad", "DynamicQuantizeMatMul")
 DIMENSIONS = (0, -1, 1, 2, 3, 2**31, 2**40, 2**62, 2**63 - 1)
 
 

@@ -67,9 +67,12 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "inspect -o": ("inspect", "A", "-o", "OUT/page.html"),
     "bench -t": ("bench", "A", "-t", "calls.npz", "--calls", "2", "--plot", "OUT/frontier.svg"),
     "calibrate": ("calibrate", "OUT/B", "--trajectories", "calls.npz", "--max-minutes", "0.01"),
+    "push --dry-run": ("push", "A", "org/name", "--dry-run"),
+    "convert --single-file": ("convert", "policy.ckpt", "-o", "OUT/C", "--single-file", "OUT/one.onnx"),
+    "build": ("build", "policy.ckpt", "-o", "OUT/C", "--trajectories", "demos.npz", "--minutes", "0.5"),
     "convert": ("convert", "policy.ckpt", "-o", "OUT/C", "--sampler", "ddim", "--steps", "2"),
 }
-NEED_CHECKPOINT = ("convert", "verify")
+NEED_CHECKPOINT = ("convert", "convert --single-file", "build", "verify")
 STATUSES = {0, 2, 141}
 """All checks of the toy hold."""
 LEFT = (".partial", ".replaced")
@@ -81,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     known = {**SETTINGS, **MOUNTED}
     parser.add_argument("--surrounding", choices=known, action="append")
     parser.add_argument("--command", choices=COMMANDS, action="append")
-    parser.add_argument("--checkpoint", type=Path, help="of Push-T, for convert and verify, which take it")
+    parser.add_argument("--checkpoint", type=Path, help="of Push-T, for convert, build and verify, which take it")
     options = parser.parse_args(arguments)
     failures, commands = 0, options.command or [c for c in COMMANDS if options.checkpoint or c not in NEED_CHECKPOINT]
     with tempfile.TemporaryDirectory() as folder:
@@ -110,6 +113,8 @@ def prepare(top: Path, checkpoint: Path | None) -> None:
     shutil.make_archive(str(top / "A"), "zip", top / "A")
     obs = np.random.default_rng(0).standard_normal((8, 2), np.float32)
     np.savez(top / "calls.npz", obs=obs, episode_ends=[4, 8])
+    pushed = np.random.default_rng(1).uniform(100, 400, (32, 2, 20)).astype(np.float32)
+    np.savez(top / "demos.npz", obs=pushed, episode_ends=[8, 16, 24, 32])
     if checkpoint is not None:
         import ttscompile
 
@@ -128,7 +133,7 @@ def run(top: Path, surrounding: str, words: Sequence[str]) -> tuple[int, str]:
     setup = {**SETTINGS, **MOUNTED}[surrounding]
     if words[0] == "calibrate" and mounts:  # on the disk itself; where it does not fit there is none
         setup += '; cp -r "$TOP/A" "$OUT/B" 2>/dev/null'
-    here = {name: top / name for name in ("A", "V", "A.zip", "calls.npz", "policy.ckpt")}
+    here = {name: top / name for name in ("A", "V", "A.zip", "calls.npz", "demos.npz", "policy.ckpt")}
     given = [str(here.get(word, word.replace("OUT", str(out)) if word.startswith("OUT/") else word)) for word in words]
     shell = ["bash", "-c", f'{setup}; exec "$@"', "bash", sys.executable, "-P", "-m", "ttscompile", *given]
     shell = ["unshare", "-m", *shell] if mounts else shell

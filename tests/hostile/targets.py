@@ -207,6 +207,17 @@ def mixed(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
     return rng.choice([*TARGETS.values()])(rng, corpus, folder)
 
 
+def structured(rng: random.Random, corpus: Path, folder: Path) -> Callable[[], None]:
+    """An artifact of somebody who knows the format: forged, and one in ten swollen; hashes are always right."""
+    source = rng.choice(sorted((corpus / "artifacts").iterdir()))
+    path = Path(shutil.copytree(source, folder / "compiled"))
+    return rng.choice([swollen.artifact, *[forged.artifact] * 9])(rng, path)
+
+
+MIXES: dict[str, Case] = {"mixed": mixed, "structured": structured}
+"""Targets that are made of others, and are not among all of them."""
+
+
 def outcome(case: Callable[[], None]) -> str:
     """``refused`` or ``accepted``; whatever else comes out of the case is a defect, and goes on to the caller."""
     with warnings.catch_warnings():

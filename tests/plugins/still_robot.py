@@ -1,4 +1,4 @@
-"""A robot that never moves, and ``lerobot-rollout`` with it. Needs lerobot."""
+"""A robot that never moves, may disappear, and ``lerobot-rollout`` with it. Needs lerobot."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,10 @@ JOINTS = ("x.pos", "y.pos")
 @RobotConfig.register_subclass("still_robot")
 @dataclass
 class StillRobotConfig(RobotConfig):
-    """``log`` is the file that gets a line for each action."""
+    """``log`` is the file that gets a line for each action; after so many frames nothing answers any more."""
 
     log: str = ""
+    frames: int = 10**9
 
 
 class StillRobot(Robot):
@@ -31,7 +32,7 @@ class StillRobot(Robot):
         self.cameras: dict[str, Any] = {}
         self.is_connected = False
         self.is_calibrated = True
-        self._log = Path(config.log)
+        self._log, self._left = Path(config.log), config.frames
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -54,6 +55,9 @@ class StillRobot(Robot):
         pass
 
     def get_observation(self) -> dict[str, Any]:
+        self._left -= 1
+        if self._left < 0:
+            raise ConnectionError("the robot does not answer any more")
         return {**dict.fromkeys(JOINTS, 0.1), "top": np.full((PIXELS, PIXELS, 3), 99, np.uint8)}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:

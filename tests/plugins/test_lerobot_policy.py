@@ -7,6 +7,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+import time
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -228,6 +229,33 @@ def test_lerobot_rollout_runs_it(saved: tuple[str, Path, Path], tmp_path: Path, 
     assert result.returncode == 0, result.stderr
     actions = np.loadtxt(sent, ndmin=2)
     assert len(actions) > 5 and actions.shape[1] == DA and np.isfinite(actions).all()
+
+
+@pytest.mark.parametrize("inference", ["sync", "rtc"])
+def test_a_robot_that_disappears_ends_the_rollout(
+    saved: tuple[str, Path, Path], tmp_path: Path, inference: str
+) -> None:
+    """With its error, soon, and nothing is sent after that: no thread of the policy goes on."""
+    case, _, compiled = saved
+    if case != "multi_task_dit":
+        pytest.skip("the robot measures what the other policy observes")
+    sent = tmp_path / "sent.txt"
+    robot = ["--robot.type=still_robot", f"--robot.log={sent}", "--robot.frames=8"]
+    run = ["--task=push", "--fps=10", "--duration=60", f"--inference.type={inference}", "--play_sounds=false"]
+    began = time.monotonic()
+    result = command(
+        "tests.plugins.still_robot",
+        f"--policy.path={compiled}",
+        "--policy.threads=2",
+        "--return_to_initial_position=false",
+        *robot,
+        *run,
+    )
+    assert time.monotonic() - began < 50, "it went on without a robot"
+    assert result.returncode != 0
+    assert "the robot does not answer any more" in result.stderr
+    actions = np.loadtxt(sent, ndmin=2)
+    assert 0 < len(actions) <= 8 and np.isfinite(actions).all()
 
 
 def test_the_policy_server_takes_it(

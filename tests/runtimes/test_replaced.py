@@ -23,6 +23,7 @@ from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactChangedError, ArtifactError
 from ttscompile.runtimes import load as loading
 from ttscompile.runtimes import open as opening
+from ttscompile.runtimes.onnxruntime import sessions
 
 from .replaced import CHANGES, COMMANDS, answer, load_often, prepared, prepared_by_commands, reuse
 from .toys import toy_program, written_artifact
@@ -232,6 +233,32 @@ def test_without_proc_exchanged_there_and_back_is_seen(
         monkeypatch.setattr(onnxruntime, "InferenceSession", opened)
         with pytest.raises(ArtifactChangedError):
             ttscompile.load(places[0], runtime)
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_nothing_of_a_small_artifact_is_mapped(
+    places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, runtime: str
+) -> None:
+    """What is written in place, which empties a file first, would end a process that reads it by a map."""
+
+    def none_is_mapped() -> None:
+        assert str(places[0]) not in Path("/proc/self/maps").read_text()
+
+    with around_sessions(monkeypatch, none_is_mapped, none_is_mapped):
+        loaded = ttscompile.load(places[0], runtime)
+    right = answer(loaded, read_manifest(places[1]).spec)
+    none_is_mapped()
+    for path in places[0].iterdir():
+        path.write_bytes(b"")
+    assert answer(loaded, read_manifest(places[1]).spec) == right
+
+
+def test_an_artifact_with_a_large_file_beside_small_ones_is_loaded(
+    places: tuple[Path, Path], expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """onnxruntime is given all files that models name, or none."""
+    monkeypatch.setattr(sessions, "MAPPED", (places[0] / "weights.safetensors").stat().st_size)
+    assert is_whole(ttscompile.load(places[0]), expected, places[0])
 
 
 @pytest.mark.slow

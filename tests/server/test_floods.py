@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import resource
+import socket
 import struct
 import time
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
 import pytest
 
-from tests.server.serving import LIMITS, client, connected, handshake, raw, read_all, serving
+from tests.server.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.server.limits import ServerLimits
@@ -80,6 +84,43 @@ def test_others_are_answered_while_pings_come() -> None:
             done.set()
             thread.join()
         assert sorted(times)[100] < 0.05
+
+
+@pytest.mark.slow
+def test_a_thousand_connections_at_once() -> None:
+    """Few of them are held, the others are closed unread, and who was there before goes on."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4096), hard))
+    limits = ServerLimits(handshake_timeout=30.0, action_timeout=10.0)
+    try:
+        with serving(limits=limits) as url, connected(url) as other, ExitStack() as stack:
+            files = len([*Path("/proc/self/fd").iterdir()])
+            came = [stack.enter_context(raw(url)) for _ in range(1000)]
+            for _ in range(20):
+                assert other("info")["n_obs_steps"] == 2
+            for each in came:
+                each.setblocking(False)
+            until = time.monotonic() + 20
+            while (held := sum(map(is_open, came))) > limits.handshakes_per_address and time.monotonic() < until:
+                time.sleep(0.05)
+            assert 0 < held <= limits.handshakes_per_address
+            assert len([*Path("/proc/self/fd").iterdir()]) <= files + 1000 + limits.handshakes_per_address
+            for each in came:
+                each.close()
+            still_serves(url)
+            assert other("info")["n_obs_steps"] == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def is_open(sock: socket.socket) -> bool:
+    """Whether the server has not closed a connection on which nothing was said."""
+    try:
+        return sock.recv(1) != b""
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
 
 
 def test_an_address_that_floods_is_cut_off() -> None:

@@ -14,8 +14,10 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -100,6 +102,45 @@ def test_who_is_no_client_of_tls_is_refused_and_written_down(lock: Lock, papers:
         lines = audit(4)
         still_serves(url, token=TOKEN, ca=str(papers / "ca.pem"))
     assert [(line["event"], line["why"]) for line in lines[:4]] == 4 * [("refused", "it did not finish its handshake")]
+
+
+@pytest.mark.parametrize("ciphers", ["eNULL:aNULL:@SECLEVEL=0", "AES128-SHA:AES256-SHA:@SECLEVEL=0"])
+def test_nothing_weaker_than_tls_is_agreed_on(ciphers: str, lock: Lock, papers: Path) -> None:
+    """Without a cipher or a certificate, or without a key of the moment."""
+    weak = ssl.create_default_context(cafile=papers / "ca.pem")
+    weak.maximum_version = ssl.TLSVersion.TLSv1_2
+    weak.set_ciphers(ciphers)
+    with serving(lock=lock) as url:
+        with raw(url) as sock, pytest.raises((ssl.SSLError, ConnectionError)):
+            weak.wrap_socket(sock, server_hostname="127.0.0.1")
+        still_serves(url, token=TOKEN, ca=str(papers / "ca.pem"))
+
+
+@pytest.mark.parametrize("tls", [False, True])
+def test_a_client_is_not_talked_down(tls: bool, papers: Path) -> None:
+    """Somebody on the way answers in the clear, or has nothing better than TLS 1.1: no token is sent."""
+    heard = list[bytes]()
+    old = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    old.load_cert_chain(papers / "both.pem")
+    old.set_ciphers("ALL:@SECLEVEL=0")
+    with pytest.warns(DeprecationWarning, match="TLSv1_1"):
+        old.maximum_version = ssl.TLSVersion.TLSv1_1
+
+    def answer(listening: socket.socket) -> None:
+        sock, _ = listening.accept()
+        with sock, suppress(OSError):
+            if tls:
+                sock = old.wrap_socket(sock, server_side=True)
+            heard.append(sock.recv(65536))
+            sock.sendall(b"HTTP/1.1 101 Switching Protocols\r\n\r\n")
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = Thread(target=answer, args=(listening,))
+        thread.start()
+        with pytest.raises(ssl.SSLError):
+            Client(f"wss://127.0.0.1:{listening.getsockname()[1]}/", token=TOKEN, ca=str(papers / "ca.pem"))
+        thread.join(10)
+    assert not any(TOKEN.encode() in each for each in heard)
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,7 @@ TABLE_PREFIX = "table/"
 PRECISIONS = (FP32, INT8, BF16, FP16)
 LOOP_PREFIX = "loop/"
 """Of the tables of loops beside the original's: ``loop/NAME/CONTEXT``."""
+TABLES = (TABLE_PREFIX, LOOP_PREFIX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +60,14 @@ class Artifact:
     Attributes:
         path: the directory; of a zipped artifact a temporary one, which lives as long as this object.
         manifest: what is not array or graph.
-        weights: constants of all pieces but the pruner's, read-only views of the file.
-        tables: TABLE contexts ``[K, ...]`` of the original loop, read-only views of the file.
+        weights: constants of all pieces but the pruner's, read-only; views of a large file.
+        tables: TABLE contexts ``[K, ...]`` of the original loop, read-only.
         loop_tables: the same of the other loops that begin with noise, by their name.
         pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
         loop_pruners: the same of loops that have a pruner of their own, by their name.
         plans: by name, ``dense`` the first of them.
         block_weights: by the name of weights that plans may have, the constants that blocks have in place of those of
-            ``weights``; read-only views of the files.
+            ``weights``; read-only, views of large files.
         envelope: of what its corrections were fitted on; None where that is not known.
     """
 
@@ -279,17 +280,17 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     check_models(directory, manifest.models, manifest.acting)
     others = sorted(manifest.files.keys() - manifest.models - {manifest.stores.program})
     tensors.require_few((directory / name for name in others), directory)
-    stored = tensors.read(directory / manifest.stores.weights)
+    stored = tensors.read(directory / manifest.stores.weights, lambda name: not name.startswith(TABLES))
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}
     for name, record in manifest.weights.items():
-        block_weights[name] = own = tensors.read(directory / record.weights)
+        block_weights[name] = own = tensors.read(directory / record.weights, lambda name: True)
         of_weights = {n: (str(stored[n].dtype), stored[n].shape) for n in own if n in stored}
         tensors.check_arrays(f"{name} weight", own, of_weights, directory)
     return Artifact(
         path=path,
         manifest=manifest,
-        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith((TABLE_PREFIX, LOOP_PREFIX))}),
+        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLES)}),
         tables=tables.pop(ORIGINAL),
         loop_tables=MappingProxyType(tables),
         pruner=_optional(directory, manifest.stores.pruner),

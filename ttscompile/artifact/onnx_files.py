@@ -1,8 +1,9 @@
-"""Where the weights of ONNX models lie, and how many parts they have, read with numpy's dependencies alone: none.
+"""Where weights of ONNX models lie, what they run and how many parts they have, read with numpy's dependencies: none.
 
 onnxruntime opens whatever file a model names beside it, and makes an object of a hundred bytes of a message of two.
 Here each of these names is held against the manifest before onnxruntime sees the model: a file of the artifact, whose
-hash was checked, and a range inside it. And all fields are counted, whether they lead to a tensor or not.
+hash was checked, and a range inside it. All fields are counted, whether they lead to a tensor or not. And operators
+that ``convert`` never writes are refused: those that loop, which may never end, and those of others.
 Source: the format of messages, https://protobuf.dev/programming-guides/encoding/, and the field numbers of onnx.proto.
 """
 
@@ -22,14 +23,15 @@ MAX_BYTES = 64 * 2**20
 MAX_FIELDS = 1_000_000
 """In all models of an artifact. Push-T has 20,000."""
 MAX_DEPTH = 32
+LOOPS = frozenset({"Loop", "Scan", "SequenceMap"})
+INTEGER = frozenset({"DynamicQuantizeMatMul", "MatMulIntegerToFloat"})
+"""What an artifact has of onnxruntime's own operators."""
 
 _SPARSE = "sparse"
 # Fields that hold messages, by message; but for messages of which each has a few numbers and texts only.
 _FIELDS: Mapping[str, Mapping[int, str]] = {
-    "model": {7: "graph", 20: "training", 25: "function"},
+    "model": {7: "graph"},
     "graph": {1: "node", 5: "tensor", 11: "value", 12: "value", 13: "value", 14: "annotation", 15: _SPARSE},
-    "training": {1: "graph", 2: "graph"},
-    "function": {7: "node", 11: "attribute", 12: "value"},
     "node": {5: "attribute", 10: "devices"},
     "attribute": {5: "tensor", 10: "tensor", 6: "graph", 11: "graph", 14: "type", 15: "type", 22: _SPARSE, 23: _SPARSE},
     _SPARSE: {1: "tensor", 2: "tensor"},
@@ -46,6 +48,8 @@ _FIELDS: Mapping[str, Mapping[int, str]] = {
     "sharded": {},
 }
 _EXTERNAL_DATA = 13
+_OPERATOR, _DOMAIN = 4, 7
+_TRAINING, _FUNCTION = 20, 25
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
@@ -56,8 +60,15 @@ class _Left:
     fields: int = MAX_FIELDS
 
 
+class _ForeignError(ValueError):
+    """Of what ``convert`` never writes."""
+
+
 def check_models(directory: Path, names: Iterable[str], files: Mapping[str, FileRecord]) -> None:
-    """Raise ArtifactError unless all weights of models are in them, or in ranges of these files, which were checked."""
+    """Raise ArtifactError unless models run what ``convert`` writes, and all weights are in them or in these files.
+
+    A model runs operators of the standard that do not loop, and those of ``INTEGER``. The files were checked.
+    """
     left, names = _Left(), sorted(names)
     if (total := sum(files[name].bytes for name in names)) > MAX_BYTES:
         raise ArtifactError(f"{directory}: expected ONNX models of {MAX_BYTES} bytes at most; found {total}. {REMEDY}")
@@ -72,7 +83,8 @@ def check_models(directory: Path, names: Iterable[str], files: Mapping[str, File
                         f" {str(place)[:200]}. {REMEDY}"
                     )
         except (ValueError, IndexError) as error:
-            found = error if left.fields < 0 else "a message that ends amiss"
+            told = left.fields < 0 or isinstance(error, _ForeignError)
+            found = error if told else "a message that ends amiss"
             raise ArtifactError(f"{path}: expected an ONNX model; found {found}. {REMEDY}") from error
 
 
@@ -80,7 +92,7 @@ def _places(message: memoryview, kind: str, depth: int, left: _Left) -> Iterator
     """The entries of ``external_data`` of each tensor below a message that has not its data itself."""
     if depth > MAX_DEPTH:
         raise ValueError("messages too deep in each other")
-    fields, entries = _FIELDS[kind], dict[str, str]()
+    fields, entries, operators = _FIELDS[kind], dict[str, str](), (set[str](), set[str]())
     for number, value in _read(message, left):
         if value is None:
             continue
@@ -91,8 +103,21 @@ def _places(message: memoryview, kind: str, depth: int, left: _Left) -> Iterator
             if texts.get(1, "") in entries:
                 raise ValueError("an entry twice")
             entries[texts.get(1, "")] = texts.get(2, "")
+        elif kind == "node" and number in (_OPERATOR, _DOMAIN):
+            operators[number == _DOMAIN].add(bytes(value).decode())
+        elif kind == "model" and number in (_TRAINING, _FUNCTION):
+            raise _ForeignError("training, or a function of its own, which convert never writes")
+    _require_known(*operators)
     if entries:
         yield entries
+
+
+def _require_known(names: set[str], domains: set[str]) -> None:
+    """Of one node; the last of each counts, and none may be foreign. Raises _ForeignError."""
+    known = names <= INTEGER if domains - {"", "ai.onnx"} else not names & LOOPS
+    if not known or domains - {"", "ai.onnx", "com.microsoft"}:
+        told = f"{'/'.join(sorted(domains))}:{'/'.join(sorted(names))}"[:100]
+        raise _ForeignError(f"the operator {told!a}, which convert never writes (loops, and operators of others)")
 
 
 def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:

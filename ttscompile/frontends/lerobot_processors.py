@@ -244,6 +244,8 @@ def _statistics(
         if missing:
             raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
         first, second = (_broadcast(directory, name, tensors[name], kind, shape) for name in names)
+        if mode == "MEAN_STD" and (second < 0).any():
+            raise CheckpointError(f"{directory}: {names[1]} has a deviation below 0. Compute the statistics again.")
         result[key] = Statistics(mode, first, second, eps)
     return result
 

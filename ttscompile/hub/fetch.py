@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..core.paths import HUB
 from ..core.untrusted_json import parse_json
 from ..errors import HubError, RuntimeUnavailableError, TtscompileError
 from .name import HubName, plain, read_name
@@ -39,6 +40,7 @@ MOST_MANIFEST_BYTES = 32 << 20
 MOST_CARD_BYTES = 1 << 20
 _ENDS = (".json", ".onnx", ".safetensors", ".txt", _CHECKPOINT)
 """Of the names of an artifact's and a checkpoint's files: nothing that Python imports or unpickles."""
+_COMMIT = re.compile(r"[0-9a-f]{40}")
 _LICENCE = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]{0,99}")
 
 
@@ -146,7 +148,24 @@ def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str],
 
 def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str], anew: bool = False) -> Path:
     """The folder of a commit in the cache, which has its name, with these files of those that there are."""
-    return Path(hub.snapshot_download(repository, revision=revision, allow_patterns=files, force_download=anew))
+    branch, offline = revision or "main", False
+    commit = branch
+    if not _COMMIT.fullmatch(branch):
+        try:
+            commit = str(hub.HfApi().model_info(repository, revision=branch).sha)
+        except hub.errors.HfHubHTTPError:
+            raise
+        except Exception:  # no network, of whichever library: the cache may know what it meant
+            offline = True
+        if not offline and not _COMMIT.fullmatch(commit):  # the library takes it for the name of a folder
+            raise HubError(f"{HUB}{repository}: expected a commit of 40 digits from the hub; found {commit!a:.100}.")
+    options = {"allow_patterns": files, "force_download": anew, "local_files_only": offline}
+    folder = Path(hub.snapshot_download(repository, revision=commit, **options))
+    if commit != branch:  # as the library does where it is given the branch: what it means where nobody answers
+        ref = folder.parents[1] / "refs" / branch
+        ref.parent.mkdir(parents=True, exist_ok=True)
+        ref.write_text(commit)
+    return folder
 
 
 def _listing(hub: Any, repository: str, commit: str) -> list[str]:
