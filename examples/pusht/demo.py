@@ -46,12 +46,12 @@ from variants import first_seed_option, open_variant, results_console, run, thre
 
 EXAMPLES = Path(__file__).resolve().parents[1]
 BUILD = EXAMPLES.parent / "build" / "pusht"
-POLICIES: Mapping[str, tuple[Path, Mapping[str, str]]] = {
-    "flow": (EXAMPLES / "policies" / "flow" / "policy", {"task": "push the T onto its place"}),
-    "transformer": (EXAMPLES / "pusht" / "pusht_dpt_ema_fp16.ckpt", {}),
-    "unet": (EXAMPLES / "policies" / "unet" / "pusht_unet_ema_fp16.ckpt", {}),
+POLICIES: Mapping[str, tuple[Path, str | None]] = {
+    "flow": (EXAMPLES / "policies" / "flow" / "policy", "push the T onto its place"),
+    "transformer": (EXAMPLES / "pusht" / "pusht_dpt_ema_fp16.ckpt", None),
+    "unet": (EXAMPLES / "policies" / "unet" / "pusht_unet_ema_fp16.ckpt", None),
 }
-"""Checkpoints that push the T, and what ``build`` has to be told of them."""
+"""Checkpoints that push the T, and their instructions."""
 ORIGINAL, SAFE = "original", "safe"
 
 
@@ -185,7 +185,7 @@ def main(
 ) -> None:
     """Build a policy that pushes the T, and say whether it is as good as the original."""
     console = results_console()
-    checkpoint, told = POLICIES[policy]
+    checkpoint, task = POLICIES[policy]
     directory = directory / policy
     directory.mkdir(parents=True, exist_ok=True)
     artifact, calls = directory / "compiled", directory / "calls.npz"
@@ -193,11 +193,11 @@ def main(
     console.print(one_line(machine), highlight=False, soft_wrap=True)
 
     console.rule("1 of 4: record what the policy observes")
-    ttscompile.convert(checkpoint, directory / "original", **told)
+    ttscompile.convert(checkpoint, directory / "original", task=task)
     console.print(f"{record_calls(directory / 'original', calls, record_episodes, batch, threads)}: {calls}")
 
     console.rule("2 of 4: build: what can be left out of a call?")
-    ttscompile.build(checkpoint, artifact, [calls], max_minutes=minutes, **told)
+    ttscompile.build(checkpoint, artifact, [calls], max_minutes=minutes, task=task)
     built = load_artifact(artifact)
     print_frontier(built, artifact, console, threads=1)
 
