@@ -18,6 +18,7 @@ from ttscompile.cli.options import (
     names_option,
     number_option,
     ray_option,
+    seed_option,
     threads_option,
 )
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
@@ -39,6 +40,11 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     "--target-sparsity",
     SHARE,
     "Reuse this share of the cells. Without any budget it is 0.95, or what leaves five steps to compute.",
+)
+@number_option(
+    "--target-flops",
+    SHARE,
+    "Save this share of the FLOPs of a dense call, prologue and pruner counted, in place of --target-sparsity.",
 )
 @number_option(
     "--latency-ms",
@@ -67,6 +73,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     show_default=True,
     help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
+@seed_option("Seed of the split, the noise and the training.")
 @click.option(
     "--max-minutes",
     cls=NumberOption,

@@ -101,6 +101,11 @@ runtime_options = together(
 """Of commands that run an artifact in a runtime of choice."""
 
 
+def seed_option(help: str) -> Decorator:
+    """``--seed``."""
+    return count_option("--seed", help, default=0, least=0, most=MOST_SEED)
+
+
 ray_option = click.option(
     "--ray",
     type=ANY_TEXT,

@@ -10,7 +10,7 @@ import numpy as np
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.observed import observed
-from ttscompile.cli.options import MOST_SEED, artifact_argument, count_option, json_option
+from ttscompile.cli.options import artifact_argument, json_option, seed_option
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
 from ttscompile.errors import ObservationError
@@ -55,7 +55,7 @@ def _numbers(_: click.Context, __: click.Parameter, value: str | None) -> Any:
 )
 @click.option("--plan", type=TEXT, help="Compute this plan. Without this option it is the default plan.")
 @click.option("--plot", "picture", type=PICTURE, help="Draw the chunk into this file (.png, .svg or .pdf).")
-@count_option("--seed", "Seed of the noise that the actions are made of.", default=0, least=0, most=MOST_SEED)
+@seed_option("Seed of the noise that the actions are made of.")
 @json_option
 def predict(
     directory: Path,

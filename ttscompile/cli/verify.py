@@ -9,7 +9,7 @@ from rich.console import Console
 
 import ttscompile
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.options import artifact_argument, count_option, json_option, threads_option
+from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
 from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
@@ -19,8 +19,6 @@ from ttscompile.report.verified import figure
 @click.command(cls=FilesCommand)
 @artifact_argument
 @trajectories_options(required=False, what="Check what the plans do on these recorded episodes, too.")
-@count_option("--calls", "Check so many recorded calls at least; whole episodes are taken.", default=24)
-@threads_option("Threads that onnxruntime computes with.")
 @json_option
 @click.pass_context
 def verify(
@@ -28,8 +26,6 @@ def verify(
     directory: Path,
     trajectories: tuple[Path, ...],
     sources: Sources,
-    calls: int,
-    threads: int,
     as_json: bool,
 ) -> None:
     """Check the artifact DIRECTORY against the answers of the original network that it holds.
@@ -43,14 +39,12 @@ def verify(
             directory,
             trajectories,
             sources=sources,
-            calls=calls,
-            threads=threads,
             progress=lambda what: status.update(f"verifying: {what}"),
         )
     for rung in found.skipped:
         say(console, f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}")
     if as_json:
-        print_json({"machine": fingerprint(), "threads": threads, **found.to_json()})
+        print_json({"machine": fingerprint(), **found.to_json()})
     else:
         _print(found, results())
     if not found.passed:
