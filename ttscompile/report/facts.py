@@ -242,6 +242,8 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
     score = scores(record).get(str(name), {})
     if not isinstance(distance := score.get("distance"), int | float):
         return ()
+    if record.get("other_noise") == 0:
+        return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
     where, cost = "above a quarter", "18 points of success and more"
     if distance <= NEAR:
         where, cost = "within a tenth", "at most 1.5 points of success"
