@@ -3,7 +3,7 @@
 Blocks of a policy stream their weights from memory once a step, which is what they wait for; a quarter of the bytes,
 and the processor's integer dot product, make them faster. An image encoder waits for arithmetic, of which the integer
 dot product does four times as much. Everything beside these products stays in float32: layer norms, softmax,
-activations, biases, the residual itself, and attention among few tokens (``integer_attention``).
+activations, biases, the residual itself, and attention among few tokens (``integers``).
 """
 
 from __future__ import annotations
@@ -22,8 +22,17 @@ from ..core.spec import FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
-from .integer_attention import HEADS, attention_of, integer_attention
-from .integer_convolution import DOMAIN, INTEGER_PRODUCT, convolution_of, integer_convolution, shapes_of
+from .integers import (
+    DOMAIN,
+    DYNAMIC_PRODUCT,
+    HEADS,
+    INTEGER_PRODUCT,
+    attention_of,
+    convolution_of,
+    integer_attention,
+    integer_convolution,
+    shapes_of,
+)
 from .onnx_model import live_nodes
 
 if TYPE_CHECKING:
@@ -42,9 +51,6 @@ LEAST_ROWS = 8
 knows of the world: a position, features and a sentence, whose sizes have nothing to do with each other."""
 
 _DOMAIN_VERSION = 1
-_PRODUCT = "DynamicQuantizeMatMul"
-"""Reads float32, quantises it to uint8 with one scale and zero point for the whole tensor, multiplies with int8 weights
-into int32, scales by column and adds the bias. Fastest of what onnxruntime 1.31 has; see ``docs/decisions.md``."""
 
 LARGEST = 127
 """Weights are in -127..127: symmetric, so that a zero point never enters the product."""
@@ -156,7 +162,7 @@ def _notes(
     if lowered:
         where = f"{len(lowered)} of {len(pieces)} blocks" if part == BLOCKS else part
         convolved = f", {kinds[INTEGER_PRODUCT]} of convolutions" if kinds[INTEGER_PRODUCT] else ""
-        count = kinds[_PRODUCT] + kinds[INTEGER_PRODUCT]
+        count = kinds[DYNAMIC_PRODUCT] + kinds[INTEGER_PRODUCT]
         megabytes = sum(value.nbytes for value in constants.values()) / 1e6
         attending = f", and {kinds[HEADS]} attentions" if kinds[HEADS] else ""
         yield f"{precision}: {count} matrices of {where}, {megabytes:.1f} MB{convolved}{attending}"
@@ -292,7 +298,7 @@ def _integer_product(node: NodeProto, product: _Product, constants: dict[str, Ar
     """The node that takes the place of ``node``; its constants go into ``constants``."""
     name, scale = _integers(product.matrix.name, product.matrix.value, constants)
     inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
-    return NodeProto(name=node.name, op_type=_PRODUCT, domain=DOMAIN, input=inputs, output=node.output)
+    return NodeProto(name=node.name, op_type=DYNAMIC_PRODUCT, domain=DOMAIN, input=inputs, output=node.output)
 
 
 def _integers(constant: str, matrix: Array, constants: dict[str, Array]) -> tuple[str, str]:

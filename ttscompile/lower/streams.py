@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from onnx import GraphProto, ModelProto, TensorProto
+from onnx import ModelProto, TensorProto
 
 from ..ir.program import Program
 from .contexts import Contexts, StreamContexts
@@ -46,24 +46,8 @@ def write_streams(
     """
     count = main.op("Shape", plans.different, start=0, end=1)
     carried = [inputs.initial, main.op("SequenceEmpty"), main.op("SequenceEmpty", dtype=INT64)]
-    body = _of_one_plan(main.inner(), program, models, weights, contexts, plans, inputs, keep)
-    count = main.op("Reshape", count, main.constant(np.zeros(0)))
-    sample, rows, cells = main.ops("Loop", [count, "", *carried], len(carried), body=body)
-    new_rows, new_cells = (main.op("ConcatFromSequence", each, axis=0) for each in (rows, cells))
-    return sample, new_rows, new_cells
-
-
-def _of_one_plan(
-    w: GraphWriter,
-    program: Program,
-    models: Mapping[str, ModelProto],
-    weights: Weights,
-    contexts: Contexts,
-    plans: ExecutedPlans,
-    inputs: LoopInputs,
-    keep: str,
-) -> GraphProto:
-    """Body of the loop: carries all samples, and sequences of rows and of their cells."""
+    # The body, of the streams of one plan, carries all samples, and sequences of rows and of their cells.
+    w = main.inner()
     i, on, samples, rows, cells = (w.fresh(n) for n in ("i", "on", "samples", "rows", "cells"))
     steps, groups = program.spec.sampler.steps, [block.group for block in program.blocks]
     members = w.op("Reshape", w.op("NonZero", w.op("Equal", plans.which, i)), w.constant([-1]))
@@ -87,7 +71,7 @@ def _of_one_plan(
     new = w.op("Reshape", by_stream, shape, allowzero=1)
     more = [w.op("SequenceInsert", rows, new), w.op("SequenceInsert", cells, flat)]
     going_on = w.op("Identity", on)
-    return w.graph(
+    body = w.graph(
         "streams_of_one_plan",
         [tensor(going_on, np.bool_), tensor(every, np.float32), sequence(more[0]), sequence(more[1], np.int64)],
         [
@@ -98,6 +82,10 @@ def _of_one_plan(
             sequence(cells, np.int64),
         ],
     )
+    count = main.op("Reshape", count, main.constant(np.zeros(0)))
+    sample, *kept_ones = main.ops("Loop", [count, "", *carried], len(carried), body=body)
+    new_rows, new_cells = (main.op("ConcatFromSequence", each, axis=0) for each in kept_ones)
+    return sample, new_rows, new_cells
 
 
 def _uncorrected(w: GraphWriter, inputs: LoopInputs, far: str) -> LoopInputs:
