@@ -152,28 +152,30 @@ class Sessions:
             if precision not in self._careful:
                 self._careful[precision] = needs_care(precision)
             self._contents = self._contents or _contents(view)
-            session = _open_file(view, file, _options(threads, spins, self._careful[precision], self._contents))
+            session = _open_file(view, file, threads, spins, self._careful[precision], self._contents)
             self._known[file, threads, spins] = session
         return self._known[file, threads, spins]
 
 
 def _contents(view: View) -> dict[str, bytes]:
-    """Files with weights, by name, if they are small: what onnxruntime is given in memory it does not map.
-
-    None otherwise: it is given all that its models name, or nothing.
-    """
+    """All files with weights if they are small, or none: what onnxruntime is given in memory it does not map."""
     sizes = {name: record.bytes for name, record in view.manifest.acting.items() if name.endswith(".safetensors")}
     small = sum(sizes.values()) < MAPPED
     return {name: read_file(view.artifact.files / name, size) for name, size in sizes.items()} if small else {}
 
 
-def _open_file(view: View, file: str, options: Any) -> Any:
-    import onnxruntime as ort
-
+def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool, contents: dict[str, bytes]) -> Any:
+    try:
+        import onnxruntime as ort
+    except ImportError as error:
+        problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
+        raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
     if os.environ.get(CONFIG_FROM_MODEL) not in (None, "", "0"):
         problem = f"the environment variable {CONFIG_FROM_MODEL} has onnxruntime ignore the threads and options that"
         raise RuntimeUnavailableError(f"{problem} a policy is loaded with. Unset it.")
-    path = view.artifact.files / file
+    path, options = view.artifact.files / file, _options(ort, threads, spins, careful)
+    if contents and (give := getattr(options, "add_external_initializers_from_files_in_memory", None)):  # from 1.24 on
+        give(list(contents), list(contents.values()), [len(content) for content in contents.values()])
     try:
         session = ort.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
     except Exception as error:  # onnxruntime's own classes are derived from Exception
@@ -189,22 +191,13 @@ def _open_file(view: View, file: str, options: Any) -> Any:
             f"{path}: onnxruntime {ort.__version__} cannot load this graph: {error} Install the version that the"
             f" artifact asks for (>= {view.manifest.requires.onnxruntime}), or convert the checkpoint again."
         ) from error
-    if options.intra_op_num_threads > 1:
+    if threads > 1:
         _threaded.add(session)
     return session
 
 
-def _options(threads: int, spin: bool, careful: bool, contents: Mapping[str, bytes]) -> Any:
-    """Options of a session. ``contents`` have to live until it is open."""
-    try:
-        import onnxruntime as ort
-    except ImportError as error:
-        problem = f"runtime 'onnxruntime' needs the package onnxruntime, which cannot be imported ({error})."
-        raise RuntimeUnavailableError(f"{problem} Run: pip install onnxruntime.") from error
+def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
     options = ort.SessionOptions()
-    give = getattr(options, "add_external_initializers_from_files_in_memory", None)  # from onnxruntime 1.24 on
-    if contents and give is not None:
-        give(list(contents), list(contents.values()), [len(content) for content in contents.values()])
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.intra_op_num_threads = threads

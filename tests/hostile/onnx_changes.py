@@ -32,8 +32,10 @@ SIZES = (
     "1e9",
     "4096",
 )
-OPERATIONS = ("Identity", "Reshape", "Add", "MatMul", "ConstantOfShape", "Loop", "If", "RandomNormal", "Tile", "Gather")
-OPERATIONS += ("Scan", "SequenceMap", "NonZero", "Unique", "Resize", "TopK", "Expand", "Pad", "DynamicQuantizeMatMul")
+OPERATIONS = (
+    *("Identity", "Reshape", "Add", "MatMul", "ConstantOfShape", "Loop", "If", "RandomNormal", "Tile", "Gather"),
+    *("Scan", "SequenceMap", "NonZero", "Unique", "Resize", "TopK", "Expand", "Pad", "DynamicQuantizeMatMul"),
+)
 DIMENSIONS = (0, -1, 1, 2, 3, 2**31, 2**40, 2**62, 2**63 - 1)
 
 

@@ -70,7 +70,11 @@ def training(model: onnx.ModelProto) -> None:
     model.training_info.add()
 
 
-@pytest.mark.parametrize("change", [endless, hidden, of_others, of_onnxruntime, function, training])
+def devices(model: onnx.ModelProto) -> None:
+    model.graph.node[0].device_configurations.add()
+
+
+@pytest.mark.parametrize("change", [endless, hidden, of_others, of_onnxruntime, function, training, devices])
 def test_what_convert_never_writes(change: Callable[[onnx.ModelProto], None], tmp_path: Path) -> None:
     write_tiny(tmp_path / "compiled")
     path = tmp_path / "compiled" / "stem.onnx"

@@ -241,7 +241,7 @@ def test_a_robot_that_disappears_ends_the_rollout(
         pytest.skip("the robot measures what the other policy observes")
     sent = tmp_path / "sent.txt"
     robot = ["--robot.type=still_robot", f"--robot.log={sent}", "--robot.frames=8"]
-    run = ["--task=push", "--fps=10", "--duration=60", f"--inference.type={inference}", "--play_sounds=false"]
+    run = ["--task=push", "--fps=10", "--duration=500", f"--inference.type={inference}", "--play_sounds=false"]
     began = time.monotonic()
     result = command(
         "tests.plugins.still_robot",
@@ -251,7 +251,7 @@ def test_a_robot_that_disappears_ends_the_rollout(
         *robot,
         *run,
     )
-    assert time.monotonic() - began < 50, "it went on without a robot"
+    assert time.monotonic() - began < 300, "it went on without a robot"
     assert result.returncode != 0
     assert "the robot does not answer any more" in result.stderr
     actions = np.loadtxt(sent, ndmin=2)

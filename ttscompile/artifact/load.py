@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import Correction
@@ -50,7 +51,6 @@ TABLE_PREFIX = "table/"
 PRECISIONS = (FP32, INT8, BF16, FP16)
 LOOP_PREFIX = "loop/"
 """Of the tables of loops beside the original's: ``loop/NAME/CONTEXT``."""
-TABLES = (TABLE_PREFIX, LOOP_PREFIX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Artifact:
         path: the directory; of a zipped artifact a temporary one, which lives as long as this object.
         manifest: what is not array or graph.
         weights: constants of all pieces but the pruner's, read-only; views of a large file.
-        tables: TABLE contexts ``[K, ...]`` of the original loop, read-only.
+        tables: TABLE contexts ``[K, ...]`` of the original loop, which are read and never mapped.
         loop_tables: the same of the other loops that begin with noise, by their name.
         pruner: constants of the pruner (their names start with ``pruner.``); empty if there is none.
         loop_pruners: the same of loops that have a pruner of their own, by their name.
@@ -280,17 +280,17 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     check_models(directory, manifest.models, manifest.acting)
     others = sorted(manifest.files.keys() - manifest.models - {manifest.stores.program})
     tensors.require_few((directory / name for name in others), directory)
-    stored = tensors.read(directory / manifest.stores.weights, lambda name: not name.startswith(TABLES))
+    stored = tensors.read(directory / manifest.stores.weights)
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}
     for name, record in manifest.weights.items():
-        block_weights[name] = own = tensors.read(directory / record.weights, lambda name: True)
+        block_weights[name] = own = tensors.read(directory / record.weights)
         of_weights = {n: (str(stored[n].dtype), stored[n].shape) for n in own if n in stored}
         tensors.check_arrays(f"{name} weight", own, of_weights, directory)
     return Artifact(
         path=path,
         manifest=manifest,
-        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith(TABLES)}),
+        weights=MappingProxyType({n: a for n, a in stored.items() if not n.startswith((TABLE_PREFIX, LOOP_PREFIX))}),
         tables=tables.pop(ORIGINAL),
         loop_tables=MappingProxyType(tables),
         pruner=_optional(directory, manifest.stores.pruner),
@@ -317,7 +317,7 @@ def _tables(
 ) -> Mapping[str, npt.NDArray[Any]]:
     """The TABLE contexts of a loop that begins with noise."""
     prefix, steps = table_prefix(loop), manifest.sampler_of(loop).steps
-    tables = {n.removeprefix(prefix): array for n, array in stored.items() if n.startswith(prefix)}
+    tables = {n.removeprefix(prefix): np.array(array) for n, array in stored.items() if n.startswith(prefix)}
     kinds = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
     wanted = {name: (kind.dtype, (steps, *kind.at(1))) for name, kind in kinds.items()}
     tensors.check_arrays("table", tables, wanted, where / manifest.stores.weights)

@@ -32,7 +32,7 @@ _SPARSE = "sparse"
 _FIELDS: Mapping[str, Mapping[int, str]] = {
     "model": {7: "graph"},
     "graph": {1: "node", 5: "tensor", 11: "value", 12: "value", 13: "value", 14: "annotation", 15: _SPARSE},
-    "node": {5: "attribute", 10: "devices"},
+    "node": {5: "attribute"},
     "attribute": {5: "tensor", 10: "tensor", 6: "graph", 11: "graph", 14: "type", 15: "type", 22: _SPARSE, 23: _SPARSE},
     _SPARSE: {1: "tensor", 2: "tensor"},
     "tensor": {},
@@ -43,13 +43,10 @@ _FIELDS: Mapping[str, Mapping[int, str]] = {
     "shape": {},
     "item": {1: "type"},
     "map": {2: "type"},
-    "devices": {2: "sharding"},
-    "sharding": {4: "sharded"},
-    "sharded": {},
 }
 _EXTERNAL_DATA = 13
 _OPERATOR, _DOMAIN = 4, 7
-_TRAINING, _FUNCTION = 20, 25
+_FOREIGN = {("model", 20), ("model", 25), ("node", 10)}
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
@@ -58,10 +55,6 @@ class _Left:
     """How many fields may still be read."""
 
     fields: int = MAX_FIELDS
-
-
-class _ForeignError(ValueError):
-    """Of what ``convert`` never writes."""
 
 
 def check_models(directory: Path, names: Iterable[str], files: Mapping[str, FileRecord]) -> None:
@@ -83,8 +76,7 @@ def check_models(directory: Path, names: Iterable[str], files: Mapping[str, File
                         f" {str(place)[:200]}. {REMEDY}"
                     )
         except (ValueError, IndexError) as error:
-            told = left.fields < 0 or isinstance(error, _ForeignError)
-            found = error if told else "a message that ends amiss"
+            found = error if type(error) is ValueError else "a message that ends amiss"
             raise ArtifactError(f"{path}: expected an ONNX model; found {found}. {REMEDY}") from error
 
 
@@ -105,19 +97,19 @@ def _places(message: memoryview, kind: str, depth: int, left: _Left) -> Iterator
             entries[texts.get(1, "")] = texts.get(2, "")
         elif kind == "node" and number in (_OPERATOR, _DOMAIN):
             operators[number == _DOMAIN].add(bytes(value).decode())
-        elif kind == "model" and number in (_TRAINING, _FUNCTION):
-            raise _ForeignError("training, or a function of its own, which convert never writes")
+        elif (kind, number) in _FOREIGN:
+            raise ValueError("training, functions of its own, or devices, which convert never writes")
     _require_known(*operators)
     if entries:
         yield entries
 
 
 def _require_known(names: set[str], domains: set[str]) -> None:
-    """Of one node; the last of each counts, and none may be foreign. Raises _ForeignError."""
+    """Of one node; the last of each counts, and none may be foreign. Raises ValueError."""
     known = names <= INTEGER if domains - {"", "ai.onnx"} else not names & LOOPS
     if not known or domains - {"", "ai.onnx", "com.microsoft"}:
         told = f"{'/'.join(sorted(domains))}:{'/'.join(sorted(names))}"[:100]
-        raise _ForeignError(f"the operator {told!a}, which convert never writes (loops, and operators of others)")
+        raise ValueError(f"the operator {told!a}, which convert never writes (loops, and operators of others)")
 
 
 def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
@@ -30,7 +30,7 @@ Array = npt.NDArray[Any]
 
 MAX_HEADER_BYTES = 64 * 2**20
 MAPPED = 2**23
-"""Bytes of a file from which on arrays may be mapped: a file that ends earlier by then ends the process that reads."""
+"""Bytes of a file from which on it is mapped: one that ends earlier by then ends the process that reads."""
 
 _PREFIX = 8
 _DTYPES: Mapping[str, np.dtype[Any]] = MappingProxyType(
@@ -128,43 +128,31 @@ def offsets(path: Path) -> dict[str, tuple[int, int]]:
     return {name: (entry.offset, entry.length) for name, entry in read_header(path).items()}
 
 
-def read(path: Path, mapped: Callable[[str], bool] = lambda name: False) -> Mapping[str, Array]:
-    """Read a safetensors file.
-
-    Args:
-        mapped: by name, whether an array of a file of ``MAPPED`` bytes or more is a view of the file, of which nothing
-            is read before it is used.
+def read(path: Path) -> Mapping[str, Array]:
+    """Read a safetensors file, or map it into memory if it is large.
 
     Returns:
-        Read-only arrays.
+        Read-only arrays. Of a file of ``MAPPED`` bytes or more they are views: nothing is read before it is used.
 
     Raises:
         ArtifactError: see ``read_header``.
         ArtifactChangedError: the file has become shorter meanwhile.
     """
     with opened(path) as file:
-        entries, view = _header(file, path), np.empty(0, np.uint8)
-        if os.fstat(file.fileno()).st_size >= MAPPED and any(map(mapped, entries)):
-            view = np.memmap(file, dtype=np.uint8, mode="r").view(np.ndarray)
-        return MappingProxyType(
-            {
-                name: _data(file, path, entry, view if mapped(name) else view[:0])
-                .view(entry.dtype)
-                .reshape(entry.shape)
-                for name, entry in entries.items()
-            }
-        )
-
-
-def _data(file: BufferedReader, path: Path, entry: Entry, view: Array) -> Array:
-    """The bytes of an array: those of the view of a file, or else read."""
-    if view.size:
-        return view[entry.offset : entry.offset + entry.length]
-    file.seek(entry.offset)
-    content = np.frombuffer(file.read(entry.length), np.uint8)
-    if content.size != entry.length:
+        size, entries = os.fstat(file.fileno()).st_size, _header(file, path)
+        if size < MAPPED:
+            file.seek(0)
+            data: Array = np.frombuffer(file.read(), np.uint8)
+        else:
+            data = np.memmap(file, dtype=np.uint8, mode="r").view(np.ndarray)
+    if len(data) < size:
         raise ArtifactChangedError(f"{path.name}: the file was changed while it was being read. Load it again.")
-    return content
+    return MappingProxyType(
+        {
+            name: data[entry.offset : entry.offset + entry.length].view(entry.dtype).reshape(entry.shape)
+            for name, entry in entries.items()
+        }
+    )
 
 
 def check_arrays(

@@ -148,22 +148,19 @@ def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str],
 
 def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str], anew: bool = False) -> Path:
     """The folder of a commit in the cache, which has its name, with these files of those that there are."""
-    branch, offline = revision or "main", False
-    commit = branch
+    commit = branch = revision or "main"
     if not _COMMIT.fullmatch(branch):
         try:
             commit = str(hub.HfApi().model_info(repository, revision=branch).sha)
         except hub.errors.HfHubHTTPError:
             raise
         except Exception:  # no network, of whichever library: the cache may know what it meant
-            offline = True
-        if not offline and not _COMMIT.fullmatch(commit):  # the library takes it for the name of a folder
+            return Path(hub.snapshot_download(repository, revision=branch, allow_patterns=files, local_files_only=True))
+        if not _COMMIT.fullmatch(commit):  # the library takes it for the name of a folder
             raise HubError(f"{HUB}{repository}: expected a commit of 40 digits from the hub; found {commit!a:.100}.")
-    options = {"allow_patterns": files, "force_download": anew, "local_files_only": offline}
-    folder = Path(hub.snapshot_download(repository, revision=commit, **options))
+    folder = Path(hub.snapshot_download(repository, revision=commit, allow_patterns=files, force_download=anew))
     if commit != branch:  # as the library does where it is given the branch: what it means where nobody answers
-        ref = folder.parents[1] / "refs" / branch
-        ref.parent.mkdir(parents=True, exist_ok=True)
+        (ref := folder.parents[1] / "refs" / branch).parent.mkdir(parents=True, exist_ok=True)
         ref.write_text(commit)
     return folder
 
