@@ -1,7 +1,9 @@
 import json
+import types
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from tests.artifact.tiny import tiny_spec
 from ttscompile.artifact import codec
 from ttscompile.artifact.manifest import SCHEMA_VERSION, Manifest, PlanRecord
 from ttscompile.artifact.strict_json import Value, dump, parse
-from ttscompile.artifact.typed_json import from_json, to_json
+from ttscompile.artifact.typed_json import from_json, read_as, to_json
 from ttscompile.core.spec import Affine, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Batch, TensorType
@@ -206,3 +208,12 @@ def test_a_future_schema_is_named_before_anything_else_is_read() -> None:
 def test_other_documents(content: bytes) -> None:
     with pytest.raises(ArtifactError, match="manifest"):
         codec.decode(content)
+
+
+def test_arrays_are_read_where_numpy_has_a_type_statement_for_them() -> None:
+    """numpy 2.5 on Python 3.12: the origin of ``NDArray[float32]`` is the alias, which knows what it stands for."""
+    alias = SimpleNamespace(__value__=np.ndarray[Any, Any])
+    kind = types.GenericAlias(alias, (np.float32,))  # type: ignore[arg-type]  # as Python 3.12 makes one
+    found = read_as(kind | None, Value([1.0, 2.0], "a"))
+    assert found.dtype == np.float32 and found.tolist() == [1.0, 2.0]
+    assert read_as(kind | None, Value(None, "a")) is None

@@ -61,7 +61,7 @@ def from_json(kind: type[Record], value: Value) -> Record:
 
 def read_as(kind: Any, value: Value) -> Any:
     """A value of any type that a field of a record may have; see ``from_json``."""
-    origin, arguments = get_origin(kind), get_args(kind)
+    origin, arguments = _origin(kind), get_args(kind)
     if origin is Annotated:
         found = read_as(arguments[0], value)
         for rule in arguments[1:]:
@@ -97,6 +97,12 @@ def read_as(kind: Any, value: Value) -> Any:
     return plain[kind]()
 
 
+def _origin(kind: Any) -> Any:
+    """As ``get_origin``; from Python 3.12 on numpy 2.5 has ``NDArray`` as an alias that stands for another type."""
+    origin = get_origin(kind)
+    return get_origin(getattr(origin, "__value__", None)) or origin
+
+
 def _record(kind: Any, value: Value) -> Any:
     hints = _hints(kind)
     members = value.keys(*hints)
@@ -118,7 +124,7 @@ def _read_either(kinds: tuple[Any, ...], value: Value) -> Any:
     if value.data is None and types.NoneType in kinds:
         return None
     rest = [kind for kind in kinds if kind is not types.NoneType]
-    listed = [kind for kind in rest if get_origin(kind) in (tuple, np.ndarray)]
+    listed = [kind for kind in rest if _origin(kind) in (tuple, np.ndarray)]
     single = [kind for kind in rest if kind not in listed]
     return read_as((listed if listed and (isinstance(value.data, list) or not single) else single)[0], value)
 
