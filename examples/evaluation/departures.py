@@ -207,8 +207,8 @@ def show(found: Sequence[Distances], summary: bool, as_json: bool) -> None:
         for name in dict.fromkeys(one.plan for one in found):
             own = [one for one in found if one.plan == name]
             worst = max(own, key=lambda one: one.distance - one.even)
-            figures = (own[0].distance, own[0].even, worst.distance - worst.even)
-            table.add_row(name, *(f"{each:.2f}" for each in figures), worst.departure)
+            shown = own[0].distance, own[0].even, worst.distance - worst.even
+            table.add_row(name, *(f"{each:.2f}" for each in shown), worst.departure)
         results_console().print(table)
         return
     table = Table("departure", "plan", "without correction", "distance", "if nobody looked", "even steps", box=None)

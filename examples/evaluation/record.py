@@ -20,7 +20,10 @@ from environments import Array, environment_class, environment_option
 from rich.console import Console
 from rich.progress import Progress
 from rollout import run_episodes
-from variants import full_plan, open_variant, run, runtime_option, threads_option
+from variants import Policy, full_plan, open_variant, run, runtime_option, threads_option
+
+from ttscompile import Noise
+from ttscompile.runtimes.info import PolicyInfo
 
 
 def save_trajectories(path: Path, episodes: Sequence[Mapping[str, Array]]) -> None:
@@ -44,15 +47,27 @@ class Wanderer:
         policy: whose observations it reads, and whose actions have this range.
     """
 
-    def __init__(self, policy: Any) -> None:
-        self.info, self.reset = policy.info, policy.reset
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
 
-    def predict_action(self, windows: Mapping[str, Array], noise: Any, plan: str | None) -> dict[str, Array]:
+    @property
+    def info(self) -> PolicyInfo:
+        """See ``Policy``."""
+        return self._policy.info
+
+    def reset(self) -> None:
+        """See ``Policy``."""
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: Noise | None = None, plan: Any = None
+    ) -> dict[str, Any]:
         """Actions ``[B, Ta, Da]``, all of a chunk the same: where its noise says."""
+        assert noise is not None
         action = self.info.action
         places = np.tanh(noise.initial[:, :1, : action.action_dim])
         chunks = np.repeat(places, action.stop - action.start, axis=1)
-        return {"action": action.normalizer.unnormalize(chunks.astype(np.float32))}
+        reached = chunks.astype(np.float32)
+        return {"action": reached if action.normalizer is None else action.normalizer.unnormalize(reached)}
 
 
 @click.command()

@@ -35,11 +35,12 @@ def test_the_same_episodes_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_a_wanderer_goes_where_its_noise_says_and_never_out_of_range() -> None:
-    chunk = ChunkSpec(2, 1, 5, Affine(np.array([0.01, 0.02], np.float32), np.array([-1, -2], np.float32)))
+    normalizer = Affine(np.array([0.01, 0.02], np.float32), np.array([-1, -2], np.float32))
+    chunk = ChunkSpec(2, 1, 5, normalizer)
     wanderer = Wanderer(SimpleNamespace(info=SimpleNamespace(action=chunk), reset=lambda: None))
     initial = np.random.default_rng(0).standard_normal((3, 8, 2)).astype(np.float32) * 9
     action = wanderer.predict_action({}, Noise(initial, None), "dense")["action"]
     assert action.shape == (3, 4, 2)
     assert (action == action[:, :1]).all()
-    assert (np.abs(chunk.normalizer.normalize(action)) <= 1).all()
+    assert (np.abs(normalizer.normalize(action)) <= 1).all()
     np.testing.assert_allclose(action[:, 0], (np.tanh(initial[:, 0]) + np.array([1, 2])) / [0.01, 0.02], rtol=1e-5)
