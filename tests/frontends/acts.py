@@ -128,7 +128,7 @@ def _weights(directory: Path) -> dict[str, torch.Tensor]:
 
 def _autoencoder(config: ACTConfig) -> dict[str, torch.Tensor]:
     """The weights of lerobot's ``vae_encoder``, a row of layers like those of the encoder."""
-    width, state = config.dim_model, config.state
+    width, state = config.dim_model, config.vectors.get("robot")
     alike = ACT(replace(config, n_encoder_layers=_BASE["n_vae_encoder_layers"])).encoder.state_dict()
     shapes = {f"vae_encoder.{name}": value for name, value in alike.items()}
     shapes["vae_encoder_cls_embed.weight"] = torch.empty(1, width)

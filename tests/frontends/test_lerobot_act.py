@@ -244,7 +244,9 @@ def test_loops_that_a_build_offers_are_left_out(saved: Path) -> None:
 def test_temporal_ensembling_is_told(changed: Callable[..., Path]) -> None:
     """Chunks are executed as they are; what to do about it is said."""
     directory = changed(temporal_ensemble_coeff=0.01, n_action_steps=1)
-    with pytest.warns(UserWarning, match="no temporal ensembling: select_action and the executor take the first 1 "):
+    with pytest.warns(
+        UserWarning, match="no temporal ensembling here: select_action and the executor take the first 1 "
+    ):
         _, spec = load_checkpoint_policy(directory)
     assert (spec.chunk.start, spec.chunk.stop) == (0, 1)
 
@@ -268,4 +270,4 @@ def test_defaults_are_lerobots(changed: Callable[..., Path]) -> None:
     assert (config.chunk_size, config.dim_model, config.n_heads, config.dim_feedforward) == (100, 512, 8, 3200)
     assert (config.n_encoder_layers, config.n_decoder_layers, config.latent_dim) == (4, 1, 32)
     assert (config.vision_backbone, config.pre_norm, config.gelu) == ("resnet18", False, False)
-    assert config.cameras == ((64, 96), (64, 96)) and config.state is config.environment is None
+    assert config.vectors == {}

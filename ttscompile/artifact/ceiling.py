@@ -15,6 +15,12 @@ FEWEST_STEPS = 5
 """Whole steps that are computed, if nobody asks for fewer. Push-T with the 16 steps of DPM-Solver++: five leave the
 score and nearly the success of all of them, four the score, three neither."""
 
+NOTHING = (
+    "One evaluation gives the actions: there is nothing to reuse between steps. What makes such a policy faster is"
+    " compilation, eight bits, and that frames are computed once."
+)
+"""Said of a policy of one step."""
+
 SOLVER_STEPS = 16
 """Of DPM-Solver++, as suggested in place of many steps."""
 
@@ -27,12 +33,20 @@ def usual_sparsity(steps: int) -> float:
 def few_steps(manifest: Manifest) -> str | None:
     """A warning where the steps are too few for ``TYPICAL_SPARSITY``, with the ceiling; None where they are not."""
     steps = manifest.steps
+    if steps == 1:
+        return NOTHING
     if (most := 1 - 1 / steps) >= TYPICAL_SPARSITY:
         return None
     return (
         f"K = {steps} denoising steps: step 0 is always computed, so at most {most:.1%} of the cells can be reused, and"
         f" no plan has less than 1/{manifest.flops.ceiling(steps):.3g} of the FLOPs of a dense call."
     )
+
+
+def uncalibrated(manifest: Manifest) -> str:
+    """What it means that an artifact is not calibrated."""
+    dense = "Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan."
+    return NOTHING if manifest.steps == 1 else dense
 
 
 def many_steps(manifest: Manifest) -> str | None:

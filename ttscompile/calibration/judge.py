@@ -8,7 +8,8 @@ For draws i < j of noise of one observation, with x the plan's answers and y the
 has the energy distance of the two distributions of answers as its mean, whether or not draw i of the plan has the noise
 of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly
 cancel, and h varies little. ``distance`` is the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can
-be told apart; the root grows as the error does. ``docs/decisions.md`` has the measurements behind norm and root.
+be told apart; the root grows as the error does. ``docs/decisions.md`` has the measurements behind norm and root. Where
+noise changes nothing the unit is another one (``measure.energy.pairs``).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from ..core.lattice import Source, plan_flops, sparsity
 from ..core.plan import Plan
 from ..core.spec import FloatArray
 from ..errors import CalibrationError
-from ..measure.energy import Numbers, pairs, rooted
+from ..measure.energy import SAME, Numbers, pairs, rooted
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport
@@ -155,9 +156,13 @@ def _loop_spec(trials: Trials, plan: Plan) -> Any:
 
 
 def other_noise(trials: Trials) -> float:
-    """How far two answers of the original to one held-out observation are apart, in the units of the actions."""
+    """How far two answers of the original to one held-out observation are apart, in the units of the actions.
+
+    Zero where that is rounding.
+    """
     part = _in_units(trials)
-    return float(np.mean([np.abs(part[:, i] - part[:, j]) for i, j in combinations(range(part.shape[1]), 2)]))
+    apart = float(np.mean([np.abs(part[:, i] - part[:, j]) for i, j in combinations(range(part.shape[1]), 2)]))
+    return apart if apart > SAME * other_observations(trials) else 0.0
 
 
 def other_observations(trials: Trials) -> float:

@@ -153,7 +153,7 @@ def bench(
         if checkpoint is not None:
             entered = [*originals(checkpoint, encoders, threads[0], artifact), *entered]
     default = artifact.manifest.default_plan
-    if default == DENSE:
+    if default == DENSE and artifact.manifest.steps > 1:
         say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
     with console.status("timing") as status:
         measured = measure(entered, calls, seed, lambda done, of: status.update(f"timing: round {done} of {of}"))

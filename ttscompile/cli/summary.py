@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.padding import Padding
 
+from ttscompile.artifact.ceiling import uncalibrated
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.output import print_json, results, table
 from ttscompile.measure.units import flops, share
@@ -67,7 +68,7 @@ def print_summary(artifact: Artifact, console: Console) -> None:
     console.print(Padding(usage.told_unused(artifact), (0, 0, 0, 2)))
     record = manifest.calibration
     if record is None:
-        console.print("Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan.")
+        console.print(uncalibrated(manifest))
         return
     print_facts(console, facts.score_table(record))
     for line in facts.remarks(record):

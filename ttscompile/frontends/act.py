@@ -10,14 +10,17 @@ Source: Zhao et al., Learning Fine-Grained Bimanual Manipulation with Low-Cost H
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .resnet import CHANNELS, SHRINKS, resnet
+from .resnet import CHANNELS, resnet
+
+_PROJECTION = "encoder_{}_state_input_proj"
 
 
 @dataclass(frozen=True)
@@ -25,18 +28,15 @@ class ACTConfig:
     """Sizes and variant of the network; the names are those of lerobot's configuration.
 
     Attributes:
-        state: width of the robot's state; None for none.
-        environment: the same of the environment's.
-        cameras: height and width of each camera's images.
+        vectors: what is observed beside images: width of the state of the ``robot``, and of the environment, ``env``.
+        vision_backbone: name of the ResNet; None without cameras.
         pre_norm: whether a block's input is normalised, rather than the stream after it.
     """
 
     chunk_size: int
     action_dim: int
-    state: int | None
-    environment: int | None
-    cameras: tuple[tuple[int, int], ...]
-    vision_backbone: str
+    vectors: Mapping[str, int]
+    vision_backbone: str | None
     dim_model: int
     n_heads: int
     dim_feedforward: int
@@ -53,30 +53,28 @@ class _Layer(nn.Module):
     def __init__(self, config: ACTConfig, decodes: bool) -> None:
         super().__init__()
         width, inner = config.dim_model, config.dim_feedforward
-        self.pre_norm, self.gelu = config.pre_norm, config.gelu
+        self.pre_norm, self.activation = config.pre_norm, functional.gelu if config.gelu else torch.relu
         self.self_attn = nn.MultiheadAttention(width, config.n_heads, batch_first=True)
         self.multihead_attn = nn.MultiheadAttention(width, config.n_heads, batch_first=True) if decodes else None
         self.linear1, self.linear2 = nn.Linear(width, inner), nn.Linear(inner, width)
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
         self.norm3 = nn.LayerNorm(width) if decodes else None
 
-    def forward(self, x: Tensor, places: Tensor, memory: Tensor | None = None, at: Tensor | None = None) -> Tensor:
-        """Tokens ``[B, T, width]`` and their positions; the encoder's tokens ``[B, S, width]`` without and with theirs."""
-        read = self._before(x, self.norm1)
-        mixed, _ = self.self_attn(read + places, read + places, read, need_weights=False)
-        x, last = self._after(x + mixed, self.norm1), self.norm2
+    def forward(self, x: Tensor, places: Tensor, *memory: Tensor) -> Tensor:
+        """Tokens ``[B, T, width]``, their positions; the encoder's tokens ``[B, S, width]`` with theirs and without."""
+        attend, last = partial(self.self_attn, need_weights=False), self.norm2
+        x = self._added(x, self.norm1, lambda read: attend(read + places, read + places, read)[0])
         if self.multihead_attn is not None and self.norm3 is not None:
-            query, last = self._before(x, self.norm2) + places, self.norm3
-            mixed, _ = self.multihead_attn(query, at, memory, need_weights=False)
-            x = self._after(x + mixed, self.norm2)
-        inner = self.linear1(self._before(x, last))
-        return self._after(x + self.linear2(functional.gelu(inner) if self.gelu else inner.relu()), last)
+            look, last = partial(self.multihead_attn, need_weights=False), self.norm3
+            # What comes before this is the same for all streams: a row that is computed when the policy is compiled.
+            x = self._added(
+                x, self.norm2, lambda read: look((read + places).expand(len(memory[0]), -1, -1), *memory)[0]
+            )
+        return self._added(x, last, lambda read: self.linear2(self.activation(self.linear1(read))))
 
-    def _before(self, x: Tensor, norm: nn.Module) -> Tensor:
-        return norm(x) if self.pre_norm else x  # type: ignore[no-any-return]
-
-    def _after(self, x: Tensor, norm: nn.Module) -> Tensor:
-        return x if self.pre_norm else norm(x)  # type: ignore[no-any-return]
+    def _added(self, x: Tensor, norm: nn.Module, block: Callable[[Tensor], Tensor]) -> Tensor:
+        """The stream after a block, normalised before the block, or after the addition."""
+        return x + block(norm(x)) if self.pre_norm else norm(x + block(x))  # type: ignore[no-any-return]
 
 
 class _Layers(nn.Module):
@@ -92,50 +90,35 @@ class _Layers(nn.Module):
 
 
 class ACT(nn.Module):
-    """The network. Its tokens are [latent, state, environment, each camera's features, pixel by pixel]."""
+    """The network. Its tokens are [latent, vectors, each camera's features, pixel by pixel]."""
 
     def __init__(self, config: ACTConfig) -> None:
         super().__init__()
-        width, vectors = config.dim_model, 1
+        width = config.dim_model
         self.encoder_latent_input_proj = nn.Linear(config.latent_dim, width)
-        for name, size in (("robot", config.state), ("env", config.environment)):
-            if size is not None:
-                self.add_module(f"encoder_{name}_state_input_proj", nn.Linear(size, width))
-                vectors += 1
-        self.encoder_1d_feature_pos_embed = nn.Embedding(vectors, width)
-        if config.cameras:
+        for name, size in config.vectors.items():
+            self.add_module(_PROJECTION.format(name), nn.Linear(size, width))
+        self.encoder_1d_feature_pos_embed = nn.Embedding(1 + len(config.vectors), width)
+        if config.vision_backbone is not None:
             # Frozen batch norm, as lerobot has it, is batch norm that is not trained.
             self.backbone = resnet(3, nn.BatchNorm2d, config.vision_backbone)
             self.encoder_img_feat_input_proj = nn.Conv2d(CHANNELS, width, 1)
-        for number, size in enumerate(config.cameras):
-            rows, columns = (math.ceil(n / SHRINKS) for n in size)
-            self.register_buffer(f"pixels{number}", positions_2d(rows, columns, width), persistent=False)
         self.encoder = _Layers(config, config.n_encoder_layers, decodes=False)
         self.decoder = _Layers(config, config.n_decoder_layers, decodes=True)
         self.decoder_pos_embed = nn.Embedding(config.chunk_size, width)
         self.action_head = nn.Linear(width, config.action_dim)
 
-    def forward(self, state: Tensor | None, environment: Tensor | None, images: Sequence[Tensor]) -> Tensor:
-        """Predict the chunk ``[B, chunk_size, Da]``, normalised.
-
-        Args:
-            state: ``[B, Ds]``, normalised; None where the policy reads none.
-            environment: ``[B, De]``, likewise.
-            images: of each camera ``[B, 3, H, W]``, normalised.
-        """
-        tokens = list[Tensor]()
-        if state is not None:
-            tokens.append(self.encoder_robot_state_input_proj(state).unsqueeze(1))
-        if environment is not None:
-            tokens.append(self.encoder_env_state_input_proj(environment).unsqueeze(1))
+    def forward(self, vectors: Mapping[str, Tensor], images: Sequence[Tensor]) -> Tensor:
+        """The chunk ``[B, chunk_size, Da]`` of vectors ``[B, Ds]`` and images ``[B, 3, H, W]``; all are normalised."""
+        tokens = [self.get_submodule(_PROJECTION.format(name))(each).unsqueeze(1) for name, each in vectors.items()]
         seen = [self.encoder_img_feat_input_proj(self.backbone(image)) for image in images]
         tokens += [features.flatten(2).transpose(1, 2) for features in seen]
         latent = self.encoder_latent_input_proj.bias.expand(tokens[0].shape[0], 1, -1)  # of zeros
-        pixels = (self.get_buffer(f"pixels{number}") for number in range(len(images)))
+        pixels = [positions_2d(*features.shape[2:], features.shape[1]) for features in seen]
         places = torch.cat((self.encoder_1d_feature_pos_embed.weight, *pixels))
         memory = self.encoder(torch.cat((latent, *tokens), dim=1), places)
-        queries = self.decoder_pos_embed.weight.expand(len(memory), -1, -1)
-        made = self.decoder(torch.zeros_like(queries), queries, memory, memory + places)
+        queries = self.decoder_pos_embed.weight.unsqueeze(0)
+        made = self.decoder(torch.zeros_like(queries), queries, memory + places, memory)
         return self.action_head(made)  # type: ignore[no-any-return]
 
 

@@ -29,6 +29,7 @@ from .resnet import DEPTHS
 from .saved_weights import require_weights
 
 _MOST_LAYERS = 256
+_VECTORS = {STATE: "robot", ENVIRONMENT: "env"}
 _COUNTER, _PREFIX = ".num_batches_tracked", "model."
 _ONLY_TRAINED = f"{_PREFIX}vae_encoder"
 """Begins the names of what lerobot evaluates in training alone."""
@@ -49,8 +50,8 @@ def read_config(directory: Path, entries: Mapping[str, Any]) -> tuple[LeRobotCon
     if shared.cameras and (backbone not in DEPTHS or dilated):
         found = f"vision_backbone is {backbone!r:.80}, replace_final_stride_with_dilation {dilated!r:.80}"
         raise CheckpointError(
-            f"{settings.where}{found}; expected {' or '.join(DEPTHS)}, and false. Build the network with lerobot and use"
-            " ttscompile.compile_denoiser(ttscompile.DirectDenoiser(network), spec)."
+            f"{settings.where}{found}; expected {' or '.join(DEPTHS)}, and false. Build the network with lerobot and"
+            " use ttscompile.compile_denoiser(ttscompile.DirectDenoiser(network), spec)."
         )
     width, heads = settings.number("dim_model", 512, MOST), settings.number("n_heads", 8, MOST)
     if width % heads or (shared.cameras and width % 4):
@@ -58,10 +59,8 @@ def read_config(directory: Path, entries: Mapping[str, Any]) -> tuple[LeRobotCon
     return shared, ACTConfig(
         chunk_size=shared.horizon,
         action_dim=shared.action_dim,
-        state=widths.get(STATE),
-        environment=widths.get(ENVIRONMENT),
-        cameras=tuple((height, width) for _, height, width in shared.cameras.values()),
-        vision_backbone=backbone,
+        vectors={name: widths[key] for key, name in _VECTORS.items() if key in widths},
+        vision_backbone=backbone if shared.cameras else None,
         dim_model=width,
         n_heads=heads,
         dim_feedforward=settings.number("dim_feedforward", 3200, MOST),
@@ -103,7 +102,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     for name, value in as_saved(network).items():
         value.copy_(weights[name])
     module = DirectDenoiser(_Observing(shared, processors, network))
-    source = {"policy": "act"} | ({"encoder": config.vision_backbone} if config.cameras else {})
+    source = {"policy": "act"} | ({"encoder": config.vision_backbone} if config.vision_backbone else {})
     return module.eval(), policy_spec(shared, processors, Loops(direct_table()), source)
 
 
@@ -123,5 +122,5 @@ class _Observing(Measured):
         """Observations ``[B, 1, ...]`` by name -> ``[B, T, Da]``."""
         measured = self.measured(observations)
         images = [measured.pop(key) for key in self.cameras]
-        state, environment = (measured[key][:, 0] if key in measured else None for key in (STATE, ENVIRONMENT))
-        return self.network(state, environment, images)  # type: ignore[no-any-return]
+        vectors = {name: measured[key][:, 0] for key, name in _VECTORS.items() if key in measured}
+        return self.network(vectors, images)  # type: ignore[no-any-return]

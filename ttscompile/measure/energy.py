@@ -9,9 +9,18 @@ import numpy.typing as npt
 
 Numbers = npt.NDArray[np.float64]
 
+SAME = 1e-4
+"""Of what another observation changes: what changes less is rounding."""
+
+TENTH = 0.1
+"""Of what another observation changes: the unit of distances where no noise changes anything."""
+
 
 def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
     """h, and how far two answers of the original are apart, mean over the pairs of draws of each call.
+
+    Where noise changes nothing: the square of how far the plan is off, and that of a ``TENTH`` of how far answers to
+    two observations are apart (of 1, where there is one), of which ``rooted`` makes a root mean square in this unit.
 
     Args:
         x: what a plan answers, ``[N, R, A]``.
@@ -26,7 +35,11 @@ def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
         apart = _far(y[:, i], y[:, j])
         found.append((crossed - _far(x[:, i], x[:, j]) - apart, apart))
     h, far = np.mean(found, axis=0)
-    return h, far
+    others = [_far(y[:, 0], np.roll(y[:, 0], n, 0)).mean() for n in range(1, len(y))]
+    observed = float(np.mean(others or [1.0]))
+    if far.mean() > SAME * observed:
+        return h, far
+    return np.square(_far(x, y)).mean(1), np.full(len(x), (TENTH * observed) ** 2)
 
 
 def _far(one: Numbers, other: Numbers) -> Numbers:

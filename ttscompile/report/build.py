@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..artifact.ceiling import uncalibrated
 from ..artifact.load import Artifact
+from ..artifact.manifest import Manifest
 from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
@@ -75,7 +77,7 @@ def build(
         *(() if course is None else (_episode(course),)),
         _latency(measured, given, manifest.default_plan),
         *[frontier] * (not chosen),
-        _calibration(manifest.calibration),
+        _calibration(manifest),
         given.verification,
         facts.limits(artifact),
     )
@@ -195,9 +197,9 @@ def _distance(row: Mapping[str, Any]) -> float:
     return 0.0 if row["name"] == DENSE else max(float(row["distance"]), 0.0)
 
 
-def _calibration(record: Mapping[str, Any] | None) -> Section:
-    if record is None:
-        return Section("Calibration", ("Not calibrated: every call is dense. ttscompile calibrate gives it a plan.",))
+def _calibration(manifest: Manifest) -> Section:
+    if (record := manifest.calibration) is None:
+        return Section("Calibration", (uncalibrated(manifest),))
     scores = facts.scores(record)
     drawn: tuple[Picture, ...] = ()
     told = facts.scores(record, ("sparsity", "error", "error_p90"))

@@ -1,4 +1,4 @@
-"""Policies that give their actions in one evaluation, such as ACT: a module and its table, of one step without noise."""
+"""Policies that give their actions in one evaluation, as ACT does: a module, and its table of one step, no noise."""
 
 from __future__ import annotations
 
