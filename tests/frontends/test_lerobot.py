@@ -288,7 +288,7 @@ def test_a_task_that_is_compiled_in_leaves_no_text_encoder(tmp_path: Path) -> No
 def test_the_command_line_says_what_is_wrong(tmp_path: Path) -> None:
     """Exit status 2 and one message; a directory needs no --format."""
     directory = save_policy(tmp_path)
-    change_json(directory / "config.json", type="act")
+    change_json(directory / "config.json", type="vqbet")
     result = CliRunner().invoke(main, ["convert", str(directory), "-o", str(tmp_path / "out")])
     assert result.exit_code == 2
     assert "no denoising loop" in result.stderr and "Traceback" not in result.stderr

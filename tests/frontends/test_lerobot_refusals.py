@@ -247,7 +247,7 @@ def test_missing_statistics_are_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", ["act", "groot", "xvla", "evo1", "vla_jepa", "wall_x", "eo1", "molmoact2", "pi0_fast", "something_new"]
+    "kind", ["vqbet", "groot", "xvla", "evo1", "vla_jepa", "wall_x", "eo1", "molmoact2", "pi0_fast", "something_new"]
 )
 def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     """Each with what can be done instead."""
@@ -255,7 +255,7 @@ def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     change_json(directory / "config.json", type=kind)
     with pytest.raises(CheckpointError, match=kind) as caught:
         load_checkpoint_policy(directory)
-    remedy = {"act": "no denoising loop", "pi0_fast": "no denoising loop"}
+    remedy = {"vqbet": "no denoising loop", "pi0_fast": "no denoising loop"}
     assert re.search(remedy.get(kind, "compile_denoiser"), str(caught.value))
 
 

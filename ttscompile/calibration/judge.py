@@ -156,10 +156,7 @@ def _loop_spec(trials: Trials, plan: Plan) -> Any:
 
 
 def other_noise(trials: Trials) -> float:
-    """How far two answers of the original to one held-out observation are apart, in the units of the actions.
-
-    Zero where that is rounding.
-    """
+    """How far two answers of the original to one observation are apart, in the actions' units; 0 if it is rounding."""
     part = _in_units(trials)
     apart = float(np.mean([np.abs(part[:, i] - part[:, j]) for i, j in combinations(range(part.shape[1]), 2)]))
     return apart if apart > SAME * other_observations(trials) else 0.0
@@ -306,13 +303,14 @@ def _scored(
     frames = [report.frames for report, _ in reports]
     of = sum(one.of for one in frames)
     block_flops = cells.shape[1] * sum(flops.blocks)
+    computed = float(np.mean([plan_flops(one, flops.blocks) for one in cells]))
     return Score(
         distance=rooted(float(gaps.mean()), float(apart.mean())),
         interval=(float(low), float(high)),
         error=error,
         error_p90=error_p90,
         sparsity=sparsity(cells),
-        flops_sparsity=1 - float(np.mean([plan_flops(one, flops.blocks) for one in cells])) / block_flops,
+        flops_sparsity=1 - computed / block_flops if block_flops else 0.0,
         flops_saved=1 - float(np.mean([report.flops[i] for report, i in reports])) / flops.dense,
         plans=len(np.unique(cells, axis=0)),
         tokens=sum(one.tokens for one in frames) / of if of else 1.0,

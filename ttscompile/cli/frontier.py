@@ -11,7 +11,7 @@ from ttscompile.cli.output import print_identity, say, table
 from ttscompile.core.plan import DENSE
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms
-from ttscompile.report.facts import chosen
+from ttscompile.report.facts import chosen, remarks
 
 
 def print_frontier(artifact: Artifact, directory: Path, output: Console, threads: int) -> None:
@@ -38,7 +38,7 @@ def print_frontier(artifact: Artifact, directory: Path, output: Console, threads
         "Times faster: than the same policy with every step computed, compiled too. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
         f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
-        *chosen(record),
+        *(chosen(record) if record.get("other_noise") else remarks(record)),
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
         "    policy.reset()  # a new episode",

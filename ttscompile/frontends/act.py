@@ -67,9 +67,8 @@ class _Layer(nn.Module):
         if self.multihead_attn is not None and self.norm3 is not None:
             look, last = partial(self.multihead_attn, need_weights=False), self.norm3
             # What comes before this is the same for all streams: a row that is computed when the policy is compiled.
-            x = self._added(
-                x, self.norm2, lambda read: look((read + places).expand(len(memory[0]), -1, -1), *memory)[0]
-            )
+            places = places.expand(len(memory[0]), -1, -1)
+            x = self._added(x, self.norm2, lambda read: look(read + places, *memory)[0])
         return self._added(x, last, lambda read: self.linear2(self.activation(self.linear1(read))))
 
     def _added(self, x: Tensor, norm: nn.Module, block: Callable[[Tensor], Tensor]) -> Tensor:
@@ -100,8 +99,7 @@ class ACT(nn.Module):
             self.add_module(_PROJECTION.format(name), nn.Linear(size, width))
         self.encoder_1d_feature_pos_embed = nn.Embedding(1 + len(config.vectors), width)
         if config.vision_backbone is not None:
-            # Frozen batch norm, as lerobot has it, is batch norm that is not trained.
-            self.backbone = resnet(3, nn.BatchNorm2d, config.vision_backbone)
+            self.backbone = resnet(3, nn.BatchNorm2d, config.vision_backbone)  # lerobot's is frozen, which is the same
             self.encoder_img_feat_input_proj = nn.Conv2d(CHANNELS, width, 1)
         self.encoder = _Layers(config, config.n_encoder_layers, decodes=False)
         self.decoder = _Layers(config, config.n_decoder_layers, decodes=True)
@@ -129,11 +127,8 @@ def positions_2d(height: int, width: int, channels: int) -> Tensor:
     """
     half = channels // 2
     frequencies = 10000 ** (2 * (torch.arange(half, dtype=torch.float32) // 2) / half)
-
-    def waves(count: int) -> Tensor:
-        places = torch.arange(1, count + 1, dtype=torch.float32)
-        angles = (places / (places[-1:] + 1e-6) * (2 * math.pi))[:, None] / frequencies
-        return torch.stack((angles[:, 0::2].sin(), angles[:, 1::2].cos()), dim=-1).flatten(1)
-
-    rows = waves(height)[:, None].expand(-1, width, -1)
-    return torch.cat((rows, waves(width)[None].expand(height, -1, -1)), dim=-1).flatten(0, 1)
+    counted = [torch.arange(1, count + 1, dtype=torch.float32) for count in (height, width)]
+    scaled = torch.meshgrid(*(each / (each[-1:] + 1e-6) * (2 * math.pi) for each in counted), indexing="ij")
+    angles = torch.stack(scaled).flatten(1).unsqueeze(-1) / frequencies
+    waves = torch.stack((angles[..., 0::2].sin(), angles[..., 1::2].cos()), dim=-1).flatten(2)
+    return torch.cat(tuple(waves), dim=-1)

@@ -90,8 +90,9 @@ DIRECTORIES = (
 ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
+LEROBOT_TYPES = "act, diffusion, multi_task_dit, smolvla, pi0 or pi05"
+
 LEROBOT = (
-    Refusal(r"^act$", "a transformer that predicts actions in one evaluation", _NO_LOOP),
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
@@ -110,7 +111,7 @@ LEROBOT = (
         "a world model that denoises video beside actions, Wan2.2, which is not rebuilt here",
         "No module of it was compiled yet.",
     ),
-    Refusal(r"", "not known", f"Expected diffusion, multi_task_dit, smolvla, pi0 or pi05. If it denoises: {_BUILD}."),
+    Refusal(r"", "not known", f"Expected {LEROBOT_TYPES}. If it denoises: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
 
@@ -207,8 +208,8 @@ def refuse_directory(path: Path) -> NoReturn:
             raise _refused(path, row.what, how, row.remedy)
     raise CheckpointError(
         f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
-        " config.json and model.safetensors of LeRobot's diffusion, multi_task_dit, smolvla, pi0 or pi05, or give a"
-        f" .ckpt file of Diffusion Policy. Otherwise: {_BUILD}."
+        f" config.json and model.safetensors of LeRobot's {LEROBOT_TYPES}, or give a .ckpt file of Diffusion Policy."
+        f" Otherwise: {_BUILD}."
     )
 
 

@@ -9,11 +9,8 @@ import numpy.typing as npt
 
 Numbers = npt.NDArray[np.float64]
 
-SAME = 1e-4
-"""Of what another observation changes: what changes less is rounding."""
-
-TENTH = 0.1
-"""Of what another observation changes: the unit of distances where no noise changes anything."""
+SAME, TENTH = 1e-4, 0.1
+"""Of what another observation changes: less is rounding; and the unit of distances where noise changes no more."""
 
 
 def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
@@ -35,8 +32,7 @@ def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
         apart = _far(y[:, i], y[:, j])
         found.append((crossed - _far(x[:, i], x[:, j]) - apart, apart))
     h, far = np.mean(found, axis=0)
-    others = [_far(y[:, 0], np.roll(y[:, 0], n, 0)).mean() for n in range(1, len(y))]
-    observed = float(np.mean(others or [1.0]))
+    observed = np.mean([_far(y[:, 0], np.roll(y[:, 0], n, 0)).mean() for n in range(1, len(y))] or [1.0])
     if far.mean() > SAME * observed:
         return h, far
     return np.square(_far(x, y)).mean(1), np.full(len(x), (TENTH * observed) ** 2)

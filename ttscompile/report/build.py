@@ -10,7 +10,6 @@ import numpy as np
 
 from ..artifact.ceiling import uncalibrated
 from ..artifact.load import Artifact
-from ..artifact.manifest import Manifest
 from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
@@ -77,7 +76,7 @@ def build(
         *(() if course is None else (_episode(course),)),
         _latency(measured, given, manifest.default_plan),
         *[frontier] * (not chosen),
-        _calibration(manifest),
+        _calibration(artifact),
         given.verification,
         facts.limits(artifact),
     )
@@ -197,9 +196,9 @@ def _distance(row: Mapping[str, Any]) -> float:
     return 0.0 if row["name"] == DENSE else max(float(row["distance"]), 0.0)
 
 
-def _calibration(manifest: Manifest) -> Section:
-    if (record := manifest.calibration) is None:
-        return Section("Calibration", (uncalibrated(manifest),))
+def _calibration(artifact: Artifact) -> Section:
+    if (record := artifact.manifest.calibration) is None:
+        return Section("Calibration", (uncalibrated(artifact.manifest),))
     scores = facts.scores(record)
     drawn: tuple[Picture, ...] = ()
     told = facts.scores(record, ("sparsity", "error", "error_p90"))

@@ -262,6 +262,8 @@ def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
     apart = record.get("other_noise")
     if apart is None:
         return ()
+    if not apart:
+        return ("Noise changes nothing here: in its place stands a tenth of what another observation changes.",)
     told = (
         f"Two dense calls with different noise are {apart:.4g} apart on these episodes. On five policies errors up to"
         " a quarter as large cost at most 0.03 of the score and a tenth of the episodes, and one more than half as"

@@ -13,10 +13,8 @@ from .flow import deterministic_table
 class DirectDenoiser(nn.Module):
     """The network as ``compile_denoiser`` takes it: ``forward(sample, timestep, **observations)``.
 
-    All of it leaves the loop. A residual stream begins with the sample, so that is read; nothing depends on it.
-
-    Args:
-        network: ``network(**observations)`` gives the actions ``[B, T, D]``.
+    ``network(**observations)`` gives the actions ``[B, T, D]``; all of it leaves the loop. A residual stream begins
+    with the sample, so that is read, and nothing depends on it.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -30,5 +28,4 @@ class DirectDenoiser(nn.Module):
 
 def direct_table() -> SamplerTable:
     """The loop of a ``DirectDenoiser``: one step, whose result is the prediction."""
-    one = np.ones(1)
-    return deterministic_table("direct", np.zeros(1), None, out_to_x0=one, x0_to_next=one)
+    return deterministic_table("direct", np.zeros(1), None, out_to_x0=np.ones(1), x0_to_next=np.ones(1))
