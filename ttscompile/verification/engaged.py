@@ -71,8 +71,8 @@ def check_engaged(
 ) -> Rung:
     """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails."""
     manifest = artifact.manifest
-    if manifest.plans.keys() <= {FULL}:
-        told = "the artifact is not calibrated: every call computes all cells, and nothing is saved"
+    if manifest.plans.keys() <= {FULL} or manifest.steps == 1:
+        told = "the artifact is not calibrated, or of one step: every call computes all cells, and nothing is saved"
         return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
     found = _measure(artifact, golden, policy, clock)
     details = {name: asdict(one) for name, one in found.items()}
