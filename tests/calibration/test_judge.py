@@ -51,9 +51,9 @@ def test_by_hand() -> None:
     x, y = np.array([[[0.0], [5.0]]]), np.array([[[1.0], [3.0]]])
     h, apart = pairs(x, y)
     assert (h.tolist(), apart.tolist()) == ([3 + 4 - 5 - 2], [2.0])
-    x, y = np.array([[[3.0, 4.0], [0.0, 0.0]]]), np.zeros((1, 2, 2))
-    root = (25 / 2) ** 0.5  # of the mean square of two numbers
-    assert pairs(x, y)[0].tolist() == [pytest.approx(0 + root - root - 0)]
+    x, y = np.array([[[3.0, 4.0], [0.0, 0.0]]]), np.array([[[0.0, 0.0], [1.0, 1.0]]])
+    root, crossed = (25 / 2) ** 0.5, (13 / 2) ** 0.5  # of the mean square of two numbers
+    assert pairs(x, y)[0].tolist() == [pytest.approx(crossed + 0 - root - 1)]
 
 
 @pytest.mark.parametrize("paired", [True, False])
