@@ -44,11 +44,11 @@ def save(directory: Path, cameras: int, backbone: str) -> None:
     """Write a policy as lerobot does, all sizes its defaults: six joints, chunks of 100."""
     features: dict[str, Any] = {STATE: {"type": "STATE", "shape": [6]}}
     features |= {IMAGE.format(i): {"type": "VISUAL", "shape": [3, *SIZE]} for i in range(cameras)}
-    config = {"type": "act", "device": "cpu", "use_vae": False, "vision_backbone": backbone}
+    config: dict[str, Any] = {"type": "act", "device": "cpu", "use_vae": False, "vision_backbone": backbone}
     config |= {"pretrained_backbone_weights": None, "normalization_mapping": MODES, "input_features": dict(features)}
     config["output_features"] = {"action": {"type": "ACTION", "shape": [6]}}
     features |= config["output_features"]
-    tensors = {}
+    tensors = dict[str, torch.Tensor]()
     for key, feature in features.items():
         shape, image = feature["shape"], feature["type"] == "VISUAL"
         mean, std, shape = (0.45, 0.25, (3, 1, 1)) if image else (10.0, 40.0, tuple(shape))
@@ -85,10 +85,14 @@ def contestants(directory: Path, artifact: Path) -> dict[str, Call]:
     )
     for plan, title in (("dense", "compiled, fp32"), ("full", "compiled, int8")):
         policy = ttscompile.load(artifact, plan=plan, threads=1)
-        found[title] = lambda obs, policy=policy: policy.predict_action(obs)["action"]
-    known = ttscompile.load(artifact, plan="full", threads=1)
-    found["compiled, int8, frames known"] = lambda obs: known.predict_action(obs)["action"]
+        found[title] = compiled(policy)
+    found[f"{title}, frames known"] = compiled(ttscompile.load(artifact, plan="full", threads=1))
     return found
+
+
+def compiled(policy: ttscompile.CompiledPolicy) -> Call:
+    """A call of a compiled policy."""
+    return lambda obs: policy.predict_action(obs)["action"]
 
 
 def lerobot(directory: Path) -> Call:

@@ -20,12 +20,13 @@ from ttscompile.errors import CheckpointError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.lerobot_config import ENVIRONMENT, STATE
 from ttscompile.ir.program import Program
 
 from ..families.support import record
 from ..once import Once
 from . import acts
-from .acts import ACTION_DIM, CHUNK, ENVIRONMENT, STATE, STREAMS, TOP, WRIST
+from .acts import ACTION_DIM, CHUNK, STREAMS, TOP, WRIST
 from .lerobot_tiny import change_json
 from .originals import golden
 
@@ -119,7 +120,7 @@ def test_nothing_is_left_in_the_loop(compiled: tuple[Path, Program]) -> None:
     one = {key: value[:1] for key, value in acts.observation(COMPILED).items()}
     for expected in (2, 0):
         policy.predict_action(one)
-        assert policy.last_report.frames.computed == expected
+        assert policy.last_report is not None and policy.last_report.frames.computed == expected
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise
 from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
-from ..schedule import SCHEDULE, searched
+from ..schedule import searched
 from ..search import open_search
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
@@ -85,7 +85,7 @@ class Loops:
         """See ``Proposer``. Of a policy of one step all cells, for what is learned after it."""
         if max(loop.steps for loop in trials.artifact.manifest.spec.all_loops.values()) == 1:
             self.told = "one evaluation gives the actions: there is nothing to reuse between steps"
-            yield Proposal(SCHEDULE, replace(plan, precision={}, repair=True), margin=float("inf"))
+            yield Proposal(f"{ORIGINAL}.1", replace(plan, precision={}, repair=True), margin=float("inf"))
             return
         costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
         order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop].one))
