@@ -230,7 +230,7 @@ def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool, loop: s
         return attentions[0] if around.issuperset(contractions) else f"{attentions[0]}+feed_forward"
     if not attentions and contractions and not convolves and not hides:
         return "feed_forward"
-    if all(n.name in contractions for n in graph.nodes if n.name in loop and node_flops(n, types) > 0):
+    if contractions and all(n.name in contractions for n in graph.nodes if n.name in loop and node_flops(n, types) > 0):
         return "network"
     signature = hashlib.sha256("|".join(n.op for n in nodes).encode()).hexdigest()[:8]
     shape = f"{len(attentions)}attention_" if attentions else ""

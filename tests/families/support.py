@@ -107,7 +107,7 @@ def render(content: dict[str, list[Row]]) -> str:
 def _blocks(each: Row) -> str:
     """``24: 8 cross-attention, 8 feed-forward, 8 self-attention``."""
     kinds = each["blocks"]
-    if list(kinds) == ["network"]:
+    if sum(kinds.values()) == 1:
         return "1: the whole network"
     return f"{sum(kinds.values())}: " + ", ".join(f"{n} {kind.replace('_', '-')}" for kind, n in kinds.items())
 
