@@ -213,8 +213,8 @@ def show(found: Sequence[Distances], summary: bool, as_json: bool) -> None:
         return
     table = Table("departure", "plan", "without correction", "distance", "if nobody looked", "even steps", box=None)
     for one in found:
-        figures = (f"{each:.2f}" for each in (one.distance, one.unbounded, one.even))
-        table.add_row(one.departure, one.plan, f"{one.outside:.0%}", *figures)
+        told = (f"{each:.2f}" for each in (one.distance, one.unbounded, one.even))
+        table.add_row(one.departure, one.plan, f"{one.outside:.0%}", *told)
     results_console().print(table)
 
 
