@@ -66,7 +66,7 @@ def choose(kept: Kept, request: Request) -> list[dict[str, Any]]:
     wanted = SAFER * scores[chosen].distance
     if nearer := [name for name in others if name in allowed and scores[name].distance <= wanted]:
         named[min(nearer, key=lambda name: times[name].median)] = SAFE
-    faster = [name for name in others if times[name].median < times[chosen].median]
+    faster = [name for name in others if ALIKE * times[name].median < times[chosen].median]
     if within := [name for name in faster if scores[name].distance <= request.farthest]:
         named[max(within, key=lambda name: times[name].median)] = FAST
     plans = {named[name]: entered[name] for name in named}
