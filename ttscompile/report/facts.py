@@ -246,7 +246,7 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
         return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
     where, cost = "above a quarter", "18 points of success and more"
     if distance <= NEAR:
-        where, cost = "within a tenth", "at most 1.5 points of success"
+        where, cost = "within a tenth", "at most 2 points of success"
     elif distance <= BOUND:
         where, cost = "within a quarter", "up to 11 points of success"
     driven = f"Such plans cost {cost} where they were driven (docs/evidence/results.md, 'What a distance means')"
