@@ -36,7 +36,6 @@ SHORTER = {
     "convert": "--steps 5",
     "calibrate": "--target-sparsity 0.8 --max-minutes 0.001",
     "strategies.py": "--sparsities 0.8 --intervals 1 --calls 4 --learned-calls 8",
-    "verify": "--calls 4",
     "bench": "--calls 1",
     "oracle.py": "--computed-steps 2 --schedules 2 --calls 4 --draws 2",
     "record.py": "--episodes 2 --threads 1",

@@ -51,6 +51,12 @@ def hidden(model: onnx.ModelProto) -> None:
     model.graph.node.append(make_node("If", ["x"], ["y"], then_branch=branch, else_branch=branch))
 
 
+def nested(model: onnx.ModelProto) -> None:
+    """A Scan within a Scan; one alone is in blocks of eight bits (``tests/runtimes/test_integer_attention.py``)."""
+    inner = make_graph([make_node("Scan", ["a"], ["b"], body=make_graph([], "c", [], []))], "d", [], [])
+    model.graph.node.append(make_node("Scan", ["x"], ["y"], body=inner))
+
+
 def of_others(model: onnx.ModelProto) -> None:
     model.graph.node[0].domain = "evil"
     model.opset_import.append(make_opsetid("evil", 1))
@@ -74,7 +80,7 @@ def devices(model: onnx.ModelProto) -> None:
     model.graph.node[0].device_configurations.add()
 
 
-@pytest.mark.parametrize("change", [endless, hidden, of_others, of_onnxruntime, function, training, devices])
+@pytest.mark.parametrize("change", [endless, hidden, nested, of_others, of_onnxruntime, function, training, devices])
 def test_what_convert_never_writes(change: Callable[[onnx.ModelProto], None], tmp_path: Path) -> None:
     write_tiny(tmp_path / "compiled")
     path = tmp_path / "compiled" / "stem.onnx"

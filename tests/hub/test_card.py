@@ -67,7 +67,7 @@ def test_a_card_of_a_calibrated_artifact_has_its_figures(
         f"{record['plans'][plan]['error']:.4g}",
         "| pusht | calibrated:x\\|y | 8 | 0.750 \\[0.500, 1.000\\] | 0.750 \\[0.500, 1.000\\] |",
         "a \\<b\\>processor\\</b\\>",
-        "`ttscompile.calibrate(DIR, CALLS, target_sparsity=0.5, strategy='interval', seed=0)`",
+        "--target-sparsity 0.5 --strategy interval --seed 0`",
         f"| identity | {identity} |",
         "licence | not known: ask who trained the base",
         'policy = ttscompile.load("hf://org/name", threads=1)',

@@ -3,7 +3,8 @@
 onnxruntime opens whatever file a model names beside it, and makes an object of a hundred bytes of a message of two.
 Here each of these names is held against the manifest before onnxruntime sees the model: a file of the artifact, whose
 hash was checked, and a range inside it. All fields are counted, whether they lead to a tensor or not. And operators
-that ``convert`` never writes are refused: those that loop, which may never end, and those of others.
+that ``convert`` never writes are refused: those that loop, which may never end, and those of others. It writes one
+``Scan``, over the heads of an attention in eight bits; that ends after as many turns as there are heads.
 Source: the format of messages, https://protobuf.dev/programming-guides/encoding/, and the field numbers of onnx.proto.
 """
 
@@ -23,7 +24,9 @@ MAX_BYTES = 64 * 2**20
 MAX_FIELDS = 1_000_000
 """In all models of an artifact. Push-T has 20,000."""
 MAX_DEPTH = 32
-LOOPS = frozenset({"Loop", "Scan", "SequenceMap"})
+LOOPS = frozenset({"Loop", "SequenceMap"})
+SCAN = "Scan"
+"""In each other they would have as many turns as their numbers multiplied."""
 INTEGER = frozenset({"DynamicQuantizeMatMul", "MatMulIntegerToFloat"})
 """What an artifact has of onnxruntime's own operators."""
 
@@ -45,7 +48,7 @@ _FIELDS: Mapping[str, Mapping[int, str]] = {
     "map": {2: "type"},
 }
 _EXTERNAL_DATA = 13
-_OPERATOR, _DOMAIN = 4, 7
+_OF_NODE = 4, 7  # operator and domain
 _FOREIGN = {("model", 20), ("model", 25), ("node", 10)}
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
@@ -60,7 +63,7 @@ class _Left:
 def check_models(directory: Path, names: Iterable[str], files: Mapping[str, FileRecord]) -> None:
     """Raise ArtifactError unless models run what ``convert`` writes, and all weights are in them or in these files.
 
-    A model runs operators of the standard that do not loop, and those of ``INTEGER``. The files were checked.
+    A model runs operators of the standard that surely end, and those of ``INTEGER``. The files were checked.
     """
     left, names = _Left(), sorted(names)
     if (total := sum(files[name].bytes for name in names)) > MAX_BYTES:
@@ -80,33 +83,35 @@ def check_models(directory: Path, names: Iterable[str], files: Mapping[str, File
             raise ArtifactError(f"{path}: expected an ONNX model; found {found}. {REMEDY}") from error
 
 
-def _places(message: memoryview, kind: str, depth: int, left: _Left) -> Iterator[dict[str, str]]:
+def _places(message: memoryview, kind: str, depth: int, left: _Left, scanned: bool = False) -> Iterator[dict[str, str]]:
     """The entries of ``external_data`` of each tensor below a message that has not its data itself."""
     if depth > MAX_DEPTH:
         raise ValueError("messages too deep in each other")
-    fields, entries, operators = _FIELDS[kind], dict[str, str](), (set[str](), set[str]())
-    for number, value in _read(message, left):
+    fields, entries, parts = _FIELDS[kind], dict[str, str](), _read(message, left)
+    if kind == "node":
+        parts = iter(known := list(parts))
+        names, domains = ({bytes(v).decode() for n, v in known if n == one and v is not None} for one in _OF_NODE)
+        _require_known(names, domains, scanned)
+        scanned = scanned or SCAN in names
+    for number, value in parts:
         if value is None:
             continue
         if number in fields:
-            yield from _places(value, fields[number], depth + 1, left)
+            yield from _places(value, fields[number], depth + 1, left, scanned)
         elif kind == "tensor" and number == _EXTERNAL_DATA:
             texts = {n: bytes(v).decode() for n, v in _read(value, left) if v is not None}
             if texts.get(1, "") in entries:
                 raise ValueError("an entry twice")
             entries[texts.get(1, "")] = texts.get(2, "")
-        elif kind == "node" and number in (_OPERATOR, _DOMAIN):
-            operators[number == _DOMAIN].add(bytes(value).decode())
         elif (kind, number) in _FOREIGN:
             raise ValueError("training, functions of its own, or devices, which convert never writes")
-    _require_known(*operators)
     if entries:
         yield entries
 
 
-def _require_known(names: set[str], domains: set[str]) -> None:
+def _require_known(names: set[str], domains: set[str], scanned: bool) -> None:
     """Of one node; the last of each counts, and none may be foreign. Raises ValueError."""
-    known = names <= INTEGER if domains - {"", "ai.onnx"} else not names & LOOPS
+    known = names <= INTEGER if domains - {"", "ai.onnx"} else not names & LOOPS and not (scanned and SCAN in names)
     if not known or domains - {"", "ai.onnx", "com.microsoft"}:
         told = f"{'/'.join(sorted(domains))}:{'/'.join(sorted(names))}"[:100]
         raise ValueError(f"the operator {told!a}, which convert never writes (loops, and operators of others)")

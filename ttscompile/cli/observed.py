@@ -77,7 +77,8 @@ def _picture(path: Path, spec: ObservationSpec, what: str) -> Array:
 
 def _window(array: Array, spec: ObservationSpec) -> tuple[Array, bool]:
     """A frame or a window as ``[1, *shape]``, and whether one frame fills it; the policy refuses other shapes."""
-    array = array.astype(spec.dtype) if array.dtype.kind == "f" else array
+    with np.errstate(over="ignore"):  # infinity is refused
+        array = array.astype(spec.dtype) if array.dtype.kind == "f" else array
     if array.ndim == 1 and array.size == np.prod(spec.shape):
         array = array.reshape(spec.shape)
     repeated = array.ndim < len(spec.shape)

@@ -30,7 +30,7 @@ def _pictures(_: click.Context, __: click.Parameter, values: tuple[str, ...]) ->
 
 def _numbers(_: click.Context, __: click.Parameter, value: str | None) -> Any:
     try:
-        return None if value is None else np.array([float(part) for part in value.split(",")], np.float32)
+        return None if value is None else np.array([float(part) for part in value.split(",")])
     except ValueError as error:
         raise click.BadParameter(f"{value!r:.100}: expected numbers with commas between, as in 0.1,-2.") from error
 

@@ -218,10 +218,10 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         told, budget = {key: record[key] for key in ("strategy", "seed") if key in record}, record.get("budget", {})
         goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
         asked = {key: budget[key] for key in goals if budget.get(key) is not None}
-        words = [f"{k}={_word(v)!r}" if isinstance(v, str) else f"{k}={_word(v)}" for k, v in (asked | told).items()]
-        if (learned := list(map(_word, record.get("learned", [])[:8]))) not in ([], ["schedule"]):
-            words.append(f"learn={learned}")
-        lines.append(f"ttscompile.calibrate({', '.join(['DIR', 'CALLS', *words])})")
+        words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
+        if (learned := record.get("learned", [])) not in ([], ["schedule"]):
+            words += f" --learn {','.join(map(_word, learned[:8]))}"
+        lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
     lines.append("ttscompile verify DIR")
     text = (
         f"With ttscompile {manifest.ttscompile_version}, by commands like these, from what the artifact records;"
