@@ -117,3 +117,14 @@ def test_the_rate_of_a_data_set_says_how_long_nothing_is_seen(tmp_path: Path, ra
 
     (one,) = _rate(tmp_path / "set", policy())
     assert one.level is level and f"4 steps are executed in {4 / rate:.2g} s" in one.found
+
+
+def test_tokens_of_an_instruction_are_not_missed(tmp_path: Path) -> None:
+    tokens = {f"observation.language.{name}": ObservationSpec((8,), dtype="int64") for name in ("tokens", "mask")}
+    spec = policy(**tokens)
+    arrays = {STATE: states(), FRONT: pictures(0.2), WRIST: pictures(0.8), "episode_ends": np.array([20, 40])}
+    np.savez(tmp_path / "frames.npz", meta=json.dumps({"frames": True}), **arrays)  # type: ignore[arg-type]
+    found = {one.what: one for one in examine_recordings([tmp_path / "frames.npz"], spec, {})}
+    assert found["instruction"].level is Level.NOTE and "convert --task" in found["instruction"].found
+    assert not [one for one in found.values() if one.level is Level.PROBLEM]
+    assert found["calls"].found == "10 in 2 episodes"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from .ranges import judged, placed
 
 PART = "recordings"
 
+_LANGUAGE = "observation.language."
+"""Begins the keys of an instruction's tokens, as lerobot names them."""
+
 _BLIND_SECONDS = 3.0
 """For which a chunk is executed without looking, from which on a robot misses what happens."""
 
@@ -25,7 +29,12 @@ _BLIND_SECONDS = 3.0
 def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping[str, Sequence[str]]) -> list[Finding]:
     """Look at recordings, which are given as to ``load_trajectories``, as the policy would observe them."""
     found, renamed = list[Finding](), dict(sources)
-    with warnings.catch_warnings(record=True) as said:
+    if said := [key for key in spec.observations if key.startswith(_LANGUAGE) and key not in sources]:
+        observed = {key: one for key, one in spec.observations.items() if key not in said}
+        spec = replace(spec, observations=observed, instruction=None)
+        told = f"{', '.join(said)}: not looked at; recordings seldom have them, and convert --task compiles a text in"
+        found.append(Finding(PART, "instruction", told, Level.NOTE))
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
             for path in paths:
@@ -33,7 +42,7 @@ def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping
             episodes = load_trajectories(paths, spec.observations, spec.chunk.stop - spec.chunk.start, renamed)
         except TrajectoryError as error:
             return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
-    found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in said]
+    found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in warned]
     found.append(Finding(PART, "calls", f"{sum(each.calls for each in episodes)} in {len(episodes)} episodes"))
     return [*found, *map(judged, placed(episodes, spec))]
 
