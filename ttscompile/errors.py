@@ -117,3 +117,8 @@ class ExecutorClosedError(ExecutorError):
 
 class ProtocolError(ExecutorError):
     """A message to the executor's server that is no request of its protocol."""
+
+
+def first_line(error: BaseException) -> str:
+    """What an error of another library says, on one line; its class where it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -16,7 +16,7 @@ from typing import Any, Protocol, Self
 from uuid import uuid4
 
 from .artifact.load import Artifact, load_artifact
-from .errors import CalibrationError, ClusterError, RuntimeUnavailableError, TtscompileError
+from .errors import CalibrationError, ClusterError, RuntimeUnavailableError, TtscompileError, first_line
 
 LOCAL = "local"
 """In the place of an address: a cluster of this machine's cores, for as long as the command runs."""
@@ -98,10 +98,8 @@ class RayPool:
             else:
                 ray.init(address=address, log_to_driver=False)
         except Exception as error:  # a node that does not start in time raises a bare one
-            first = f"{error or type(error).__name__}".splitlines()[0][:200]
-            raise ClusterError(
-                f"--ray {address}: no cluster can be reached ({first}). Start it, or give {LOCAL!r}."
-            ) from error
+            told = f"no cluster can be reached ({first_line(error)}). Start it, or give {LOCAL!r}."
+            raise ClusterError(f"--ray {address}: {told}") from error
         self.count = max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._sent: tuple[Work, str, Any] | None = None
         self._run = ray.remote(num_cpus=1, max_retries=RETRIES)(_run)

@@ -14,7 +14,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from ttscompile.errors import ArtifactChangedError, ClusterError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import ArtifactChangedError, ClusterError, RuntimeUnavailableError, TtscompileError, first_line
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.load import load
 
@@ -104,7 +104,7 @@ class RayCopies:
         try:
             outcome: Outcome = await self._handle.predict.remote(plan, obs)
         except RayError as error:
-            raise ClusterError(f"a copy failed: {_first_line(error)}. Ask again.") from error
+            raise ClusterError(f"a copy failed: {first_line(error)}. Ask again.") from error
         if isinstance(outcome, TtscompileError):
             raise outcome
         return outcome
@@ -117,7 +117,7 @@ class RayCopies:
             async with asyncio.timeout(HEALTH_SECONDS):
                 found = await asyncio.to_thread(serve.status)
         except Exception as error:  # whatever Ray raises where there is no cluster any more
-            return f"the cluster does not answer: {_first_line(error)}"
+            return f"the cluster does not answer: {first_line(error)}"
         application = found.applications.get(self._name)
         state = "gone" if application is None else application.status.value
         return "" if state == "RUNNING" else f"the copies are {state}"
@@ -150,7 +150,7 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
             **given,
         )
     except Exception as error:  # a node that does not start in time raises a bare one
-        raise ClusterError(f"--ray {address}: no cluster can be reached ({_first_line(error)}).") from error
+        raise ClusterError(f"--ray {address}: no cluster can be reached ({first_line(error)}).") from error
     try:
         serve.start(proxy_location="Disabled")
         deployment = serve.deployment(
@@ -166,7 +166,7 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
             )
         except RuntimeError as error:
             remedy = "All machines need the packages and the artifact under the same path, and cores for the copies"
-            raise ClusterError(f"the copies did not start: {_first_line(error)}. {remedy}.") from error
+            raise ClusterError(f"the copies did not start: {first_line(error)}. {remedy}.") from error
         yield RayCopies(handle, name)
     finally:
         if address == LOCAL:
@@ -174,7 +174,3 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
         else:
             serve.delete(name)
         ray.shutdown()
-
-
-def _first_line(error: BaseException) -> str:
-    return ((str(error).strip() or type(error).__name__).splitlines()[0])[:200]

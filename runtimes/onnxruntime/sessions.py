@@ -18,7 +18,8 @@ from __future__ import annotations
 import ctypes
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 from weakref import WeakSet
@@ -102,11 +103,10 @@ class Sessions:
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
         unused = filter(of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
         others = set(filter(is_of_loop, manifest.pieces))
-        sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
-        sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
-        sessions |= self._of_blocks(view) if blocks else {}
-        self._contents.clear()
-        return sessions
+        with self._reading(view):
+            sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
+            sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
+            return sessions | self._of_blocks(view) if blocks else sessions
 
     def of_blocks(self, view: View) -> dict[str, Any]:
         """What runs single blocks, by name, some time after the artifact was loaded.
@@ -114,7 +114,7 @@ class Sessions:
         Raises:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
         """
-        with view.artifact.reading():
+        with view.artifact.reading(), self._reading(view):
             return self._of_blocks(view)
 
     def of_layers(self, view: View) -> dict[str, Any]:
@@ -123,8 +123,17 @@ class Sessions:
         Raises:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
         """
-        with view.artifact.reading():
+        with view.artifact.reading(), self._reading(view):
             return self._open(view, [LAYERS])
+
+    @contextmanager
+    def _reading(self, view: View) -> Iterator[None]:
+        """Within the block sessions are opened with what ``_contents`` says; each copies what it needs of that."""
+        self._contents = _contents(view)
+        try:
+            yield
+        finally:
+            self._contents = {}
 
     def _of_blocks(self, view: View) -> dict[str, Any]:
         manifest = view.manifest
@@ -151,7 +160,6 @@ class Sessions:
             precision = view.precision.get(str(part_of(piece)), FP32)
             if precision not in self._careful:
                 self._careful[precision] = needs_care(precision)
-            self._contents = self._contents or _contents(view)
             session = _open_file(view, file, threads, spins, self._careful[precision], self._contents)
             self._known[file, threads, spins] = session
         return self._known[file, threads, spins]

@@ -25,6 +25,26 @@ def test_the_same_answers_are_at_no_distance() -> None:
     assert found.distance == 0
 
 
+def test_calls_at_rest_keep_the_unit_of_the_others() -> None:
+    """Of three in ten calls both draws give the same: the unit is what noise changes on average over all calls."""
+    draw, found, calls = np.random.default_rng(0), Unpaired("fast"), []
+    for number in range(100):
+        own = dense = np.full((2, 8, 3), draw.standard_normal())
+        if number % 10 >= 3:
+            own, dense = draw.normal(0, 0.05, (2, 2, 8, 3)) + dense
+        else:
+            own = dense + 0.2
+        found.add(own, dense)
+        calls.append((own.reshape(2, -1), dense.reshape(2, -1)))
+
+    def far(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.sqrt(np.square(a - b).mean()))
+
+    gaps = [far(x[0], y[1]) + far(x[1], y[0]) - far(x[0], x[1]) - far(y[0], y[1]) for x, y in calls]
+    apart = [far(y[0], y[1]) for _, y in calls]
+    assert found.distance == pytest.approx((np.mean(gaps) / np.mean(apart)) ** 0.5) and found.distance > 1
+
+
 def test_which_samplers_take_noise_alike() -> None:
     """Same name, same steps, draws in both or in neither."""
     euler = flow_matching_table(4)

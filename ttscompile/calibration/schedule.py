@@ -50,7 +50,7 @@ class Schedule:
         view, goal = view_of(artifact, base_of(artifact)), self._request.goal
         if view.manifest.steps == 1:
             told = "the policy has one denoising step, which every plan computes: nothing can be reused"
-            return f"{told}. Convert with more denoising steps, or use plan='dense'."
+            return f"{told}. Learn which parts may have eight bits: --learn precision."
         if goal.kind == ERROR and not self._strategy.fits_correction:
             return (
                 f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {self._strategy.name!r}. Give"

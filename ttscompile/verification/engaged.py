@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from time import perf_counter
 
+from ..artifact.ceiling import uncalibrated
 from ..artifact.golden import Golden
 from ..artifact.load import Artifact
 from ..artifact.manifest import PlanRecord
@@ -72,8 +73,7 @@ def check_engaged(
     """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails."""
     manifest = artifact.manifest
     if manifest.plans.keys() <= {FULL} or manifest.steps == 1:
-        told = "the artifact is not calibrated, or of one step: every call computes all cells, and nothing is saved"
-        return Rung(ENGAGED, SKIPPED, told, remedy="Run 'ttscompile calibrate' to give it a plan.")
+        return Rung(ENGAGED, SKIPPED, uncalibrated(manifest))
     found = _measure(artifact, golden, policy, clock)
     details = {name: asdict(one) for name, one in found.items()}
     judged = {

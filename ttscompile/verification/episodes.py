@@ -126,17 +126,19 @@ class Unpaired:
 
     def __init__(self, plan: str) -> None:
         self.plan = plan
-        self._found: list[tuple[float, float]] = []
+        self._own, self._dense = list[npt.NDArray[np.float64]](), list[npt.NDArray[np.float64]]()
 
     def add(self, own: npt.NDArray[np.float64], dense: npt.NDArray[np.float64]) -> None:
         """The actions that were executed of one call, ``[2, ...]``: a draw each."""
-        h, apart = pairs(*(one.reshape(1, 2, -1) for one in (own, dense)))
-        self._found.append((float(h[0]), float(apart[0])))
+        self._own.append(own.reshape(2, -1))
+        self._dense.append(dense.reshape(2, -1))
 
     @property
     def distance(self) -> float:
         """Between the two, in units of what other noise changes."""
-        return rooted(*np.mean(self._found, axis=0))
+        # All calls at once: whether noise changes anything is asked of the policy, and not of a call at rest.
+        h, apart = pairs(np.stack(self._own), np.stack(self._dense))
+        return rooted(float(h.mean()), float(apart.mean()))
 
 
 def _run(

@@ -25,13 +25,14 @@ from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
 from ...core.spec import Noise
 from ...errors import CalibrationFailedError
+from ...measure.energy import TENTH
 from ...runtimes.open import open_runtime
 from ...runtimes.random_calls import Observation
 from ...runtimes.runtime import Runtime
 from ..arguments import calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
-from ..judge import Score, judge, other_noise
+from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
 from ..schedule import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
@@ -121,7 +122,7 @@ class Loops:
         task = replace(Task.of(own.executor, own.calls, 0, own.seed, own.pool), clock=clock)
         crowded = SpacedSchedules(task.whole, own.state, clock, own.bar, f"crowded, {loop}")
         counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
-        apart = other_noise(own)
+        apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
         for number, count in enumerate(counts):
             if number and (clock.left() <= 0 or self._too_slow(of_steps(cost, count), fastest)):
                 break
