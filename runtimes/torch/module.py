@@ -24,7 +24,8 @@ from ttscompile.runtimes.instructions import Instructions, instructions_of
 
 from .loop import denoise
 from .plain_network import CPU, CallModule
-from .pruned_call import PrunedCall, either
+from .planned_loop import either
+from .pruned_call import PrunedCall
 from .sampler import Advance
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import ttscompile
 from ttscompile.calibration.pruner import paper
-from ttscompile.calibration.schedule import open_search
+from ttscompile.calibration.search import open_search
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, Strategy, strategy_of
 from ttscompile.calibration.task import Found, Search
 from ttscompile.core.lattice import Source, illegal_cells

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ttscompile.runtimes.executor.schedule import TickGrid, Timeline, expand, splice
+from ttscompile.runtimes.executor.timeline import TickGrid, Timeline, expand, splice
 
 
 def line(start: int, *values: float, observed: float = 0.0) -> Timeline:

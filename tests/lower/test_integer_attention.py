@@ -12,7 +12,7 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 
 from tests.lower.running import Array, session
 from ttscompile.ir.pieces import CONDITION
-from ttscompile.lower.integers import FEWEST, HEADS
+from ttscompile.lower.integer_attention import FEWEST, HEADS
 from ttscompile.lower.precision import lower_precision, quantize_model
 
 COUNT, CHANNELS = 3, 8

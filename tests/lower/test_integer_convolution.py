@@ -13,7 +13,7 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 from torch.nn import functional
 
 from tests.lower.running import Array, session
-from ttscompile.lower.integers import LEAST
+from ttscompile.lower.integer_convolution import LEAST
 from ttscompile.lower.precision import quantize_matrix, quantize_model
 from ttscompile.measure.machine import has_integer_dot_product
 

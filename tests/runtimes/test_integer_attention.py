@@ -17,7 +17,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
-from ttscompile.lower.integers import FEWEST, HEADS
+from ttscompile.lower.integer_attention import FEWEST, HEADS
 from ttscompile.samplers.flow import flow_matching_table
 
 ACTIONS, WIDTH, COUNT, BLOCKS, STEPS = 2, 16, 2, 2, 3

@@ -185,7 +185,7 @@ PROPOSERS = (
         anew=True,
         takes=6.0,
     ),
-    Row("pruner", "gates for each observation", "calibration.pruner.paper:Pruner", consecutive=True),
+    Row("pruner", "gates for each observation", "calibration.proposers.pruner:Pruner", consecutive=True),
     Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
     Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
     Row("weights", "low-rank updates of later steps' weights", "calibration.proposers.weights:Weights", True, True),

@@ -3,7 +3,7 @@
 Blocks of a policy stream their weights from memory once a step, which is what they wait for; a quarter of the bytes,
 and the processor's integer dot product, make them faster. An image encoder waits for arithmetic, of which the integer
 dot product does four times as much. Everything beside these products stays in float32: layer norms, softmax,
-activations, biases, the residual itself, and attention among few tokens (``integers``).
+activations, biases, the residual itself, and attention among few tokens (``integer_attention``).
 """
 
 from __future__ import annotations
@@ -22,14 +22,12 @@ from ..core.spec import FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
-from .integers import (
+from .integer_attention import HEADS, attention_of, integer_attention
+from .integer_convolution import (
     DOMAIN,
     DYNAMIC_PRODUCT,
-    HEADS,
     INTEGER_PRODUCT,
-    attention_of,
     convolution_of,
-    integer_attention,
     integer_convolution,
     shapes_of,
 )

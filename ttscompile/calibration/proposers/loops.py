@@ -34,7 +34,7 @@ from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
-from ..schedule import open_search, searched
+from ..search import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
 from ..trials import Trials

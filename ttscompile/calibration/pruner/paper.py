@@ -30,28 +30,17 @@ comes with the head is its plans frozen: the cells that it computes most often.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...artifact.load import Artifact
-from ...artifact.view import view_of
 from ...core.lattice import PlanArray, Source, whole_steps_plan
-from ...core.plan import Plan
-from ...errors import CalibrationFailedError
-from ...ir.pieces import PRUNER
 from ...ir.plan_head import first_numbers, has_head
 from ...runtimes.plans import pruner_plan
 from ..calls import Calls, IntArray
-from ..clock import Clock
-from ..judge import Score
-from ..proposer import Proposal, Proposals, Request
-from ..schedule import one_plan, searched
 from ..spacing import spacings
 from ..task import Array, Found, NothingAfter, Task
-from ..trials import Trials, base_of
 from .straight_through import Practice, legal, written
 
 UPDATES = 240
@@ -331,42 +320,3 @@ def _divided(task: Task) -> tuple[IntArray, IntArray]:
     whole = [part if len(part) else order[:1] for part in parts]
     practised, compared = ((part[:, None] * window + np.arange(window)).reshape(-1) for part in whole)
     return practised, compared
-
-
-class Pruner:
-    """Gates for each observation, on average within the cells that the plan so far computes. See ``Proposer``.
-
-    Attributes:
-        told: see ``Proposer``.
-    """
-
-    def __init__(self, request: Request) -> None:
-        self._most, self.told = request.intervals, ""
-
-    def applies(self, artifact: Artifact) -> str | None:
-        """See ``Proposer``."""
-        if has_head(view_of(artifact, base_of(artifact)).pruner):
-            return None
-        return "the artifact has no pruner that could learn. Convert the checkpoint again."
-
-    def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
-        """See ``Proposer``."""
-        cells = plan.cells
-        if cells is None or plan.loop != trials.base.loop:
-            raise CalibrationFailedError(
-                f"the pruner learns from a schedule of loop {trials.base.loop!r}; found another."
-            )
-        computed = int((cells == Source.COMPUTE).sum())
-        task = Task.of(trials.executor, trials.windows, computed, trials.seed, trials.pool)
-        search = Paper(replace(task, clock=clock))
-        found, updates, _ = searched(trials, search, clock, self._most, PRUNER)
-        self.told = f"{updates} updates; its best head is {found.error:.4g} off on calls that it was not trained on"
-        share = float(np.mean(cells != Source.COMPUTE))
-
-        def refusal(score: Score, others: Mapping[str, Score]) -> str | None:
-            if score.sparsity < share - 1e-9:
-                return f"reuses {score.sparsity:.4f} of the cells on held-out calls; the schedule reuses {share:.4f}."
-            return one_plan(score, updates)
-
-        made = replace(plan, cells=None, correction=None)
-        yield Proposal(PRUNER, made, {**found.notes, "updates": updates}, pruner=found.pruner, refusal=refusal)
