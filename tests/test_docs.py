@@ -22,7 +22,7 @@ from click.testing import CliRunner
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
-from ttscompile.artifact.ceiling import BOUND, NEAR
+from ttscompile.artifact.ceiling import BOUND, FARTHEST
 from ttscompile.cli import main
 
 PAGES = examples.pages()
@@ -250,8 +250,8 @@ def test_a_picture_is_drawn_by_its_script(tmp_path: Path, name: str) -> None:
 def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
     """The default's bound was chosen by these numbers."""
     plans = load(ROOT / "docs" / "pictures" / "distance.py", "docs_distance").plans()
-    within = [row["points"] for row in plans if row["distance"] <= NEAR]
-    beyond = [row["points"] for row in plans if NEAR < row["distance"] <= BOUND]
+    within = [row["points"] for row in plans if row["distance"] <= BOUND]
+    beyond = [row["points"] for row in plans if BOUND < row["distance"] <= FARTHEST]
     said = (
         f"Within a tenth no plan lost more than {-min(within):.1f} points of success**; between a tenth and a quarter"
         f" {['none', 'one', 'two', 'three'][sum(points <= -6 for points in beyond)]} of"

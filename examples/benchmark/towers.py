@@ -32,7 +32,7 @@ from ttscompile.frontends.resnet import group_norm, resnet
 from ttscompile.frontends.siglip import Siglip, SiglipConfig
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.pieces import CONDITION
-from ttscompile.lower.integers import HEADS
+from ttscompile.lower.integer_attention import HEADS
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.samplers.flow import flow_matching_table

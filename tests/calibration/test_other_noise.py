@@ -14,7 +14,7 @@ import torch
 
 import ttscompile
 from tests.once import Once
-from ttscompile.artifact.ceiling import BOUND
+from ttscompile.artifact.ceiling import FARTHEST
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.judge import Score, other_noise, other_observations
@@ -108,9 +108,11 @@ def test_record_table_and_words_say_the_ratio() -> None:
 @pytest.mark.parametrize(
     ("distance", "budget", "doubtful"),
     [
-        (BOUND, {"target_sparsity": 0.9}, False),
-        (BOUND + 0.01, {"target_sparsity": 0.9}, True),
-        (BOUND + 0.01, {"max_action_error": 8.0}, False),  # who names an error knows what it means
+        (FARTHEST, {"target_sparsity": 0.9}, False),
+        (FARTHEST + 0.01, {"target_sparsity": 0.9}, True),
+        (FARTHEST + 0.01, {"max_action_error": 8.0}, False),  # who names an error knows what it means
+        (FARTHEST + 0.01, {"max_distance": 0.9}, False),
+        (FARTHEST + 0.01, {"latency_ms": 8.0}, True),
     ],
 )
 def test_a_plan_that_is_far_off_is_doubtful(distance: float, budget: dict[str, float], doubtful: bool) -> None:
@@ -121,7 +123,7 @@ def test_a_plan_that_is_far_off_is_doubtful(distance: float, budget: dict[str, f
 
 
 @pytest.mark.parametrize(
-    ("distance", "word"), [(BOUND, "within"), (BOUND + 0.01, "above"), (float("nan"), "above"), ("far", "")]
+    ("distance", "word"), [(FARTHEST, "within"), (FARTHEST + 0.01, "above"), (float("nan"), "above"), ("far", "")]
 )
 def test_a_record_has_a_verdict(distance: object, word: str) -> None:
     record = result(10.0).record()

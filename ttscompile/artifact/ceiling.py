@@ -1,16 +1,15 @@
-"""What the number of denoising steps means for reuse: its ceiling, the usual budget, and when fewer are better."""
+"""How far a plan may go: from the original, and with a number of denoising steps; and when fewer of them are better."""
 
 from __future__ import annotations
 
 from .manifest import Manifest
 
-NEAR = 0.1
-"""Distance from the original up to which a plan is chosen as the default. Further ones cost some of the success: one of
+BOUND = 0.1
+"""Distance from the original up to which a plan is chosen as the default. Plans further away cost successes: one at
 0.16 lost 6 points in 800 paired episodes ("What a distance means" in ``docs/evidence/results.md``)."""
 
-BOUND = 0.25
-"""Distance up to which a plan is offered at all. Up to it plans lost at most 0.03 of the score, on five policies: "What
-an error means" on the same page."""
+FARTHEST = 0.25
+"""Distance up to which a plan is offered at all. Up to it plans lost as many as 10.5 points of success; same page."""
 
 TYPICAL_SPARSITY = 0.95
 """What the method's authors aim at, with 100 steps."""

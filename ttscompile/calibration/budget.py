@@ -28,6 +28,8 @@ from ..runtimes.runtime import Runtime
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
 """The ways to ask for a plan: the names of the arguments of ``calibrate``."""
+DISTANCE = "max_distance"
+"""Another one, where the default is chosen among many plans; a latency may go with it."""
 
 WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0
 """Calls of a plan that are not counted; that are, at least and at most; and after how long no more are made."""

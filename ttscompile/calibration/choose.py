@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from ..core.plan import DENSE, FULL
+from ..core.plan import DENSE, FULL, Plan
 from ..errors import CalibrationFailedError
 from ..measure.points import Point, efficient
 from ..measure.timer import Times
@@ -22,20 +22,34 @@ ALIKE = 1.1
 Where little is left to compute, a further step costs less than timing is off, and makes a plan much nearer."""
 
 
-def choose(kept: Kept, request: Request) -> list[dict[str, Any]]:
-    """Judge and time every plan, in each precision that it can have, and keep what is chosen, and nothing else.
+@dataclass(frozen=True)
+class Frontier:
+    """What was tried, and what was chosen.
+
+    Attributes:
+        tried: all plans, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
+            called while it was tried; ``told`` what it does, in words; ``distance`` and ``interval`` how far it is from
+            the original on held-out episodes, with 95 % limits (``judge``); ``milliseconds`` and ``worst`` the median
+            and the longest of its calls on this machine, in milliseconds; ``near`` whether it is within
+            ``Request.farthest``; ``on_frontier`` whether no other is faster and nearer; ``kept`` whether the artifact
+            gets it.
+        plans: that the artifact gets, by name; ``schedule`` is the default.
+        scores: of these, by name.
+    """
+
+    tried: tuple[dict[str, Any], ...]
+    plans: dict[str, Plan]
+    scores: dict[str, Score]
+
+
+def choose(kept: Kept, request: Request) -> Frontier:
+    """Judge and time every plan, in each precision that it can have, and choose.
 
     Without a deadline the fastest plan that is near enough is the default, or the nearest of those that are as fast
     (``ALIKE``). With one it is the nearest of those whose longest call keeps it. Where none is within ``Request.bound``
     it is the nearest within ``Request.farthest``, with a warning. ``schedule`` is the name of the default, ``safe``
     that of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that
     is not too far.
-
-    Returns:
-        What was tried, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
-        called while it was tried; ``told`` what it does, in words; ``milliseconds`` and ``worst`` the median and the
-        longest of its calls on this machine; ``near`` whether it is near enough to be offered (``proposer.near``);
-        ``on_frontier`` whether no other is faster and nearer; ``kept`` whether the artifact has it.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -87,9 +101,8 @@ def choose(kept: Kept, request: Request) -> list[dict[str, Any]]:
     ]
     if chosen not in close:
         kept.trials.bar.warn(_remark(scores[chosen], request))
-    kept.plans, kept.default = {DENSE: kept.plans[DENSE], **plans}, SCHEDULE
-    kept.scores = {named[name]: scores[name] for name in named}
-    return tried
+    plans = {DENSE: kept.plans[DENSE], **plans}
+    return Frontier(tuple(tried), plans, {named[name]: scores[name] for name in named})
 
 
 def _remark(score: Score, request: Request) -> str:

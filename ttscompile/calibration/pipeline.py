@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..artifact.ceiling import BOUND, NEAR, few_steps, usual_sparsity
+from ..artifact.ceiling import FARTHEST, few_steps, usual_sparsity
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import locked, update_plans
@@ -20,7 +20,7 @@ from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..verification.record_golden import record_plans
 from .arguments import calls_to_learn_from, require_alone, require_directory, require_limits
-from .budget import goal_of
+from .budget import DISTANCE, LATENCY, goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
 from .choose import choose
 from .clock import Clock
@@ -157,9 +157,9 @@ def calibrate(
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
         request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
         if chooses:  # its bound is of what is chosen in the end, and not of each that learns
-            bounds = (NEAR, BOUND) if max_distance is None else (max_distance, max_distance)
-            request = replace(request, margin=None, bound=bounds[0], farthest=bounds[1])
-            request = replace(request, deadline_ms=latency_ms, threads=goal.threads)
+            request = replace(request, margin=None, deadline_ms=latency_ms, threads=goal.threads)
+            if max_distance is not None:
+                request = replace(request, bound=max_distance, farthest=max_distance)
         made = [(row, row.make(request)) for row in rows]
         for _, proposer in made:
             if (reason := proposer.applies(artifact)) is not None:
@@ -203,8 +203,11 @@ def calibrate(
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
                 bar.warn(f"plan {name!r} is left out: {reason}")
-            frontier = choose(kept, request) if chooses else []
+            frontier = choose(kept, request) if chooses else None
+            if frontier is not None:
+                kept.plans, kept.scores, kept.default = frontier.plans, frontier.scores, SCHEDULE
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
+        chosen_within = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),
             strategy=strategy,
@@ -219,9 +222,9 @@ def calibrate(
             intervals=schedule.intervals,
             stopped=schedule.stopped or ("time limit" if clock.left() < 0 else "finished"),
             seconds=clock.elapsed(),
-            budget=schedule.budget.record(),
+            budget=chosen_within if chooses else schedule.budget.record(),
             told=told,
-            frontier=tuple(frontier),
+            frontier=() if frontier is None else frontier.tried,
         )
         if result.stopped == "time limit":
             bar.warn(
@@ -231,7 +234,7 @@ def calibrate(
         if result.doubtful:
             bar.warn(
                 f"plan {kept.default!r} is {result.plans[kept.default].distance:.2f} of what other noise changes from"
-                f" the original; above {BOUND:g} scores may fall. Allow more time or computed cells, or record more."
+                f" the original; above {FARTHEST:g} scores may fall. Allow more time or computed cells, or record more."
             )
         _write(Path(path), artifact, result, kept, anew)
         state.remove()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy.typing as npt
 
-from ..artifact.ceiling import BOUND, NEAR
+from ..artifact.ceiling import BOUND, FARTHEST
 from ..errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ SAFER = 0.7
 
 
 def near(score: Score, bound: float) -> bool:
-    """Whether a plan of this score may become the default."""
+    """Whether a plan of this score is within a bound, by its distance and by the limit of that."""
     return score.distance <= bound and score.interval[1] <= SURE * bound
 
 
@@ -97,8 +97,8 @@ class Request:
     rank: int = 16
     updates: int = 600
     margin: float | None = None
-    bound: float = NEAR
-    farthest: float = BOUND
+    bound: float = BOUND
+    farthest: float = FARTHEST
     deadline_ms: float | None = None
     threads: int = 1
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from ..artifact.ceiling import BOUND
-from .budget import ERROR
+from ..artifact.ceiling import FARTHEST
+from .budget import DISTANCE, ERROR
 from .judge import Score
 
 
@@ -54,8 +54,8 @@ class CalibrationResult:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the default plan is so far from the original that scores may fall, and nobody asked for an error."""
-        return ERROR not in self.budget and self.plans[self.default_plan].distance > BOUND
+        """Whether scores may fall, so far from the original is the default plan, and nobody said how far it may be."""
+        return not {ERROR, DISTANCE} & self.budget.keys() and self.plans[self.default_plan].distance > FARTHEST
 
     @property
     def sparsity(self) -> float:

@@ -97,7 +97,7 @@ class Schedule:
             best = crowded.best(more, f"{more} steps")
             if best is None:
                 break
-            found, budget = task.whole_steps(best[0]), replace(budget, cells=more * blocks)
+            found, budget = task.whole_steps(best.steps), replace(budget, cells=more * blocks)
         if not kept:
             return
         told = f"{self.intervals} interval{'s' * (self.intervals != 1)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from ..errors import CalibrationFailedError
 from .budget import Budget, Goal
@@ -27,8 +28,14 @@ SHARE = 0.2
 """Share of the time limit that is kept from the search for these plans."""
 
 
-Best = tuple[tuple[int, ...], float]
-"""The steps of a schedule, and its error on calls that its correction was not fitted on, in the units of actions."""
+class Best(NamedTuple):
+    """The best schedule of a family.
+
+    ``error`` is that on calls that its correction was not fitted on, in the units of the actions.
+    """
+
+    steps: tuple[int, ...]
+    error: float
 
 
 class SpacedSchedules:
@@ -54,7 +61,7 @@ class SpacedSchedules:
             if found is None or errors.normalised < found[0].normalised:
                 found = errors, steps
             self._bar.update(number + 1, f"error {found[0].units:.4g}", self._clock.left())
-        return None if found is None else (found[1], found[0].units)
+        return None if found is None else Best(found[1], found[0].units)
 
     def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]]) -> Errors | None:
         """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
@@ -94,7 +101,7 @@ def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: in
         if best is None:
             what = f"the time limit ended the search for a plan with an action error of at most {goal.value:g}"
             raise failed(what, "Allow more time, or a larger error")
-        tried[full] = best[1]
+        tried[full] = best.error
         return tried[full] <= goal.value
 
     most, low = max(1, steps // 2), 0
@@ -133,5 +140,5 @@ def named_plans(
         if (best := crowded.best(count, f"plan {name}")) is None:
             skipped[name] = "the time limit left none for it"
         else:
-            plans[name] = task.whole_steps(best[0])
+            plans[name] = task.whole_steps(best.steps)
     return plans, skipped

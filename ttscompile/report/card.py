@@ -216,7 +216,7 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
     lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{more}{precision}"]
     if record is not None:
         told, budget = {key: record[key] for key in ("strategy", "seed") if key in record}, record.get("budget", {})
-        goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error")
+        goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error", "max_distance")
         asked = {key: budget[key] for key in goals if budget.get(key) is not None}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
         if (learned := record.get("learned", [])) not in ([], ["schedule"]):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..artifact.ceiling import BOUND, NEAR, few_steps
+from ..artifact.ceiling import BOUND, FARTHEST, few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
@@ -245,9 +245,9 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
     if record.get("other_noise") == 0:
         return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
     where, cost = "above a quarter", "18 points of success and more"
-    if distance <= NEAR:
+    if distance <= BOUND:
         where, cost = "within a tenth", "at most 2 points of success"
-    elif distance <= BOUND:
+    elif distance <= FARTHEST:
         where, cost = "within a quarter", "up to 11 points of success"
     driven = f"Such plans cost {cost} where they were driven (docs/evidence/results.md, 'What a distance means')"
     return (f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes. {driven}.",)

@@ -135,6 +135,7 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     artifact = load_artifact(directory)
     assert artifact.manifest.model_identity == before
     assert artifact.manifest.default_plan == result.default_plan == "schedule"
+    assert result.budget == {"max_distance": 0.4} and not result.doubtful, "it was said how far it may be"
     assert set(artifact.plans) == {DENSE, *result.plans} and "schedule" in result.plans
     rows = {row["name"]: row for row in artifact.manifest.calibration["frontier"]}  # type: ignore[index]
     assert rows[DENSE]["distance"] < 1e-5 and rows["schedule"]["near"] and rows["schedule"]["kept"]
@@ -222,10 +223,9 @@ def chosen(
     )
     warned: list[str] = []
     monkeypatch.setattr(kept.trials.bar, "warn", warned.append)
-    choose(kept, request(**asked))
-    assert kept.default == "schedule"
-    assert len(warned) == (kept.scores["schedule"].distance > request(**asked).bound)
-    return {name: names[id(plan)] for name, plan in kept.plans.items() if name != "dense"}
+    frontier = choose(kept, request(**asked))
+    assert len(warned) == (frontier.scores["schedule"].distance > request(**asked).bound)
+    return {name: names[id(plan)] for name, plan in frontier.plans.items() if name != "dense"}
 
 
 def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, recording: Path) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,8 +52,15 @@ ANSWERING = 0.4
 """Share of a loop's time for the answers to learn from."""
 
 
-Cost = tuple[float, float]
-"""What calls of a loop take, in milliseconds: with one computed step, and more for each further one."""
+class Cost(NamedTuple):
+    """What calls of a loop take, in milliseconds: with ``one`` computed step, and more for each further ``step``."""
+
+    one: float
+    step: float
+
+    def of(self, steps: int) -> float:
+        """With so many computed steps."""
+        return self.one + (steps - 1) * self.step
 
 
 class Loops:
@@ -78,10 +86,10 @@ class Loops:
             yield Proposal(f"{ORIGINAL}.1", replace(plan, precision={}, repair=True), margin=float("inf"))
             return
         costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
-        order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop][0]))
+        order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop].one))
         for number, loop in enumerate(order):
             wanted = self._wanted(loop)
-            if wanted >= self._bound and (reason := self._too_slow(costs[loop][0], self._fastest)) is not None:
+            if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
             if number and clock.left() <= 0:
@@ -124,21 +132,21 @@ class Loops:
         counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
         apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
         for number, count in enumerate(counts):
-            if number and (clock.left() <= 0 or self._too_slow(of_steps(cost, count), fastest)):
+            if number and (clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
                 break
             quick = crowded.best(count, f"{loop}, {count} steps", TRIED)
             if quick is None and number:
                 clock.cut = True
                 break
             hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
-            if quick is not None and quick[1] > hopeless and count != counts[-1]:
+            if quick is not None and quick.error > hopeless and count != counts[-1]:
                 continue
             proposal = self._searched(own, task, loop, count)
             yield proposal
             name = proposal.name
             alone = replace(proposal, beside=False, margin=float("inf"))
-            if near(self._scores[name], self._bound) and of_steps(cost, count) < self._fastest:
-                self._best, self._fastest = alone, of_steps(cost, count)
+            if near(self._scores[name], self._bound) and cost.of(count) < self._fastest:
+                self._best, self._fastest = alone, cost.of(count)
             if near(self._scores[name], self._farthest) and self._is_nearest(name):
                 self._nearest = alone
             reached = near(self._scores[name], wanted) and self._deadline is None  # with a deadline as many as keep it
@@ -201,7 +209,7 @@ class Loops:
             trials.state.save()
         with trials.state.reading():
             one, step = known[loop]
-            return float(one), float(step)
+            return Cost(float(one), float(step))
 
     def _measured(self, trials: Trials, loop: str) -> tuple[float, float]:
         artifact, record = trials.artifact, trials.artifact.manifest.precision
@@ -215,11 +223,6 @@ class Loops:
             one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
             found.append((one, max(most - one, 0.0) / max(more - 1, 1)))
         return min(found)
-
-
-def of_steps(cost: Cost, steps: int) -> float:
-    """What a call takes with so many computed steps."""
-    return cost[0] + (steps - 1) * cost[1]
 
 
 def too_far(name: str, score: Score, bound: float) -> str:
