@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 NOT_RUN = {
-    "make": "sets up an environment; what it runs then are CI's own steps, and tests/examples/test_pusht_demo.py",
+    "make": "sets up an environment; what it runs then are CI's own steps, and examples/pusht/demo.py",
     "pip install": "would change the environment of this run",
     "git clone": "there is no network",
     "source": "of the shell, and for what make would have set up",

@@ -1,6 +1,6 @@
 """How late a control loop of 200 Hz wakes on this machine, alone and beside a policy at work.
 
-    python examples/benchmark/jitter.py compiled/ --control-hz 50 --seconds 10
+    python examples/benchmark/jitter.py compiled/ --policy-hz 50 --seconds 10
 
 The clock that matters is the robot's: run it there, with what else runs there.
 """
@@ -58,14 +58,14 @@ def jitter(policy: CompiledPolicy, policy_hz: float, seconds: float) -> dict[str
 
 @click.command()
 @artifact_argument
-@number_option("--control-hz", RATE, "Rate in Hz of the frames and actions of the policy.", required=True)
+@number_option("--policy-hz", RATE, "Rate in Hz of the frames and actions of the policy.", required=True)
 @number_option("--seconds", SECONDS, "Run each loop for so many seconds.", default=10.0)
 @click.option("--plan", type=TEXT, help="Run this plan. Without this option it is the default plan.")
 @threads_option("Threads that the policy computes with.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
-def main(directory: Path, control_hz: float, seconds: float, plan: str | None, threads: int, as_json: bool) -> None:
+def main(directory: Path, policy_hz: float, seconds: float, plan: str | None, threads: int, as_json: bool) -> None:
     """Measure how late a loop wakes, alone and beside a plan of the artifact DIRECTORY."""
-    found = jitter(load(directory, threads=threads, plan=plan, seed=0), control_hz, seconds)
+    found = jitter(load(directory, threads=threads, plan=plan, seed=0), policy_hz, seconds)
     if as_json:
         print_json({name: one.to_json() for name, one in found.items()})
         return

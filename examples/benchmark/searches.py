@@ -20,7 +20,7 @@ from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.strategies import strategy_of
 from ttscompile.calibration.targets import executor_elsewhere, where
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.trials import Trials
+from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.correction import FEATURES, Correction
 from ttscompile.core.lattice import check_plan
 from ttscompile.errors import CalibrationError
@@ -194,7 +194,7 @@ class Searching:
                     progress(f"search: {names[wish]}", number, len(names))
                     searches.keep(*wish, next(outcomes))
                 progress("search", len(names), len(names))
-            assert len(trials.held_out.calls)  # answered by the pool, and kept
+            trials.sample(HELD_OUT)  # answered by the pool, and kept
         entrants, skipped, cut = list[Entrant](), dict[str, str](), list[str]()
         for strategy, sparsity in wished:
             for series, found in (searches.known(strategy, budgets[sparsity]) or {}).items():

@@ -11,7 +11,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-RESAMPLES = 10_000
+RESAMPLES, PORTION = 10_000, 500
+"""How often episodes are drawn anew, and how many of these are held at once."""
 LEVEL = 0.95
 Values: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
@@ -40,8 +41,11 @@ def estimate(values: Values, seed: int = 0, level: float = LEVEL) -> Estimate:
         The estimate; of one value the interval has no width, and means nothing.
     """
     array = np.asarray(values, dtype=np.float64)
-    picks = np.random.default_rng(seed).integers(0, len(array), size=(RESAMPLES, len(array)))
-    low, high = np.quantile(array[picks].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
+    rng, means = np.random.default_rng(seed), np.empty(RESAMPLES)
+    for start in range(0, RESAMPLES, PORTION):
+        part = means[start : start + PORTION]
+        part[:] = array[rng.integers(0, len(array), size=(len(part), len(array)))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return Estimate(float(array.mean()), float(low), float(high))
 
 

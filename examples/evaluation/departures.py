@@ -13,8 +13,9 @@ Images and instructions stay as they are. With --summary there is one row a plan
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -60,28 +61,82 @@ class Distances:
     even: float
 
 
+@dataclass(frozen=True)
+class Recorded:
+    """The values of one key, ``[n, ..., Do]``, and their range, number by number."""
+
+    values: FloatArray
+
+    @cached_property
+    def low(self) -> FloatArray:
+        """The lowest of each number, ``[Do]``."""
+        return np.asarray(self.values.min(tuple(range(self.values.ndim - 1))))
+
+    @cached_property
+    def high(self) -> FloatArray:
+        """The highest of each number, ``[Do]``."""
+        return np.asarray(self.values.max(tuple(range(self.values.ndim - 1))))
+
+    @property
+    def middle(self) -> FloatArray:
+        """Of the range of each number, ``[Do]``."""
+        return (self.low + self.high) / 2
+
+    @property
+    def some_numbers(self) -> range:
+        """Three or four of the Do, evenly spaced; all where there are fewer."""
+        count = self.values.shape[-1]
+        return range(0, count, max(1, count // 3))
+
+    def noisy(self, rng: np.random.Generator) -> FloatArray:
+        """With noise of 1 % of the range."""
+        return self.values + 0.01 * (self.high - self.low) * rng.standard_normal(self.values.shape)
+
+    def drawn(self, rng: np.random.Generator) -> FloatArray:
+        """At random in the range."""
+        return rng.uniform(self.low, self.high, self.values.shape).astype(np.float32)
+
+    def stretched(self, times: float) -> FloatArray:
+        """So many times as far from the middle."""
+        return self.middle + times * (self.values - self.middle)
+
+    def mirrored(self, number: int) -> FloatArray:
+        """With this number on the other side of its middle; as they are where there is no such number."""
+        changed = self.values.copy()
+        if number < changed.shape[-1]:
+            changed[..., number] = 2 * self.middle[number] - changed[..., number]
+        return changed
+
+
 def departures(
-    values: FloatArray, rng: np.random.Generator, other: FloatArray | None = None
-) -> Iterator[tuple[str, FloatArray]]:
-    """Changed observations ``[n, ..., Do]`` by what was done to them, and those of another task, if there are any."""
-    axes = tuple(range(values.ndim - 1))
-    low, high = values.min(axes), values.max(axes)
-    middle, width = (low + high) / 2, high - low
-    yield "as recorded", values
-    yield "noise of 1 % of the range", values + 0.01 * width * rng.standard_normal(values.shape)
+    values: Mapping[str, FloatArray], rng: np.random.Generator, other: Mapping[str, FloatArray] | None = None
+) -> Iterator[tuple[str, dict[str, FloatArray]]]:
+    """What can be done to observations, all keys at once: its name, and what comes of it.
+
+    Args:
+        values: recorded, by key, ``[n, ..., Do]``; each may have a Do of its own.
+        rng: of what is random.
+        other: the same keys, recorded while something else was done.
+    """
+    every = {key: Recorded(each) for key, each in values.items()}
+
+    def changed(how: Callable[[Recorded], FloatArray]) -> dict[str, FloatArray]:
+        return {key: how(each) for key, each in every.items()}
+
+    yield "as recorded", dict(values)
+    yield "noise of 1 % of the range", changed(lambda one: one.noisy(rng))
     for times in (1.2, 3, 4, 6, 10, 30):
-        yield f"{times:g} times the range", middle + times * (values - middle)
-    for number in range(0, values.shape[-1], max(1, values.shape[-1] // 3)):
-        changed = values.copy()
-        changed[..., number] = 2 * middle[number] - changed[..., number]
-        yield f"number {number} mirrored", changed
-    for name, constant in (("lowest", low), ("highest", high), ("zeros", 0 * low)):
-        yield f"constant: {name}", np.broadcast_to(constant, values.shape)
-    yield "random in the range", rng.uniform(low, high, values.shape).astype(np.float32)
-    yield "columns reversed", values[..., ::-1]
-    yield "times 100", 100 * values
+        yield f"{times:g} times the range", changed(partial(Recorded.stretched, times=times))
+    for number in sorted({number for each in every.values() for number in each.some_numbers}):
+        yield f"number {number} mirrored", changed(partial(Recorded.mirrored, number=number))
+    yield "constant: lowest", changed(lambda one: np.broadcast_to(one.low, one.values.shape))
+    yield "constant: highest", changed(lambda one: np.broadcast_to(one.high, one.values.shape))
+    yield "constant: zeros", changed(lambda one: np.zeros_like(one.values))
+    yield "random in the range", changed(lambda one: one.drawn(rng))
+    yield "columns reversed", changed(lambda one: one.values[..., ::-1])
+    yield "times 100", changed(lambda one: 100 * one.values)
     if other is not None:
-        yield "another task", other
+        yield "another task", {key: other[key] for key in values}
 
 
 class Calls:
@@ -123,23 +178,18 @@ def apart(one: FloatArray, other: FloatArray) -> float:
 
 
 def measured(
-    artifact: Artifact, names: Sequence[str], recorded: Observation, other_task: Observation | None, count: int
+    artifact: Artifact, names: Sequence[str], recorded: Observation, other_task: Observation | None
 ) -> Iterator[Distances]:
-    """Distances of plans from the one that computes everything."""
+    """Distances of plans from the one that computes everything; of another task there are as many calls as recorded."""
     full = artifact.plan(full_plan(artifact.path))
     runtime, unbounded = (open_runtime(one, plan=full) for one in (artifact, replace(artifact, envelope=None)))
-    calls, rng = Calls(artifact, count, 0), np.random.default_rng(0)
-    other = apart(*(one.answers(runtime, full, recorded)[0] for one in (calls, Calls(artifact, count, 1))))
+    count, rng = rows(recorded), np.random.default_rng(0)
+    calls, with_other_noise = (Calls(artifact, count, seed) for seed in (0, 1))
+    noise_changes = apart(*(one.answers(runtime, full, recorded)[0] for one in (calls, with_other_noise)))
     blocks = len(artifact.manifest.groups)
-    changing = {
-        key: departures(recorded[key], rng, (other_task or {}).get(key))
-        for key in recorded
-        if vector(artifact.manifest.spec.observations[key])
-    }
-    for changed in zip(*changing.values(), strict=False):
-        observation = recorded | {
-            key: np.ascontiguousarray(value, np.float32) for key, (_, value) in zip(changing, changed, strict=True)
-        }
+    vectors = {key: value for key, value in recorded.items() if vector(artifact.manifest.spec.observations[key])}
+    for departure, changed in departures(vectors, rng, other_task):
+        observation = recorded | {key: np.ascontiguousarray(value, np.float32) for key, value in changed.items()}
         exact, _ = calls.answers(runtime, full, observation)
         for name in names:
             plan = artifact.plan(name)
@@ -148,7 +198,7 @@ def measured(
             own, outside = calls.answers(runtime, plan, observation)
             others = (calls.answers(unbounded, one, observation)[0] for one in (plan, even))
             far = float(np.mean(np.array(outside) > FAR)) if outside else 0.0
-            yield Distances(changed[0][0], name, far, *(apart(each, exact) / other for each in (own, *others)))
+            yield Distances(departure, name, far, *(apart(each, exact) / noise_changes for each in (own, *others)))
 
 
 def vector(spec: ObservationSpec) -> bool:
@@ -179,13 +229,36 @@ def main(
     """
     artifact = load_artifact(directory)
     recorded = some_calls(artifact, trajectories, calls)
-    count = len(next(iter(recorded.values())))
-    others = some_calls(artifact, other, count) if other else None
-    corrected = [name for name, plan in artifact.plans.items() if plan.correction is not None]
-    found = list(measured(artifact, names or corrected, recorded, others, count))
+    others = some_calls(artifact, other, calls) if other else None
+    count = min(rows(each) for each in (recorded, others) if each is not None)
+    recorded, others = (each and {key: value[:count] for key, value in each.items()} for each in (recorded, others))
+    found = list(measured(artifact, with_correction(artifact, names), recorded, others))
     show(found, summary, as_json)
-    if max(one.distance - one.even for one in found) > ALLOWED:
+    worst = max(found, key=lambda one: one.distance - one.even)
+    if worst.distance - worst.even > ALLOWED:
+        further = f"{worst.distance - worst.even:.2f} of other noise further from the original than even steps are"
+        click.echo(f"plan '{worst.plan}' is {further}, at: {worst.departure}", err=True)
         raise SystemExit(1)
+
+
+def with_correction(artifact: Artifact, names: Sequence[str]) -> list[str]:
+    """The plans that were asked for, or all that have a correction.
+
+    Raises:
+        click.UsageError: there is none, or one that was asked for has none.
+    """
+    corrected = [name for name, plan in artifact.plans.items() if plan.correction is not None]
+    plain = [name for name in names if artifact.plan(name).correction is None]
+    if plain or not corrected:
+        found = f"plan '{plain[0]}' has none" if plain else "no plan has one"
+        there = f"Plans that have one: {', '.join(corrected)}" if corrected else "'ttscompile build' makes such plans"
+        raise click.UsageError(f"{artifact.path}: expected plans with a correction; found that {found}. {there}.")
+    return list(names) or corrected
+
+
+def rows(observation: Observation) -> int:
+    """How many calls there are."""
+    return len(next(iter(observation.values())))
 
 
 def some_calls(artifact: Artifact, paths: Sequence[Path], calls: int) -> Observation:

@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 from bootstrap import Estimate, Values, paired_difference, paired_difference_of_shares
 
 SCORE_MARGIN, SUCCESS_MARGIN = 0.03, 0.05
 """What may be lost, at most: of the score, which is 0 to 1, and of the share of episodes that succeed."""
 EQUIVALENT, WORSE, TOO_FEW = "equivalent", "worse", "too few episodes"
+FEWEST = 50
+"""Episodes whose scores can prove equivalence. Resampling knows no loss that none of them had: what strikes 6 % of all
+episodes is among 50 of them with 95 %. (The intervals of shares are wide enough for any number.)"""
+POWER = 0.8
+"""Share of the runs of ``Verdict.enough`` episodes that settle it."""
 ERROR = 0.05
 """Of all comparisons of a table together: the chance that an interval misses (Bonferroni)."""
 
@@ -25,13 +31,14 @@ class Verdict:
     """What some paired episodes say of a difference.
 
     Attributes:
-        word: ``EQUIVALENT`` if the interval is above the margin; ``WORSE`` if it is not, and below 0; else ``TOO_FEW``.
+        word: ``EQUIVALENT`` if the interval is above the margin, for scores of at least ``FEWEST`` episodes; ``WORSE``
+            if it is not above, and below 0; else ``TOO_FEW``.
         difference: from the baseline, with its interval.
         margin: that may be lost, positive.
         episodes: that were paired.
         comparisons: that share the error.
-        enough: episodes that would probably settle it, if the difference stays as it is; None where it is settled, and
-            where it lies on the margin.
+        enough: episodes that would do in four of five cases, if the difference is what was found; None where it is
+            settled.
     """
 
     word: str
@@ -74,17 +81,28 @@ def verdict(
     else:
         found = paired_difference(values, baseline, seed, level)
     word = EQUIVALENT if found.low > -margin else WORSE if found.high < 0 else TOO_FEW
-    enough = None if word != TOO_FEW else _enough(found, margin, len(values))
-    return Verdict(word, found, margin, len(values), comparisons, enough)
+    made = Verdict(word, found, margin, len(values), comparisons, None)
+    if word == EQUIVALENT and not shares and len(values) < FEWEST:
+        return replace(made, word=TOO_FEW, enough=FEWEST)
+    if word != TOO_FEW:
+        return made
+    enough = _enough(found, margin, len(values), level)
+    return replace(made, enough=enough if shares else max(enough, FEWEST))
 
 
-def _enough(found: Estimate, margin: float, episodes: int) -> int | None:
-    """The half-width of an interval falls with the root of the number of episodes."""
+def _enough(found: Estimate, margin: float, episodes: int, level: float) -> int:
+    """How many episodes settle it with ``POWER``.
+
+    The half-width of an interval falls with the root of the number of episodes. If it is just as wide as the room that
+    there is, every other run settles it, because the mean varies as well.
+    """
     if found.mean > -margin:
         width, room = found.mean - found.low, found.mean + margin  # to be called equivalent
     else:
         width, room = found.high - found.mean, -found.mean  # to be called worse
-    return math.ceil(episodes * (width / room) ** 2 / 10) * 10 if room > 0 else None
+    z = NormalDist().inv_cdf((1 + level) / 2)
+    wider = (z + NormalDist().inv_cdf(POWER)) / z
+    return math.ceil(episodes * (wider * width / room) ** 2 / 10) * 10
 
 
 def joined(verdicts: Sequence[Verdict]) -> str:

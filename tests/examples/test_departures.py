@@ -61,9 +61,56 @@ def test_the_worst_of_a_plan_and_another_task(asked: list[str], tmp_path: Path) 
 
 def test_departures_by_hand() -> None:
     values, rng = np.array([[0.0, 2.0], [4.0, 2.0]], np.float32), np.random.default_rng(0)
-    made = dict(departures.departures(values, rng, -values))
-    assert made["3 times the range"].tolist() == [[-4, 2], [8, 2]]
-    assert made["number 0 mirrored"].tolist() == [[4, 2], [0, 2]]
-    assert made["columns reversed"].tolist() == [[2, 0], [2, 4]]
-    assert made["constant: highest"].tolist() == [[4, 2], [4, 2]]
-    assert made["another task"].tolist() == (-values).tolist()
+    made = dict(departures.departures({"obs": values}, rng, {"obs": -values}))
+    assert made["3 times the range"]["obs"].tolist() == [[-4, 2], [8, 2]]
+    assert made["number 0 mirrored"]["obs"].tolist() == [[4, 2], [0, 2]]
+    assert made["columns reversed"]["obs"].tolist() == [[2, 0], [2, 4]]
+    assert made["constant: highest"]["obs"].tolist() == [[4, 2], [4, 2]]
+    assert made["another task"]["obs"].tolist() == (-values).tolist()
+
+
+def test_keys_of_different_widths_depart_together() -> None:
+    """All have the departure of that name, and a number is mirrored in every key that has it."""
+    rng = np.random.default_rng(0)
+    values = {"pose": rng.uniform(0, 1, (5, 2)), "joints": rng.uniform(0, 1, (5, 1, 9))}
+    named = list(departures.departures(values, np.random.default_rng(1)))
+    made = dict(named)
+    assert len(made) == len(named) and all(list(changed) == list(values) for changed in made.values())
+    assert [name for name in made if "mirrored" in name] == [f"number {n} mirrored" for n in (0, 1, 3, 6)]
+    changed = {name: [key for key in values if (each[key] != values[key]).any()] for name, each in made.items()}
+    assert changed["number 0 mirrored"] == changed["number 1 mirrored"] == ["pose", "joints"]
+    assert changed["number 3 mirrored"] == changed["number 6 mirrored"] == ["joints"]
+    for key, value in values.items():
+        np.testing.assert_array_equal(made["times 100"][key], 100 * value)
+        assert (made["constant: zeros"][key] == 0).all()
+
+
+def test_of_another_task_there_may_be_fewer_calls(asked: list[str], tmp_path: Path) -> None:
+    """Then as many of those that were recorded are compared."""
+    away = np.linspace(40, 50, 8, dtype=np.float32).reshape(4, 2)
+    np.savez(tmp_path / "other.npz", obs=away, episode_ends=[2, 4])
+    words = [*asked, "--other", str(tmp_path / "other.npz"), "--json"]
+    fewer = json.loads(CliRunner().invoke(departures.main, words, catch_exceptions=False).stdout)
+    four = json.loads(CliRunner().invoke(departures.main, [*asked[:-1], "4", "--json"], catch_exceptions=False).stdout)
+    assert fewer[-1]["departure"] == "another task" and fewer[: len(four)] == four
+
+
+def test_a_plan_that_goes_too_far_is_named(asked: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """On standard error, with the place; the exit status is 1."""
+    monkeypatch.setattr(departures, "ALLOWED", -2.0)  # even as near as even steps is too far
+    result = CliRunner().invoke(departures.main, [*asked, "--json"], catch_exceptions=False)
+    worst = max(json.loads(result.stdout), key=lambda one: one["distance"] - one["even"])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("plan 'fast' is ") and result.stderr.endswith(f"at: {worst['departure']}\n")
+    assert f"{worst['distance'] - worst['even']:.2f} of other noise further" in result.stderr
+
+
+@pytest.mark.parametrize("words", [[], ["--plan", "dense"]])
+def test_plans_without_a_correction_are_refused(words: list[str], tmp_path: Path) -> None:
+    artifact = written_artifact(toy_program(), tmp_path / "artifact")
+    np.savez(tmp_path / "calls.npz", obs=np.zeros((4, 2), np.float32), episode_ends=[4])
+    given = [str(artifact.path), "--trajectories", str(tmp_path / "calls.npz"), *words]
+    result = CliRunner().invoke(departures.main, given)
+    assert result.exit_code == 2 and "expected plans with a correction" in result.stderr
+    assert ("plan 'dense' has none" in result.stderr) == bool(words)
+    assert "'ttscompile build' makes such plans" in " ".join(result.stderr.split())

@@ -6,20 +6,22 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import demo
 import numpy as np
 import pytest
-from demo import ORIGINAL, SAFE, Step, best_of, conclusion, drive, speed_table
+from demo import ORIGINAL, SAFE, Step, best_of, conclusion, drive, speed_table, steps_to, time_steps
 from episodes import Episodes
-from equivalence import SCORE_MARGIN, SUCCESS_MARGIN, Verdict
+from equivalence import SCORE_MARGIN, SUCCESS_MARGIN, TOO_FEW, WORSE, Verdict, verdict
 from evaluate import Evaluation, summarise, verdict_table, verdicts_of
 from rollout import Episode, Rollout
-from variants import open_variant
+from variants import open_variant, run
 
 from tests.examples.printed import printed
-from ttscompile import Plan
+from ttscompile import Plan, Source
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import uniform_plan
+from ttscompile.core.spec import BF16, INT8
 
 
 def cells(table: Any) -> list[list[str]]:
@@ -80,14 +82,51 @@ def test_the_conclusion_has_a_margin_and_a_number_of_episodes() -> None:
     said = conclusion("schedule", STEPS, unclear)
     assert said.startswith(f"{faster}400 episodes are too few to say whether {within}; ") and said.endswith("0 may do.")
     (lost,) = verdicts(200, 100)
-    assert conclusion("schedule", STEPS, lost).startswith(f"{faster}It is worse than the original")
+    assert conclusion("schedule", STEPS, lost) == f"{faster}It is worse than the original."
+
+
+def test_what_is_worse_in_one_measure_is_worse() -> None:
+    """Though the other is not settled."""
+    zeros, wide = [0.0] * 400, [3.0, -3.0] * 200
+    unclear, lost = verdict(wide, zeros, SCORE_MARGIN), verdict([0.0] * 400, [1.0] * 400, SUCCESS_MARGIN, shares=True)
+    assert (unclear.word, lost.word) == (TOO_FEW, WORSE)
+    said = conclusion("schedule", STEPS, (unclear, lost))
+    assert said.endswith("times faster. It is worse than the original.") and "too few" not in said
 
 
 def test_the_fastest_equivalent_plan_is_shown() -> None:
-    assert best_of(evaluations(200, 200, 200)) == 0
-    assert best_of(evaluations(200, 100, 200)) == 1
-    assert best_of(evaluations(200, 100, 100)) == 1  # none: the nearest
-    assert best_of(evaluations(200, 100)) == 0
+    assert best_of(verdicts(200, 200, 200)) == 0
+    assert best_of(verdicts(200, 100, 200)) == 1
+    assert best_of(verdicts(200, 100, 100)) == 1  # none: the nearest
+    assert best_of(verdicts(200, 100)) == 0
+
+
+def test_the_steps_to_a_plan_are_named_by_what_it_says() -> None:
+    """And each has the plan that is timed for it."""
+    cells = np.full((4, 3), Source.TIMESTEP, np.int8)
+    cells[[0, 2]] = Source.COMPUTE
+    cells[3, 0] = Source.COMPUTE
+    first, two = {"compiled, everything computed": "dense"}, "2 steps computed"
+    assert steps_to("dense", Plan()) == first
+    assert steps_to("fast", Plan(cells=cells)) == {**first, two: "fast"}
+    assert steps_to("pruner", Plan()) == {**first, "the cells computed that the pruner chooses": "pruner"}
+    small = steps_to("fast", Plan(cells=cells, precision={"blocks": INT8, "condition": INT8, "tail": BF16}))
+    assert small == {
+        **first,
+        two: "fast@fp32",
+        "8-bit weights in blocks, condition; 16-bit weights in tail": "fast",
+    }
+
+
+@pytest.mark.slow
+def test_each_step_is_timed(compiled_layer: Path, one_layer_checkpoint: Path, tmp_path: Path) -> None:
+    artifact = shutil.copytree(compiled_layer, tmp_path / "compiled")
+    update_plans(artifact, {"ten": Plan(cells=uniform_plan(100, 3, 10))}, "ten", {"strategy": "interval"})
+    steps = time_steps(one_layer_checkpoint, artifact, "ten", 2)
+    named = ["the original, in PyTorch", "compiled, everything computed", "10 steps computed"]
+    assert [step.what for step in steps] == named
+    assert all(step.ms > 0 for step in steps) and steps[2].ms < steps[1].ms
+    assert [step.what for step in time_steps(one_layer_checkpoint, artifact, "dense", 1)] == named[:2]
 
 
 def test_the_table_of_verdicts_names_what_was_allowed() -> None:
@@ -116,6 +155,23 @@ def test_episodes_that_were_run_before_are_compared(compiled_pusht: Path, tmp_pa
     found = drive(artifact, ["one"], (7, 8), 2, 2)
     assert [one.label for one in found] == [ORIGINAL, "one"]
     assert [round(one.score.mean * 0.95, 6) for one in found] == [0.8, 0.7]
+
+
+def test_a_bad_checkpoint_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And nothing is left behind but the folder that it would have worked in."""
+    bad = tmp_path / "not-a-policy.ckpt"
+    bad.write_text("nothing of the kind")
+    monkeypatch.setattr(demo, "POLICIES", {"flow": (bad, None)})
+    monkeypatch.setattr(sys, "argv", ["demo.py", "--directory", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as ended:
+        run(demo.main)
+    told = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert told.startswith("error: ") and "Traceback" not in told
+    assert "not-a-policy.ckpt" in told
+    assert [*(tmp_path / "out").rglob("*")] == [tmp_path / "out" / "flow"]
 
 
 @pytest.mark.slow

@@ -105,10 +105,12 @@ def render(content: dict[str, list[Row]]) -> str:
 
 
 def _blocks(each: Row) -> str:
-    """``24: 8 cross-attention, 8 feed-forward, 8 self-attention``."""
+    """``24: 8 cross-attention, 8 feed-forward, 8 self-attention``; of one block, what it is."""
     kinds = each["blocks"]
-    if sum(kinds.values()) == 1:
+    if kinds == {"network": 1}:
         return "1: the whole network"
+    if sum(kinds.values()) == 1 and each["hoisted"] + each["batched"] >= 1:
+        return "1: nothing to reuse"
     return f"{sum(kinds.values())}: " + ", ".join(f"{n} {kind.replace('_', '-')}" for kind, n in kinds.items())
 
 
