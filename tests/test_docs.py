@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import click
@@ -19,6 +21,7 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
+import ttscompile
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
@@ -233,6 +236,21 @@ def test_the_comparison_of_outputs_sees_what_is_gone() -> None:
     assert examples.renewed(["was printed once", "dense 1 ms 1%", "..."], printed) == [printed[1], "..."]
     assert examples.missing(["computed steps 0, 54, 83"], ["computed steps 0"]) == []
     assert examples.renewed([], printed) == printed
+    table = ["  plan   distance   ms", " ──────", "  dense   0.0   553"]
+    assert examples.missing(table, ["  plan   distance   ms", " ────────", "  dense   0.1   60"]) == []
+    assert examples.missing(table, ["  plan   distance   longest   ms", " ────────", "  dense   0.1   60"]) == table[:1]
+
+
+def test_the_reference_shows_every_public_name() -> None:
+    shown = set()
+    for page in ("python.md", "errors.md"):
+        for path in re.findall(r"^::: (\S+)", (ROOT / "docs" / "reference" / page).read_text(), re.MULTILINE):
+            parent, _, name = path.rpartition(".")
+            thing = getattr(importlib.import_module(parent), name, None) or importlib.import_module(path)
+            inside = vars(thing).values() if isinstance(thing, ModuleType) else ()
+            shown |= {id(thing), *(id(each) for each in inside if getattr(each, "__module__", None) == path)}
+    names = [name for name in ttscompile.__all__ if name != "__version__"]
+    assert [name for name in names if id(getattr(ttscompile, name)) not in shown] == []
 
 
 @pytest.mark.parametrize("name", ["distance", "lattice"])
