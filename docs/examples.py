@@ -131,10 +131,18 @@ def likeness(shown: str, printed: str) -> float:
     return kept / len(wanted)
 
 
+def headers(lines: Sequence[str]) -> list[str]:
+    """Lines with a rule below: the columns of tables, or the last line of their names."""
+    rules = [bool(line.strip()) and not words_of(line) for line in lines]
+    return [line for line, below in zip(lines, rules[1:], strict=False) if below and words_of(line)]
+
+
 def missing(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
-    """Lines that are shown and that nothing printed resembles."""
+    """Lines that are shown and that nothing printed resembles, and columns of tables that are not exactly printed."""
     wanted = [line for line in shown if line.strip() != ELIDED and words_of(line)]
-    return [line for line in wanted if max((likeness(line, other) for other in printed), default=0) < ALIKE]
+    gone = [line for line in wanted if max((likeness(line, other) for other in printed), default=0) < ALIKE]
+    columns = [words_of(line) for line in headers(printed)]
+    return gone + [line for line in headers(shown) if line not in gone and words_of(line) not in columns]
 
 
 def renewed(shown: Sequence[str], printed: Sequence[str]) -> list[str]:

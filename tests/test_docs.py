@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import click
@@ -19,6 +21,7 @@ import pytest
 import zarr
 from click.testing import CliRunner
 
+import ttscompile
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
@@ -233,6 +236,21 @@ def test_the_comparison_of_outputs_sees_what_is_gone() -> None:
     assert examples.renewed(["was printed once", "dense 1 ms 1%", "..."], printed) == [printed[1], "..."]
     assert examples.missing(["computed steps 0, 54, 83"], ["computed steps 0"]) == []
     assert examples.renewed([], printed) == printed
+    table = ["  plan   distance   ms", " ──────", "  dense   0.0   553"]
+    assert examples.missing(table, ["  plan   distance   ms", " ────────", "  dense   0.1   60"]) == []
+    assert examples.missing(table, ["  plan   distance   longest   ms", " ────────", "  dense   0.1   60"]) == table[:1]
+
+
+def test_the_reference_shows_every_public_name() -> None:
+    shown = set()
+    for page in ("python.md", "errors.md"):
+        for path in re.findall(r"^::: (\S+)", (ROOT / "docs" / "reference" / page).read_text(), re.MULTILINE):
+            parent, _, name = path.rpartition(".")
+            thing = getattr(importlib.import_module(parent), name, None) or importlib.import_module(path)
+            inside = vars(thing).values() if isinstance(thing, ModuleType) else ()
+            shown |= {id(thing), *(id(each) for each in inside if getattr(each, "__module__", None) == path)}
+    names = [name for name in ttscompile.__all__ if name != "__version__"]
+    assert [name for name in names if id(getattr(ttscompile, name)) not in shown] == []
 
 
 @pytest.mark.parametrize("name", ["distance", "lattice"])
@@ -249,14 +267,26 @@ def test_a_picture_is_drawn_by_its_script(tmp_path: Path, name: str) -> None:
 
 def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
     """The default's bound was chosen by these numbers."""
-    plans = load(ROOT / "docs" / "pictures" / "distance.py", "docs_distance").plans()
-    within = [row["points"] for row in plans if row["distance"] <= BOUND]
-    beyond = [row["points"] for row in plans if BOUND < row["distance"] <= FARTHEST]
-    said = (
-        f"Within a tenth no plan lost more than {-min(within):.1f} points of success**; between a tenth and a quarter"
-        f" {['none', 'one', 'two', 'three'][sum(points <= -6 for points in beyond)]} of"
-        f" {['five', 'six', 'seven', 'eight'][len(beyond) - 5]} lost 6 points or more"
+    picture = load(ROOT / "docs" / "pictures" / "distance.py", "docs_distance")
+    plans = picture.plans()
+    within = [row for row in plans if row["distance"] <= BOUND]
+    few, many = (
+        min((row for row in within if (row["episodes"] < picture.FEW) == hollow), key=lambda row: row["points"])
+        for hollow in (True, False)
     )
+    between = [row["points"] for row in plans if BOUND < row["distance"] <= FARTHEST]
+    (beyond,) = (row["points"] for row in plans if row["distance"] > FARTHEST)
+    losses = f"{-few['points']:.1f} points of success in {few['episodes']} episodes"
+    said = (
+        f"Within a tenth the largest loss was {losses}**, where nothing can be told, **and {-many['points']:.1f} in"
+        f" {many['episodes']:,}**; between a tenth and a quarter"
+        f" {['none', 'one', 'two', 'three'][sum(points <= -6 for points in between)]} of"
+        f" {['seven', 'eight', 'nine'][len(between) - 7]} lost 6 points or more, {-min(between):.1f} at most; the one"
+        f" beyond lost {-beyond:.1f}"
+    )
+    for page in ("design.md", "howto/calibrate.md", "howto/budget.md"):
+        text = " ".join((ROOT / "docs" / page).read_text().split())
+        assert f"{losses} and {-many['points']:.1f} in {many['episodes']:,}, those up to 0.25 as many as" in text, page
     assert said in " ".join((ROOT / "docs" / "evidence" / "results.md").read_text().split())
     assert all(row["low"] <= row["points"] <= row["high"] for row in plans)
 

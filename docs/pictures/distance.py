@@ -2,7 +2,8 @@
 
 python docs/pictures/distance.py [FILE]
 
-The plans are those of ``docs/evidence/driven.json``: all that were judged by ``calibration.judge`` and then driven.
+The plans are those of ``docs/evidence/driven.json``: those that were judged by
+``calibration.judge`` and whose success in episodes is known.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from ttscompile.artifact.ceiling import BOUND, FARTHEST
 DRIVEN = Path(__file__).resolve().parents[1] / "evidence" / "driven.json"
 MARGIN = 5.0
 """Points of success, below which a plan is called equivalent (``examples/evaluation/equivalence.py``)."""
+FEW = 400
+"""Episodes, below which a point is hollow: hardly any such plan can be called equivalent."""
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 
 
@@ -37,10 +40,21 @@ def draw(path: Path) -> None:
     rows = plans()
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     for policy, colour in zip(policies, COLOURS, strict=True):
-        own = [row for row in rows if row["policy"] == policy]
-        across, up = [row["distance"] for row in own], [row["points"] for row in own]
-        ends = [[row["points"] - row["low"] for row in own], [row["high"] - row["points"] for row in own]]
-        axes.errorbar(across, up, ends, fmt="o", color=colour, label=policy, capsize=3, elinewidth=1)
+        for row in (row for row in rows if row["policy"] == policy):
+            ends = [[row["points"] - row["low"]], [row["high"] - row["points"]]]
+            inside = "white" if row["episodes"] < FEW else colour
+            axes.errorbar(
+                row["distance"],
+                row["points"],
+                ends,
+                fmt="o",
+                color=colour,
+                markerfacecolor=inside,
+                capsize=3,
+                elinewidth=1,
+            )
+        axes.plot([], [], "o", color=colour, label=policy)
+    axes.plot([], [], "o", color="grey", markerfacecolor="white", label=f"fewer than {FEW} episodes")
     axes.axhline(0, color="black", linewidth=0.8)
     axes.axhline(-MARGIN, color="grey", linewidth=0.8, linestyle=":")
     for bound, name in ((BOUND, "the default"), (FARTHEST, "fast")):
