@@ -15,8 +15,8 @@ PROVES_NOTHING = re.compile(
     r"|\blos(?:es?|t) nothing|\bno loss\b|\bcost(?:s|ing)? no (?:score|success)"
 )
 """What only an infinite number of episodes could show."""
-EQUIVALENT = re.compile(r"\bequivalent\b|\bas good as the original\b(?!\?)")
-"""A question claims nothing."""
+EQUIVALENT = re.compile(r"(?<!not )\bequivalent\b|(?<!whether it is )\bas good as the original\b(?!\?)")
+"""A question claims nothing, nor does who denies it."""
 MARGIN = re.compile(r"\b\d+(?:\.\d+)? (?:points|of the score)|\bmargin")
 EPISODES = re.compile(r"\b[\d,]+ (?:paired )?episodes\b")
 
@@ -58,6 +58,8 @@ def test_a_page_claims_what_was_measured(page: Path) -> None:
         ("It is as good as the original within a margin, in 2,400 paired episodes.", 0),
         ("It is equivalent: less than 0.03 of the score is lost, in 800 episodes.", 0),
         ("## As good as the original?", 0),
+        ("It says whether it is as good as the original.", 0),
+        ("Another is driven if the default is not equivalent.", 0),
         ("Three steps are equivalent: less than 5 points are lost, in 800 episodes.", 0),
         ("Three steps score 0.93 where the original scores 0.94.", 0),
     ],

@@ -284,6 +284,10 @@ def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
         f" {['seven', 'eight', 'nine'][len(between) - 7]} lost 6 points or more, {-min(between):.1f} at most; the one"
         f" beyond lost {-beyond:.1f}"
     )
+    facts = (ROOT / "ttscompile" / "report" / "facts.py").read_text()
+    for end, lost in (("they", few["points"]), ("they", min(between)), ("one", beyond)):
+        at_most = "" if end == "one" else "at most "
+        assert f'"{end} lost {at_most}{-lost:.1f}"' in facts
     for page in ("design.md", "howto/calibrate.md", "howto/budget.md"):
         text = " ".join((ROOT / "docs" / page).read_text().split())
         assert f"{losses} and {-many['points']:.1f} in {many['episodes']:,}, those up to 0.25 as many as" in text, page

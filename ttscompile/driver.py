@@ -17,7 +17,6 @@ from .artifact.write import require_replaceable, write_artifact
 from .capture.export import capture
 from .capture.narrow import narrow, needed, unneeded
 from .core.coercion import integer
-from .core.finding import Level
 from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, INT8, ORIGINAL, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
@@ -132,11 +131,9 @@ def convert(
             origin["base_licence"] = fetched.licence
     options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None, base)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
-    for one in (doubts := [one for one in examine(Path(checkpoint), spec, encoders) if one.remedy]):
-        if one.level is Level.PROBLEM:  # what the robot is told would mean nothing
+    for one in examine(Path(checkpoint), spec, encoders):
+        if one.remedy:
             warnings.warn(one.told, stacklevel=2)
-    if notes := tuple(one.told for one in doubts if one.level is not Level.PROBLEM):
-        explain("examine", notes)
     spec = replace(spec, source={**spec.source, **origin})
     beside = files_beside(checkpoint, spec)
     if spec.source.get("format") == "lerobot" and not beside:

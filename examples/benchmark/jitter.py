@@ -7,6 +7,9 @@ The clock that matters is the robot's: run it there, with what else runs there.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -19,12 +22,63 @@ from ttscompile.cli.output import print_json, results_console, run, table
 from ttscompile.cli.types import RATE, SECONDS, TEXT
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
-from ttscompile.runtimes.executor.measure import Jitter, measure_jitter, some_observation
+from ttscompile.runtimes.executor.measure import some_observation
 from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.load import load
 from ttscompile.runtimes.policy import CompiledPolicy
 
 JITTER_HZ = 200
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """How late the ticks of a loop were, in milliseconds, and what the loop's own work took.
+
+    Attributes:
+        late: ticks that were later than half a period.
+        work_us: median of the work of a tick, microseconds.
+    """
+
+    hz: float
+    ticks: int
+    p50: float
+    p99: float
+    max: float
+    late: int
+    work_us: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return asdict(self)
+
+
+def measure_jitter(hz: float, seconds: float, work: Callable[[], object] = lambda: None) -> Jitter:
+    """Run a loop in real time, sleeping between ticks, and measure how late it wakes.
+
+    Args:
+        hz: rate of the loop.
+        seconds: how long it runs.
+        work: called in every tick.
+    """
+    ticks = max(int(seconds * hz), 1)
+    late, took = np.empty(ticks), np.empty(ticks)
+    start = time.perf_counter()
+    for i in range(ticks):
+        due = start + (i + 1) / hz
+        time.sleep(max(due - time.perf_counter(), 0.0))
+        woke = time.perf_counter()
+        work()
+        late[i], took[i] = woke - due, time.perf_counter() - woke
+    p50, p99 = (float(p) for p in np.percentile(1e3 * late, [50, 99]))
+    return Jitter(
+        hz=hz,
+        ticks=ticks,
+        p50=p50,
+        p99=p99,
+        max=float(1e3 * late.max()),
+        late=int(np.count_nonzero(late > 0.5 / hz)),
+        work_us=float(1e6 * np.median(took)),
+    )
 
 
 def jitter(policy: CompiledPolicy, policy_hz: float, seconds: float) -> dict[str, Jitter]:

@@ -80,7 +80,7 @@ class Recorded:
     @property
     def middle(self) -> FloatArray:
         """Of the range of each number, ``[Do]``."""
-        return (self.low + self.high) / 2
+        return np.asarray((self.low + self.high) / 2, np.float32)
 
     @property
     def some_numbers(self) -> range:
@@ -90,7 +90,8 @@ class Recorded:
 
     def noisy(self, rng: np.random.Generator) -> FloatArray:
         """With noise of 1 % of the range."""
-        return self.values + 0.01 * (self.high - self.low) * rng.standard_normal(self.values.shape)
+        noise = rng.standard_normal(self.values.shape, np.float32)
+        return self.values + np.float32(0.01) * (self.high - self.low) * noise
 
     def drawn(self, rng: np.random.Generator) -> FloatArray:
         """At random in the range."""
@@ -231,7 +232,8 @@ def main(
     recorded = some_calls(artifact, trajectories, calls)
     others = some_calls(artifact, other, calls) if other else None
     count = min(rows(each) for each in (recorded, others) if each is not None)
-    recorded, others = (each and {key: value[:count] for key, value in each.items()} for each in (recorded, others))
+    recorded = {key: value[:count] for key, value in recorded.items()}
+    others = others and {key: value[:count] for key, value in others.items()}
     found = list(measured(artifact, with_correction(artifact, names), recorded, others))
     show(found, summary, as_json)
     worst = max(found, key=lambda one: one.distance - one.even)

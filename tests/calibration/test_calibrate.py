@@ -61,7 +61,7 @@ def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: 
     assert result.sparsity >= TARGET
     assert result.plans["uniform"].sparsity == pytest.approx(TARGET)
     assert result.plans["schedule"].error < 0.7 * result.plans["uniform"].error
-    assert result.validation_error <= result.plans["schedule"].error
+    assert result.plans[result.default_plan].error <= result.plans["schedule"].error
     assert artifact.manifest.default_plan == result.default_plan
 
 
@@ -102,8 +102,7 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
     record = json.loads(json.dumps(dict(manifest.calibration)))
     assert record["plans"]["schedule"]["error"] == pytest.approx(result.plans["schedule"].error)
     assert record["plans"][result.default_plan]["sparsity"] == pytest.approx(result.sparsity)
-    for plan in record["plans"].values():
-        assert plan["of_other_noise"] == pytest.approx(plan["error"] / result.other_noise)
+    assert record["other_noise"] == pytest.approx(result.other_noise) > 0
     assert record["stopped"] == result.stopped == "finished"
     assert set(manifest.plans) == set(result.plans)
     assert record["budget"] == {"target_sparsity": TARGET, "cells": 18}

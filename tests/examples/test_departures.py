@@ -72,7 +72,7 @@ def test_departures_by_hand() -> None:
 def test_keys_of_different_widths_depart_together() -> None:
     """All have the departure of that name, and a number is mirrored in every key that has it."""
     rng = np.random.default_rng(0)
-    values = {"pose": rng.uniform(0, 1, (5, 2)), "joints": rng.uniform(0, 1, (5, 1, 9))}
+    values = {"pose": rng.random((5, 2), np.float32), "joints": rng.random((5, 1, 9), np.float32)}
     named = list(departures.departures(values, np.random.default_rng(1)))
     made = dict(named)
     assert len(made) == len(named) and all(list(changed) == list(values) for changed in made.values())

@@ -9,7 +9,7 @@ from typing import Any
 import demo
 import numpy as np
 import pytest
-from demo import ORIGINAL, SAFE, Step, best_of, conclusion, drive, speed_table, steps_to, time_steps
+from demo import ORIGINAL, Step, best_of, conclusion, drive, speed_table, steps_to, time_steps
 from episodes import Episodes
 from equivalence import SCORE_MARGIN, SUCCESS_MARGIN, TOO_FEW, WORSE, Verdict, verdict
 from evaluate import Evaluation, summarise, verdict_table, verdicts_of
@@ -20,6 +20,7 @@ from tests.examples.printed import printed
 from ttscompile import Plan, Source
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
+from ttscompile.calibration.step_counts import SAFE
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import BF16, INT8
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.executor.measure import measure_jitter
 
 from .simulation import FakeClock, ScriptedPolicy
 
@@ -66,16 +65,3 @@ def test_observe_is_no_slower_than_a_tick_allows(running: AsyncExecutor, benchma
         running.observe(frame)
         took.append(time.perf_counter() - start)
     assert np.median(took) < 10 * MOST
-
-
-def test_jitter_is_measured() -> None:
-    def work() -> None:
-        time.sleep(0.001)
-
-    made = measure_jitter(200, 0.25, work)
-    assert made.ticks == 50
-    assert made.work_us >= 1000
-    assert 0 <= made.p50 <= made.p99 <= made.max
-    assert made.late <= made.ticks
-    slow = measure_jitter(200, 0.05, lambda: time.sleep(0.02))
-    assert slow.late >= slow.ticks - 2  # a loop whose work is too long is late, and that is seen

@@ -243,6 +243,7 @@ def test_samplers_against_plain_loops(tmp_path: Path, objective: str, options: d
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:normaliser of observation.state")
 def test_rk4_with_plain_attention_compiles(tmp_path: Path) -> None:
     """Four evaluations a step, each a step of the lattice, in both runtimes; and they agree on random plans."""
     directory = save_policy(tmp_path, **PLAIN, num_layers=1, objective="flow_matching", integration_method="rk4")

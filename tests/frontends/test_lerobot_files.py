@@ -19,7 +19,7 @@ from ttscompile.frontends.lerobot_files import lerobot_files
 from . import lerobot_unets, pis
 from .lerobot_tiny import DA, DS, SIDE, change_json, save_policy
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:normaliser of observation.state")]
 
 STATE, TOP = "observation.state", "observation.images.top"
 

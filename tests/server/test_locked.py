@@ -30,7 +30,20 @@ from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.server.executor_server import ExecutorServer
 from ttscompile.runtimes.server.lock import Lock, hashed, read_token, tls_context
 
-from .serving import CLIENT, LIMITS, Client, Quick, client, connected, handshake, raw, read_all, serving, still_serves
+from .serving import (
+    CLIENT,
+    LIMITS,
+    Client,
+    Quick,
+    agreed,
+    client,
+    connected,
+    handshake,
+    raw,
+    read_all,
+    serving,
+    still_serves,
+)
 
 if importlib.util.find_spec("websockets") is None or importlib.util.find_spec("trustme") is None:
     pytest.skip("NO LOCK TESTS: websockets or trustme is not installed; see CONTRIBUTING", allow_module_level=True)
@@ -123,22 +136,6 @@ def test_nothing_weaker_than_tls_is_agreed_on(ciphers: str, papers: Path) -> Non
         with raw(url) as sock, pytest.raises((ssl.SSLError, ConnectionError)):
             weak.wrap_socket(sock, server_hostname="127.0.0.1")
         still_serves(url, token=TOKEN, ca=str(papers / "ca.pem"))
-
-
-def agreed(client: ssl.SSLContext, server: ssl.SSLContext) -> str:
-    """The cipher that the two agree on, without a network between them."""
-    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-    ends = [
-        client.wrap_bio(to_client, to_server, server_hostname="127.0.0.1"),
-        server.wrap_bio(to_server, to_client, server_side=True),
-    ]
-    for _ in range(4):
-        for end in ends:
-            with suppress(ssl.SSLWantReadError):
-                end.do_handshake()
-    cipher = ends[0].cipher()
-    assert cipher is not None
-    return cipher[0]
 
 
 @pytest.mark.parametrize("tls", [False, True])

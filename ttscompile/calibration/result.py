@@ -67,20 +67,11 @@ class CalibrationResult:
         """The same share with each cell weighed by its FLOPs."""
         return self.plans[self.default_plan].flops_sparsity
 
-    @property
-    def validation_error(self) -> float | None:
-        """Error of the default plan, in the units of the actions; None where there is none (``Score.error``)."""
-        return self.plans[self.default_plan].error
-
     def record(self) -> dict[str, Any]:
         """As JSON, for the artifact. Without the time it took: the same calibration gives the same bytes."""
         record = asdict(self)
         del record["seconds"]
         record["plans"] = {name: score.record() for name, score in self.plans.items()}
-        if self.other_noise:
-            for score in record["plans"].values():
-                if "error" in score:
-                    score["of_other_noise"] = score["error"] / self.other_noise
         record["frontier"] = [dict(one) for one in self.frontier]
         if not record["frontier"]:
             del record["frontier"]

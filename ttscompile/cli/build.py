@@ -12,7 +12,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.frontier import print_frontier
 from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import LEROBOT, SectionedCommand
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
@@ -76,8 +76,6 @@ def build(
 
         def explain(stage: str, notes: tuple[str, ...]) -> None:
             status.update(f"compiling: after {stage}")
-            if stage == "examine":
-                say(console, *(f"warning: {note}" for note in notes))
             if stage == "write":
                 status.stop()  # the search has a bar of its own
 

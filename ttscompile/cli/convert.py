@@ -90,9 +90,7 @@ def convert(
         def on_stage(name: str, notes: tuple[str, ...]) -> None:
             stages.append({"stage": name, "notes": list(notes)})
             status.update(f"compiling: after {name}")
-            if name == "examine":
-                say(console, *(f"warning: {note}" for note in notes))
-            elif explain:
+            if explain:
                 first, *more = notes or ("nothing to do",)
                 say(console, f"{name:<22}{first}", *(f"{'':<22}{note}" for note in more))
 

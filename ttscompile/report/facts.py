@@ -200,17 +200,18 @@ def plan_table(artifact: Artifact) -> Table:
 
 def score_table(record: Mapping[str, Any]) -> Table:
     """What calibration measured on episodes that it did not learn from."""
-    compared = "of_other_noise"
-    told = any(score.get(compared) is not None for score in scores(record).values())
-
-    def row(name: str, score: Mapping[str, Any], *saved: str) -> tuple[str, ...]:
-        beside = (_figure(score, compared, ".2f"),) if told else ()
-        errors = _figure(score, "error"), *beside, _figure(score, "error_p90")
-        return name, _figure(score, "distance", ".3f"), *errors, *(saved or ("", ""))
-
-    rows = [row(marked(name), s, share(s["sparsity"]), share(s["flops_saved"])) for name, s in scores(record).items()]
-    beside = ("/ other noise",) if told else ()
-    errors = "mean action error", *beside, "90th percentile"
+    rows = [
+        (
+            marked(name),
+            _figure(score, "distance", ".3f"),
+            _figure(score, "error"),
+            _figure(score, "error_p90"),
+            share(score["sparsity"]),
+            share(score["flops_saved"]),
+        )
+        for name, score in scores(record).items()
+    ]
+    errors = "mean action error", "90th percentile"
     head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
 
@@ -222,7 +223,9 @@ def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
 
 def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What the figures of a calibration mean, in words."""
-    return (*(chosen(record) or verdict(record)), *other_noise(record), *learned(record), *left_out(record))
+    noise = "Noise changes nothing here: in its place stands a tenth of what another observation changes."
+    unit = [noise] * (record.get("other_noise") == 0)
+    return (*(chosen(record) or verdict(record)), *unit, *learned(record), *left_out(record))
 
 
 def chosen(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -244,13 +247,14 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     if record.get("other_noise") == 0:
         return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
-    where, cost = "above a quarter", "18 points of success and more"
+    where, lost = "above a quarter", "one lost 18.5"
     if distance <= BOUND:
-        where, cost = "within a tenth", "at most 2 points of success"
+        where, lost = "within a tenth", "they lost at most 3.5"
     elif distance <= FARTHEST:
-        where, cost = "within a quarter", "up to 11 points of success"
-    driven = f"Such plans cost {cost} where they were driven (docs/evidence/results.md, 'What a distance means')"
-    return (f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes. {driven}.",)
+        where, lost = "within a quarter", "they lost at most 10.5"
+    told = f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes"
+    page = "docs/evidence/results.md, 'What a distance means'"
+    return (f"{told}. Where such plans were driven {lost} points of success ({page}).",)
 
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -261,22 +265,6 @@ def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
         " evaluate it on your task."
     )
     return (*(f"Learned, {name}: {one}." for name, one in told.items()), *[network] * ("weights" in told))
-
-
-def other_noise(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """What the errors can be held against, and what that has meant for the task."""
-    apart = record.get("other_noise")
-    if apart is None:
-        return ()
-    if not apart:
-        return ("Noise changes nothing here: in its place stands a tenth of what another observation changes.",)
-    told = (
-        f"Two dense calls with different noise are {apart:.4g} apart on these episodes. On five policies errors up to"
-        " a quarter as large cost at most 0.03 of the score and a tenth of the episodes, and one more than half as"
-        " large cost 0.43 of the score (docs/evidence/results.md, 'What an error means'). Yours may forgive less:"
-        " evaluate it."
-    )
-    return (told,)
 
 
 def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:

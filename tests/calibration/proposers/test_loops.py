@@ -23,7 +23,7 @@ from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import SAFER, Proposal, near
-from ttscompile.calibration.proposers.loops import Loops, of_steps
+from ttscompile.calibration.proposers.loops import Cost, Loops
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import DENSE, ORIGINAL, Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
@@ -84,7 +84,7 @@ def proposed(proposer: Loops, trials: Trials) -> dict[str, tuple[Proposal, Score
 
 
 def test_a_cost_is_that_of_a_step_and_of_each_further_one() -> None:
-    assert [of_steps((3.0, 0.5), steps) for steps in (1, 2, 5)] == [3.0, 3.5, 5.0]
+    assert [Cost(3.0, 0.5).of(steps) for steps in (1, 2, 5)] == [3.0, 3.5, 5.0]
 
 
 def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
