@@ -3,8 +3,8 @@
     python examples/ablation/ablate.py compiled/ --trajectories calls.npz --computed-steps 3 --minutes 2
 
 Every row is a way to spend the same number of computed cells a call, mean over the calls: evenly spaced or searched
-steps, switches, gates trained for all calls, and a head trained to decide for each observation, with one direction of
-reuse or with all. Each is measured with and without a correction of the sampler, on windows of consecutive calls of
+steps, gates trained for all calls, and a head trained to decide for each observation, with one direction of reuse or
+with all. Each is measured with and without a correction of the sampler, on windows of consecutive calls of
 episodes that nothing was learned from, against the same loop with every block computed and the same noise.
 ``oracle.py`` says what choosing among schedules could gain.
 """
@@ -51,7 +51,6 @@ from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source, dense_plan
-from ttscompile.rivals.adaptation import Switched
 from ttscompile.runtimes.plans import pruner_plan
 
 WITH_OTHER_NOISE = 64
@@ -123,8 +122,6 @@ def rows_of(directions: Sequence[str], ways: Sequence[str], updates: int) -> lis
     rows: list[tuple[str, str, Maker]] = []
     if "searched" in ways:
         rows.append(("searched steps", "TIMESTEP", Tts))
-    if "switched" in ways:
-        rows.append(("searched steps, switches", "TIMESTEP", Switched))
     for name in directions:
         sources = DIRECTIONS[name]
         if "gates" in ways and name != "ROLLOUT":  # a plan for all calls never computes what it would read
@@ -305,8 +302,8 @@ def show(rows: Sequence[Row], title: str) -> None:
     "--way",
     "ways",
     multiple=True,
-    type=click.Choice(["searched", "switched", "gates", "head", "refined", "refreshed"]),
-    default=["searched", "switched", "gates", "head", "refined", "refreshed"],
+    type=click.Choice(["searched", "gates", "head", "refined", "refreshed"]),
+    default=["searched", "gates", "head", "refined", "refreshed"],
 )
 @click.option("--pinned", is_flag=True, help="All calls of a window have the noise of its first.")
 @click.option("--seed", default=0)

@@ -217,3 +217,11 @@ def test_arrays_are_read_where_numpy_has_a_type_statement_for_them() -> None:
     found = read_as(kind | None, Value([1.0, 2.0], "a"))
     assert found.dtype == np.float32 and found.tolist() == [1.0, 2.0]
     assert read_as(kind | None, Value(None, "a")) is None
+
+
+def test_an_array_without_numbers_may_still_have_too_large_a_shape() -> None:
+    """numpy has none of these sizes. Found by fuzzing."""
+    empty = {"dtype": "int64", "shape": [0, 2**62, 4], "values": []}
+    with pytest.raises(ArtifactError, match=r"a\.shape: expected sizes that an array can have"):
+        read_as(np.ndarray[Any, np.dtype[np.int64]], Value(empty, "a"))
+    assert read_as(np.ndarray[Any, np.dtype[np.int64]], Value({**empty, "shape": [0, 2]}, "a")).shape == (0, 2)

@@ -227,7 +227,7 @@ def test_an_unknown_strategy_is_refused_before_any_work(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counted = _count_targets(monkeypatch)
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-switches"):
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-paper"):
         quick(artifact, recording, strategy="magic")
     assert counted() == 0
 

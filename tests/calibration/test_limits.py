@@ -32,11 +32,9 @@ from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.trials import SHARE
-from ttscompile.calibration.tts import Tts
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
-from ttscompile.rivals.adaptation import Switched
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.runtimes.runtime import Runtime
 from ttscompile.trajectories import load_trajectories
@@ -57,7 +55,7 @@ class _Hand(Clock):
 class _Slow:
     """A search whose intervals take 10 s, and whose plan takes 25 s more to be finished."""
 
-    intervals, closing, settling, done = 50, 0, 25.0, False
+    intervals, settling, done = 50, 25.0, False
 
     def __init__(self, clock: _Hand) -> None:
         self._clock = clock
@@ -150,13 +148,6 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
 def test_only_corrections_need_many_calls(artifact: Path, recording: Path) -> None:
     result = calibrate(artifact, [recording], 0.7, "interval", progress=False, max_minutes=1e-6)
     assert result.calls["calibration"] == 64
-
-
-def test_without_a_pruner_no_time_is_kept_for_it(make_task: MakeTask) -> None:
-    task = make_task(20, calls=4)
-    with_head, without = (Switched(one) for one in (task, replace(task, pruner={})))
-    assert (with_head.closing, without.closing) == (5, 0)
-    assert Tts(task).closing == 0  # the default leaves the pruner alone
 
 
 def test_errors_that_are_no_numbers_are_large_ones(compiled: Path) -> None:

@@ -109,7 +109,7 @@ def test_one_call_is_enough(make_task: MakeTask, name: str) -> None:
 
 
 def test_an_unknown_name_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-switches, tts-paper, interval"):
+    with pytest.raises(CalibrationError, match="'magic'; expected one of tts, tts-paper, interval"):
         strategy_of("magic")
 
 
@@ -134,7 +134,7 @@ def test_every_strategy_has_a_maker_that_is_described(make_task: MakeTask, name:
 
 def test_names_are_given_once_and_the_first_is_the_default() -> None:
     assert len(set(NAMES)) == len(MAKERS) == len(STRATEGIES)
-    assert (DEFAULT, FITTED) == ("tts", ("tts", "tts-switches"))
+    assert (DEFAULT, FITTED) == ("tts", ("tts",))
     assert [one.name for one in STRATEGIES if one.baseline] == ["interval"]
 
 

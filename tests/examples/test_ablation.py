@@ -17,7 +17,7 @@ from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.pruner.paper import UPDATES
 from ttscompile.runtimes.reference.model import Contexts
 
-WAYS = ["searched", "switched", "gates", "head", "refined"]
+WAYS = ["searched", "gates", "head", "refined"]
 
 
 def test_every_way_and_direction_is_a_row_once() -> None:

@@ -11,7 +11,7 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.rivals import sensitivity
-from ttscompile.rivals.sensitivity import chains, slopes
+from ttscompile.rivals.slopes import chains, slopes
 
 
 def random_plan(reuse: Source, computed: float) -> PlanArray:

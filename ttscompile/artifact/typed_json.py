@@ -146,7 +146,10 @@ def _array(value: Value) -> npt.NDArray[Any]:
     array = _vector(members["values"], members["dtype"].text("float32", "int64"))
     if array.size != math.prod(shape):
         value.fail(f"{math.prod(shape)} numbers, for the shape {list(shape)}")
-    return array.reshape(shape)
+    try:
+        return array.reshape(shape)
+    except ValueError:  # their product overflows, though one of them is 0
+        members["shape"].fail("sizes that an array can have")
 
 
 def _vector(value: Value, dtype: str) -> npt.NDArray[Any]:

@@ -59,7 +59,8 @@ class Kept:
         if reason is None and not proposal.beside:
             reason = self._no_better(trials, score, proposal.margin)
         if reason is not None:
-            self.refused[proposal.name] = reason
+            if proposal.name not in self.judged:  # one of that name that was kept before stays
+                self.refused[proposal.name] = reason
             return False
         self.refused.pop(proposal.name, None)
         self.plans[proposal.name], self.scores[proposal.name] = proposal.plan, score

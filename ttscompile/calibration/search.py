@@ -10,10 +10,6 @@ from .strategies import strategy_of
 from .task import Found, Search, Task
 from .trials import Trials
 
-CLOSING_SHARE = 0.3
-"""What a search does at the end is left out where it would take more than this share of the time: on Push-T an interval
-of search lowers the error by 3 to 30 %, the switches by a few."""
-
 
 def open_search(name: str, task: Task) -> Search:
     """The search of the strategy of this name, ready to begin.
@@ -54,9 +50,6 @@ def search_plan(
         start = clock.elapsed()
         if number > 0 and not clock.has(longest + search.settling):
             break
-        closing = search.closing * longest
-        if 0 < closing <= CLOSING_SHARE * clock.limit and not clock.has(longest + search.settling + closing):
-            search.close()
         search.advance(number)
         number += 1
         longest = max(longest, clock.elapsed() - start)

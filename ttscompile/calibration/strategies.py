@@ -80,13 +80,6 @@ STRATEGIES = (
         fits_correction=True,
     ),
     Strategy(
-        "tts-switches",
-        "the same, and single cells moved by the observation",
-        "rivals.adaptation:Switched",
-        fits_correction=True,
-        uses_pruner=True,
-    ),
-    Strategy(
         "tts-paper",
         "test-time sparsity as published, arXiv 2605.13316: gates trained for each observation",
         "calibration.pruner.paper:Paper",

@@ -129,11 +129,9 @@ class Search(Protocol):
 
     Attributes:
         intervals: how many there are at most.
-        closing: how many are still to be done after ``close``.
     """
 
     intervals: int
-    closing: int
 
     @property
     def settling(self) -> float:
@@ -141,9 +139,6 @@ class Search(Protocol):
 
     def advance(self, interval: int) -> None:
         """Do interval number ``interval``, of ``intervals``; they are done in order."""
-
-    def close(self) -> None:
-        """The time is running out: do what is still to be done at the end, and be done."""
 
     @property
     def done(self) -> bool:
@@ -171,13 +166,10 @@ class NothingAfter:
     """What a ``Search`` says that has nothing left to do after its intervals: it keeps its best plan throughout."""
 
     intervals = 1
-    closing, settling = 0, 0.0
+    settling = 0.0
     _interval = 0  # how many were done
 
     @property
     def done(self) -> bool:
         """Whether all intervals were done."""
         return self._interval >= self.intervals
-
-    def close(self) -> None:
-        """Nothing is left to be done."""

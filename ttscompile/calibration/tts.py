@@ -29,8 +29,6 @@ class Tts:
         loss: error of the plan on calls that its correction was not fitted on.
     """
 
-    closing = 0
-
     def __init__(self, task: Task) -> None:
         self._task, self._whole = task, task.whole
         model = task.executor.model
@@ -58,11 +56,6 @@ class Tts:
         """The correction, if it is not fitted yet."""
         return 0.0 if self._settled is not None else self._whole.correcting(self._full)
 
-    def close(self) -> None:
-        """Settle the schedule, with a correction from all calls."""
-        if self._settled is None:
-            self._settled = self._task.whole_steps(self._steps)
-
     def advance(self, interval: int) -> None:
         """Try a schedule of the family, or two moves of a step."""
         if interval < len(self._family):
@@ -73,7 +66,7 @@ class Tts:
             self._whole.expect(steps for move in moves for steps in self._candidates(*move))  # if none of them helps
             self._try(self._candidates(*moves[0]))
         if interval + 1 >= len(self._family) + len(self._moves):
-            self.close()
+            self.found()
 
     def state(self) -> dict[str, Array]:
         """Computed steps and their error; corrections are fitted again."""
@@ -87,12 +80,12 @@ class Tts:
         """Go back to where ``state`` was taken."""
         self._steps, self.loss = tuple(int(k) for k in state["steps"]), float(state["loss"])
         if state["settled"]:
-            self.close()
+            self.found()
 
     def found(self) -> Found:
-        """The schedule with its correction."""
-        self.close()
-        assert self._settled is not None
+        """The schedule with its correction, which is fitted to all calls."""
+        if self._settled is None:
+            self._settled = self._task.whole_steps(self._steps)
         return self._settled
 
     def _candidates(self, distance: int, i: int) -> list[tuple[int, ...]]:

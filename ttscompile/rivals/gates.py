@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ..calibration.task import Array, Found, NothingAfter, Task
 from ..core.lattice import BoolArray, PlanArray, Source, uniform_plan
 from .fixed import COMPARED
-from .sensitivity import slopes
+from .slopes import slopes
 
 INTERVALS = 120
 """Gradient steps."""

@@ -106,7 +106,7 @@ def test_nothing_is_read_of_earlier_calls_where_calls_stand_alone(make_task: Mak
 
 
 def test_an_earlier_calibration_leaves_no_trace(task: Task) -> None:
-    """The head of the artifact is the one that it left, and switches leave one that is zero but for them."""
+    """The head of the artifact is the one that it left."""
     left = {name: value if name == "pruner.mask" else np.zeros_like(value) for name, value in task.pruner.items()}
     first, again = trained(task, 2).state(), trained(replace(task, pruner=left), 2).state()
     for name, value in first.items():

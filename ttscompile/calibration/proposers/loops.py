@@ -1,19 +1,20 @@
 """Which loop, and how many of its steps: of each loop the fewest computed steps that are near enough to the original.
 
-Loops are tried from the one on whose cheapest call this machine spends least. In each, schedules of more and more whole
-steps are proposed, with corrections, until one is near enough to be the default (``proposer.near``). One more follows,
-for what is learned after it to trade. A loop that is further itself, when all is computed, is searched for a plan that
-may be ``fast``; one that is too far even for that is left out, and so is one whose cheapest call takes longer than the
-best plan so far.
+In each loop crowded schedules of more and more whole steps are proposed first, with corrections, until one is near
+enough to be the default (``proposer.near``), and one more, for what is learned after it to trade. They take seconds, so
+there is a default even where time is short. Then schedules are searched in the same way, from the fewest steps on.
 
-The original's own loop comes last. Another one is somewhere else even where it computes every step, so its plans come
-near only so far. Where the best of them uses more than half of the bound, the original's loop is searched for a plan
-that is a good deal nearer, however long a call of it takes: for tasks that forgive less than the bound does.
+Another loop than the original's is somewhere else even where it computes every step, and its plans hardly come nearer
+than that. So loops that are near enough themselves are tried first, from the one on whose cheapest call this machine
+spends least, and the original's own after them. Where the best plan by then uses more than half of the bound, the
+original's loop is searched for one that is a good deal nearer, however long a call of it takes: for tasks that forgive
+less than the bound does. Loops that are further come last. They may only give ``fast``, and get less of the time. One
+that is too far even for that is left out, and so is one whose cheapest call takes longer than the best plan so far.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -51,6 +52,9 @@ machine that does other work too. In the end all plans are timed in turn."""
 ANSWERING = 0.4
 """Share of a loop's time for the answers to learn from."""
 
+ASIDE = 0.25
+"""Weight, where time is divided, of a loop that may only give ``fast``; that of others is 1."""
+
 
 class Cost(NamedTuple):
     """What calls of a loop take, in milliseconds: with ``one`` computed step, and more for each further ``step``."""
@@ -86,9 +90,10 @@ class Loops:
             yield Proposal(f"{ORIGINAL}.1", replace(plan, precision={}, repair=True), margin=float("inf"))
             return
         costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
-        order = sorted(costs, key=lambda loop: (loop == ORIGINAL, costs[loop].one))
+        close, far = self._by_distance(trials, costs)
+        order = [*close, ORIGINAL, *far]
         for number, loop in enumerate(order):
-            wanted = self._wanted(loop)
+            wanted = self._farthest if loop in far else self._wanted(loop)
             if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
@@ -96,25 +101,31 @@ class Loops:
                 clock.cut = True
                 self._left_out.append(f"{loop} for want of time")
                 continue
-            share = clock.left() / (len(order) - number)
+            weights = [ASIDE if one in far else 1.0 for one in order[number:]]
+            share = clock.left() * weights[0] / sum(weights)
             own = self._opened(trials, loop, share)
-            if loop != ORIGINAL:
-                every = Plan(loop, dense_plan(own.executor.model.steps, own.executor.model.blocks), repair=True)
-                whole = judge(own, every)
-                if whole.interval[0] > self._farthest:
-                    told = f"{loop} is {whole.distance:.3g} from the original with every step computed"
-                    self._left_out.append(told)
-                    continue
-                if whole.distance > self._bound:  # a plan is hardly nearer than its loop: this one is for ``fast``
-                    wanted = self._farthest
-            ends = clock.until(min(1.0, (clock.elapsed() + share) / clock.limit))
-            yield from self._of_loop(own, loop, ends, costs[loop], wanted)
+            yield from self._of_loop(own, loop, _ending(clock, share), costs[loop], wanted)
         best, found = self._best or self._nearest, "fastest that is near enough" if self._best else "nearest"
         if best is None:
             raise CalibrationFailedError(self._none())
         yield best
         left = f"; left out: {', '.join(self._left_out)}" if self._left_out else ""
         self.told = f"{best.name} is the {found}{left}"
+
+    def _by_distance(self, trials: Trials, costs: Mapping[str, Cost]) -> tuple[list[str], list[str]]:
+        """Other loops than the original's that may give the default, and those that may give ``fast``; cheapest first.
+
+        By how far they are with every step computed.
+        """
+        close, far = list[str](), list[str]()
+        for loop in sorted(costs.keys() - {ORIGINAL}, key=lambda loop: costs[loop].one):
+            own = trials.of_loop(loop)
+            whole = judge(own, Plan(loop, dense_plan(own.executor.model.steps, own.executor.model.blocks), repair=True))
+            if whole.interval[0] > self._farthest:
+                self._left_out.append(f"{loop} is {whole.distance:.3g} from the original with every step computed")
+            else:
+                (close if whole.distance <= self._bound else far).append(loop)
+        return close, far
 
     def _wanted(self, loop: str) -> float:
         """How near a plan of a loop has to be for the search to end there."""
@@ -124,42 +135,68 @@ class Loops:
         return SAFER * found if found > self._bound / 2 else self._bound
 
     def _of_loop(self, own: Trials, loop: str, clock: Clock, cost: Cost, wanted: float) -> Proposals:
-        """Plans of more and more computed steps of a loop, until one is as near as is wanted, and one more."""
-        further, safer = False, wanted < self._bound
-        fastest = float("inf") if safer else self._fastest  # of the loops before
+        """Plans of more and more computed steps of a loop until one is as near as is wanted: crowded, then searched."""
         task = replace(Task.of(own.executor, own.calls, 0, own.seed, own.pool), clock=clock)
-        crowded = SpacedSchedules(task.whole, own.state, clock, own.bar, f"crowded, {loop}")
-        counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
-        apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
+        counts = yield from self._crowded(own, task, loop, cost, wanted)
+        further = False
         for number, count in enumerate(counts):
-            if number and (clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
-                break
-            quick = crowded.best(count, f"{loop}, {count} steps", TRIED)
-            if quick is None and number:
+            if number and clock.left() <= 0:
                 clock.cut = True
                 break
-            hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
-            if quick is not None and quick.error > hopeless and count != counts[-1]:
-                continue
-            proposal = self._searched(own, task, loop, count)
-            yield proposal
-            name = proposal.name
-            alone = replace(proposal, beside=False, margin=float("inf"))
-            if near(self._scores[name], self._bound) and cost.of(count) < self._fastest:
-                self._best, self._fastest = alone, cost.of(count)
-            if near(self._scores[name], self._farthest) and self._is_nearest(name):
-                self._nearest = alone
-            reached = near(self._scores[name], wanted) and self._deadline is None  # with a deadline as many as keep it
-            if further or (reached and safer):
+            share = _ending(clock, clock.left() / (len(counts) - number))
+            search = open_search("tts", replace(task, clock=share, budget=count * own.executor.model.blocks))
+            found = searched(own, search, share, None, f"search, {loop}, {count} steps")[0]
+            yield from self._judged(self._proposal(loop, count, found), cost.of(count))
+            further, enough = self._reached(loop, count, wanted), further
+            if enough or (further and wanted < self._bound):
                 break
-            further = reached
 
-    def _searched(self, own: Trials, task: Task, loop: str, count: int) -> Proposal:
-        """The best schedule of so many steps that there is time for."""
-        search = open_search("tts", replace(task, budget=count * own.executor.model.blocks))
-        found: Found = searched(own, search, task.clock, None, f"search, {loop}, {count} steps")[0]
-        name, made = f"{loop.replace('+', '')}.{count}", Plan(loop, found.schedule, found.correction, repair=True)
+    def _crowded(
+        self, own: Trials, task: Task, loop: str, cost: Cost, wanted: float
+    ) -> Generator[Proposal, bool, list[int]]:
+        """Plans that crowd their computed steps; returns the numbers of steps that a search may make near enough."""
+        safer = wanted < self._bound
+        fastest = float("inf") if safer else self._fastest  # of the loops before
+        crowded = SpacedSchedules(task.whole, own.state, task.clock, own.bar, f"crowded, {loop}")
+        counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
+        apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
+        hopeless, further = HOPELESS * (wanted if safer else self._farthest) * apart, False
+        hopeful: list[int] = []
+        for number, count in enumerate(counts):
+            if number and (task.clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
+                break
+            quick = crowded.best(count, f"{loop}, {count} steps", TRIED)
+            if quick is None:  # no time; a search gives something
+                task.clock.cut = True
+                return hopeful or [count]
+            if quick.error > hopeless and count != counts[-1]:
+                continue
+            hopeful.append(count)
+            yield from self._judged(self._proposal(loop, count, task.whole_steps(quick.steps)), cost.of(count))
+            further, enough = self._reached(loop, count, wanted), further
+            if enough or (further and safer):
+                break
+        return hopeful
+
+    def _proposal(self, loop: str, count: int, found: Found) -> Proposal:
+        name, made = _name(loop, count), Plan(loop, found.schedule, found.correction, repair=True)
         return Proposal(name, made, found.notes, beside=True, refusal=partial(self._refusal, name))
+
+    def _judged(self, proposal: Proposal, cost: float) -> Proposals:
+        """Have a plan judged; where it is kept, it may be the best so far."""
+        held = yield proposal
+        if not held:
+            return
+        score, alone = self._scores[proposal.name], replace(proposal, beside=False, margin=float("inf"))
+        again = self._best is not None and self._best.name == proposal.name  # nearer now
+        if near(score, self._bound) and (again or cost < self._fastest):
+            self._best, self._fastest = alone, cost
+        if near(score, self._farthest) and self._is_nearest(proposal.name):
+            self._nearest = alone
+
+    def _reached(self, loop: str, count: int, wanted: float) -> bool:
+        """Whether a plan of so many steps is as near as is wanted; with a deadline as many are tried as keep it."""
+        return near(self._scores[_name(loop, count)], wanted) and self._deadline is None
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
         """Trials of a loop, that has so many seconds."""
@@ -182,10 +219,12 @@ class Loops:
         return f"takes {least:.3g} ms at least, and the best {fastest:.3g}" if least > CLEARLY * fastest else None
 
     def _is_nearest(self, name: str) -> bool:
-        return self._nearest is None or self._scores[name].distance < self._scores[self._nearest.name].distance
+        return self._nearest is None or self._scores[name].distance <= self._scores[self._nearest.name].distance
 
-    def _refusal(self, name: str, score: Score, _: Mapping[str, Score]) -> str | None:
-        """Why a plan is too far from the original for all purposes."""
+    def _refusal(self, name: str, score: Score, kept: Mapping[str, Score]) -> str | None:
+        """Why a plan is too far from the original for all purposes, or no nearer than another of as many steps."""
+        if name in kept and kept[name].distance < score.distance:
+            return f"is {score.distance:.3g} from the original; another of as many steps {kept[name].distance:.3g}"
         self._scores[name] = score
         if score.distance <= self._farthest:
             return None
@@ -223,6 +262,15 @@ class Loops:
             one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
             found.append((one, max(most - one, 0.0) / max(more - 1, 1)))
         return min(found)
+
+
+def _name(loop: str, count: int) -> str:
+    return f"{loop.replace('+', '')}.{count}"
+
+
+def _ending(clock: Clock, seconds: float) -> Clock:
+    """The same clock with so many more seconds, and no more than there are."""
+    return clock.until(min(1.0, (clock.elapsed() + seconds) / clock.limit))
 
 
 def too_far(name: str, score: Score, bound: float) -> str:
