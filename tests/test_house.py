@@ -59,7 +59,6 @@ RIVALS_READ = {
         "execute",
         "spacing",
         "task",
-        "tts",
     )
 }
 """What rivals know of calibration: what a strategy is given, and what it may compare."""

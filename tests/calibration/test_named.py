@@ -95,7 +95,7 @@ def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The time limit ends the search for ``safe`` at its first candidate, which is bad."""
-    monkeypatch.setattr(step_counts.SpacedSchedules, "best", lambda *_: (tuple(range(8)), 1.0))
+    monkeypatch.setattr(step_counts.SpacedSchedules, "best", lambda *_: step_counts.Best(tuple(range(8)), 1.0))
     result = calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
     assert "safe" not in result.plans
     assert result.skipped["safe"].endswith("from the original, no safer than schedule: its search was cut short")

@@ -22,7 +22,7 @@ WAYS = ["searched", "gates", "head", "refined"]
 
 def test_every_way_and_direction_is_a_row_once() -> None:
     rows = [(decided, reads) for decided, reads, _ in rows_of(list(DIRECTIONS), WAYS, UPDATES)]
-    assert len(rows) == len(set(rows)) == 2 + 3 + 4 + 1  # a plan for all calls has no use for ROLLOUT
+    assert len(rows) == len(set(rows)) == 1 + 3 + 4 + 1  # a plan for all calls has no use for ROLLOUT
 
 
 def test_an_interval_is_over_episodes() -> None:

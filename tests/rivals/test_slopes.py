@@ -10,7 +10,7 @@ from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import PlanArray, Source
-from ttscompile.rivals import sensitivity
+from ttscompile.rivals import slopes as module
 from ttscompile.rivals.slopes import chains, slopes
 
 
@@ -41,7 +41,7 @@ def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
 def test_slopes_are_the_gradients_of_the_reference(
     make_task: MakeTask, monkeypatch: pytest.MonkeyPatch, reuse: Source, computed: float, size: int
 ) -> None:
-    monkeypatch.setattr(sensitivity, "BYTES", size)  # one call at a time, or all
+    monkeypatch.setattr(module, "BYTES", size)  # one call at a time, or all
     task = make_task(20, calls=5)
     plan = random_plan(reuse, computed)
     found = slopes(task.executor, task.actions, plan, reuse, task.calls)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tests.executor.simulation import FakeClock, ScriptedPolicy
 from ttscompile.errors import ExecutorError
@@ -160,3 +161,17 @@ def agreed(client: ssl.SSLContext, server: ssl.SSLContext) -> str:
     cipher = ends[0].cipher()
     assert cipher is not None
     return cipher[0]
+
+
+def weakened(papers: Path, ciphers: str) -> tuple[ssl.SSLContext, ssl.SSLContext]:
+    """A client and a server that have these ciphers alone; skips where OpenSSL has none of them."""
+    weak = ssl.create_default_context(cafile=papers / "ca.pem")
+    careless = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    careless.load_cert_chain(papers / "rsa.pem")
+    for each in (weak, careless):
+        each.maximum_version = ssl.TLSVersion.TLSv1_2
+        try:
+            each.set_ciphers(ciphers)
+        except ssl.SSLError as error:
+            pytest.skip(f"NO WEAK CIPHERS: OpenSSL here has none of {ciphers} ({error})")
+    return weak, careless

@@ -43,6 +43,7 @@ from .serving import (
     read_all,
     serving,
     still_serves,
+    weakened,
 )
 
 if importlib.util.find_spec("websockets") is None or importlib.util.find_spec("trustme") is None:
@@ -122,15 +123,7 @@ def test_who_is_no_client_of_tls_is_refused_and_written_down(lock: Lock, papers:
 @pytest.mark.parametrize("ciphers", ["eNULL:aNULL:@SECLEVEL=0", "AES128-SHA:AES256-SHA:@SECLEVEL=0"])
 def test_nothing_weaker_than_tls_is_agreed_on(ciphers: str, papers: Path) -> None:
     """Without a cipher or a certificate, or without a key of the moment; a context that is not ours agrees on them."""
-    weak = ssl.create_default_context(cafile=papers / "ca.pem")
-    careless = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    careless.load_cert_chain(papers / "rsa.pem")
-    for each in (weak, careless):
-        each.maximum_version = ssl.TLSVersion.TLSv1_2
-        try:
-            each.set_ciphers(ciphers)
-        except ssl.SSLError as error:
-            pytest.skip(f"NO WEAK CIPHERS: OpenSSL here has none of {ciphers} ({error})")
+    weak, careless = weakened(papers, ciphers)
     assert agreed(weak, careless) in {name["name"] for name in careless.get_ciphers()}
     with serving(lock=Lock(hashed(TOKEN, "test"), tls_context(papers / "rsa.pem"))) as url:
         with raw(url) as sock, pytest.raises((ssl.SSLError, ConnectionError)):

@@ -64,9 +64,8 @@ def test_a_sound_artifact_holds(sound: Path) -> None:
 def test_an_artifact_that_is_not_calibrated_holds_and_says_what_it_lacks(compiled: Path) -> None:
     found = ttscompile.verify(compiled)
     assert found.passed
-    assert all(
-        "every call computes all cells" in found.rung(name).told for name in ("plans", "sparsity error", "engaged")
-    )
+    assert all("every call computes all cells" in found.rung(name).told for name in ("plans", "sparsity error"))
+    assert "every call is dense" in found.rung("engaged").told
 
 
 def test_the_weights_of_one_block(artifact: Path) -> None:
