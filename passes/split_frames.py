@@ -171,7 +171,8 @@ def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], tak
                 inside.add(node.name)
         inside.difference_update(entries)
         read_outside = {name for name in inside if any(user.name not in inside for user in users[name])}
-        exits = [n.name for n in graph.nodes if n.name in inside and n.name in {*read_outside, *graph.outputs}]
+        leaving = inside & {*read_outside, *graph.outputs}
+        exits = [node.name for node in graph.nodes if node.name in leaving]
         bad = [name for name in exits if not _is_exit(graph, name, rows)]
         if not bad:
             break

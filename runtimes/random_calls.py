@@ -36,7 +36,7 @@ def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
 
 
 def noise_of_any_horizon(spec: PolicySpec, rng: np.random.Generator, streams: int) -> Noise:
-    """Noise of calls in a loop, drawn for the original's whole horizon: the same however many steps are predicted."""
+    """Noise of calls in a loop. It is drawn for the original's whole horizon, so a seed means the same for any."""
     shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
     initial = rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
     if not spec.sampler.stochastic:

@@ -288,7 +288,7 @@ class Manifest:
         flops: see ``FlopsRecord``.
         plans: beside ``dense``, by name.
         default_plan: ``dense`` or a name in ``plans``.
-        calibration: record of the calibration, JSON (``calibration_record``); None before any.
+        calibration: record of the calibration, JSON (``codec.check_record``); None before any.
         stores: names of the files that are not ONNX.
         requires: what the ONNX graphs need.
         files: every file but the manifest.

@@ -30,7 +30,8 @@ Array = npt.NDArray[Any]
 
 MAX_HEADER_BYTES = 64 * 2**20
 MAPPED = 2**23
-"""Bytes of a file from which on it is mapped: one that ends earlier by then ends the process that reads."""
+"""Bytes of a file from which on it is mapped. Smaller files are read whole: if a mapped file is cut short while it is
+read, the process dies."""
 
 _PREFIX = 8
 _DTYPES: Mapping[str, np.dtype[Any]] = MappingProxyType(
