@@ -103,7 +103,7 @@ def calibrate(
     What learns proposes plans; they are judged on episodes that nothing was learned from, by how far what they answer
     is from what the original answers. Beside the plan that keeps the budget the artifact gets 'safe', which computes
     twice as much, and 'fast', which computes half. Exit status 1: nothing was kept, the budget was
-    not, or the default plan is further than a quarter of what other noise changes from the original.
+    not, or the default plan's distance from the original is above a quarter of what other noise changes.
     """
     manifest_of(directory)
     require_recordings(trajectories)

@@ -188,7 +188,7 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
 def _nearness(row: Mapping[str, Any]) -> str:
     if row["name"] == DENSE:
         return "the original"
-    return "near enough" if row["near"] else "too far"
+    return "may be taken" if row["near"] else "too far"
 
 
 def _distance(row: Mapping[str, Any]) -> float:
