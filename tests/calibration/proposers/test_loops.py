@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +108,40 @@ def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
     by_steps = sorted(own[ORIGINAL], key=lambda name: int(name.partition(".")[2]))
     safer = [found[name][1].distance <= SAFER * score.distance for name in by_steps]
     assert safer and safer[-1] and not any(safer[:-1])
+
+
+def test_a_loop_that_may_only_give_fast_comes_last_and_gets_less_of_the_time(
+    directory: Path, recording: Path, timed: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[tuple[str, float, float]] = []
+
+    def of_loop(_: Loops, own: Trials, loop: str, clock: Clock, cost: Cost, wanted: float) -> Iterator[Proposal]:
+        tried.append((loop, wanted, clock.limit))
+        return iter(())
+
+    monkeypatch.setattr(Loops, "_of_loop", of_loop)
+    monkeypatch.setattr(Clock, "elapsed", lambda self: 0.0)
+    trials = replace(trials_of(directory, [recording]), clock=Clock(100.0))
+    for bound in (0.4, 0.01):
+        with pytest.raises(CalibrationFailedError, match="no plan could be tried: wrong is"):
+            proposed(Loops(request(bound=bound, farthest=0.4)), trials)
+    close, far = tried[:2], tried[2:]
+    assert close == [("short", 0.4, 50.0), (ORIGINAL, 0.4, 100.0)]
+    assert far == [(ORIGINAL, 0.01, 80.0), ("short", 0.4, 100.0)]
+
+
+def test_a_plan_that_was_placed_by_rule_stays_where_a_search_finds_no_nearer_one() -> None:
+    loops, near_one, far_one = Loops(request(bound=0.4)), score_of(0.1), score_of(0.2)
+    assert loops._refusal("short.2", near_one, {}) is None
+    assert loops._refusal("short.2", far_one, {"short.2": near_one}) == (
+        "is 0.2 from the original; another of as many steps 0.1"
+    )
+    assert loops._scores["short.2"] is near_one
+    assert loops._refusal("short.2", score_of(0.05), {"short.2": near_one}) is None
+
+
+def score_of(distance: float) -> Score:
+    return Score(distance, (distance, distance), None, None, 0.0, 0.0, 0.0, 1)
 
 
 def test_a_slow_original_is_left_out_where_the_fastest_plan_is_near(
