@@ -76,16 +76,18 @@ class Schedule:
             actions = actions[: resolved.horizon]
         rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
         start = self.grid.tick(observed)
-        new = Timeline(start, rows, np.full(len(rows), observed))
+        new = Timeline.of(start, rows, observed)
         seam = start if self.last is None else self.last[0] + 1
-        spliced = splice(self.timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
+        blend = settings.blend_steps if settings.seam == "blend" else 0
+        ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" else None
+        spliced = splice(self.timeline, new, seam, blend, ensemble)
         if spliced is None or new.end <= self.grid.tick(now):
             return "overdue"
         played = [action for _, action in list(self._played)[-3:]]
         past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
         refusal = self._guard.refuse_motion(past, spliced.rows)
         if refusal is not None:  # without its reserve it may do, if anything is left then
-            spliced = spliced.until(start + resolved.horizon * resolved.ticks_per_step)
+            spliced = spliced.between(seam, start + resolved.horizon * resolved.ticks_per_step)
             self.refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
             if self.refusal is not None:
                 return "refused"
@@ -96,7 +98,7 @@ class Schedule:
     def executed(self) -> float:
         """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
         assert self.timeline is not None
-        return float(self.timeline.observed[-1]) + self._resolved.horizon / self._resolved.policy_hz
+        return float(self.timeline.observed.max()) + self._resolved.horizon / self._resolved.policy_hz
 
     def need_by(self, time: float) -> None:
         """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""

@@ -21,13 +21,16 @@ if TYPE_CHECKING:
     from ttscompile.runtimes.info import PolicyInfo
 
 INTERPOLATIONS = ("hold", "linear")
-SEAMS = ("replace", "blend", "prefix")
+SEAMS = ("replace", "blend", "ensemble", "prefix")
 
 _MAY_BE_ZERO = frozenset({"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"})
 """Of the whole numbers among the settings; the others are at least 1."""
 
 _MOST = 10**9
 """Of any of them: a week of ticks at a kilohertz, and a queue that Python can have."""
+
+_MOST_COEFFICIENT = 10.0
+"""Of a seam ``ensemble``, either way: one prediction then weighs more than 20,000 times as much as the next."""
 
 
 class Policy(Protocol):
@@ -71,9 +74,12 @@ class ExecutorSettings:
             sooner, and nothing but the last action is left for a chunk that is late.
         rate_tolerance: how far from its place in the window a frame may be, as a share of the policy's period.
         max_age: of the newest frame of a window when a call starts; None: three periods of the policy.
-        seam: how a chunk joins the one before: ``replace``; ``blend``, linear over ``blend_steps``; or ``prefix``
-            (experimental), for policies that take ``prefix``, the actions that are committed already, and inpaint.
+        seam: how a chunk joins those before: ``replace``; ``blend``, linear over ``blend_steps``; ``ensemble``, each
+            action a weighted mean of what all chunks predicted for it; or ``prefix`` (experimental), for policies that
+            take ``prefix``, the actions that are committed already, and inpaint.
         blend_steps: control ticks.
+        ensemble_coefficient: m of the weights ``exp(-m * i)`` of ``ensemble``, i = 0 for the oldest prediction of a
+            tick: 0 for a plain mean, negative where new predictions shall count more than old ones.
         max_hold: control ticks for which the last action is repeated when there is no other, not even in reserve; then
             ``action`` raises. Right for positions; for velocities and differences set 0.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
@@ -99,6 +105,7 @@ class ExecutorSettings:
     max_age: float | None = None
     seam: str = "replace"
     blend_steps: int = 4
+    ensemble_coefficient: float = 0.01
     max_hold: int = 3
     margin_ticks: int = 1
     warm_up: int = 2
@@ -125,8 +132,10 @@ class ExecutorSettings:
         for name in ("policy_hz", "max_age"):
             value = getattr(self, name)
             if value is not None:
-                _require_positive(value, name)
-        _require_positive(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
+                _require_number(value, name)
+        _require_number(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
+        most, name = _MOST_COEFFICIENT, "ensemble_coefficient"
+        _require_number(self.ensemble_coefficient, name, most, f"between {-most:g} and {most:g}", -most)
         if self.interpolation not in INTERPOLATIONS:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
@@ -136,8 +145,10 @@ class ExecutorSettings:
             raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
 
 
-def _require_positive(value: object, name: str, below: float = inf, wanted: str = "positive and finite") -> None:
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < below:
+def _require_number(
+    value: object, name: str, below: float = inf, wanted: str = "positive and finite", above: float = 0.0
+) -> None:
+    if isinstance(value, bool) or not isinstance(value, Real) or not above < float(value) < below:
         raise ExecutorError(f"{name} must be a number, {wanted}; found {value!r}.")
 
 
@@ -178,7 +189,7 @@ class Resolved:
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy. Raises ExecutorError: they do not fit."""
-    _require_positive(control_hz, "control_hz")
+    _require_number(control_hz, "control_hz")
     policy_hz = settings.policy_hz or control_hz
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0

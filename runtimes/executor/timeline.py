@@ -11,7 +11,7 @@ the first tick that is not, however long its inference took::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import floor
 
 import numpy as np
@@ -64,21 +64,33 @@ class Timeline:
         start: tick of the first row.
         rows: float32 ``[N, Da]``, one a tick.
         observed: float64 ``[N]``, time of the newest frame that each row was computed from.
+        chunks: int64 ``[N]``, how many chunks each row is the mean of.
     """
 
     start: int
     rows: FloatArray
     observed: npt.NDArray[np.float64]
+    chunks: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, start: int, rows: FloatArray, observed: float) -> Timeline:
+        """The actions of one chunk."""
+        return cls(start, rows, np.full(len(rows), observed), np.ones(len(rows), np.int64))
 
     @property
     def end(self) -> int:
         """One past the last tick."""
         return self.start + len(self.rows)
 
-    def until(self, tick: int) -> Timeline:
-        """What is scheduled before a tick."""
-        kept = max(min(tick - self.start, len(self.rows)), 0)
-        return Timeline(self.start, self.rows[:kept], self.observed[:kept])
+    def between(self, first: int, end: int) -> Timeline:
+        """What is scheduled from a tick on, and before another; views."""
+        part = slice(max(first - self.start, 0), max(end - self.start, 0))
+        return Timeline(self.start + part.start, self.rows[part], self.observed[part], self.chunks[part])
+
+    def then(self, other: Timeline) -> Timeline:
+        """This, and after its end another."""
+        pairs = ((self.rows, other.rows), (self.observed, other.observed), (self.chunks, other.chunks))
+        return Timeline(self.start, *(np.concatenate(pair) for pair in pairs))
 
     def at(self, tick: int) -> FloatArray | None:
         """The action of a tick, a view; None if none is scheduled."""
@@ -101,7 +113,9 @@ def expand(actions: FloatArray, ticks_per_step: int, interpolation: str) -> Floa
     return np.asarray(between.reshape(-1, actions.shape[1]), dtype=np.float32)
 
 
-def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Timeline | None:
+def splice(
+    old: Timeline | None, new: Timeline, seam: int, blend: int = 0, ensemble: float | None = None
+) -> Timeline | None:
     """The schedule after a chunk came.
 
     Args:
@@ -109,6 +123,8 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
         new: the whole chunk, from the tick of its observation on.
         seam: first tick that is not consumed.
         blend: ticks over which the old actions turn evenly into the new ones, where both are there; 0 to replace them.
+        ensemble: coefficient of ``average``, for what both have, and what only the old ones have stays; None for
+            neither.
 
     Returns:
         What is scheduled from ``seam`` on; None if the whole chunk is overdue.
@@ -116,17 +132,42 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
     if new.end <= seam:
         return None
     first = max(seam, new.start)
-    rows, observed = new.rows[first - new.start :].copy(), new.observed[first - new.start :]
+    made = new.between(first, new.end)
     if old is None:
-        return Timeline(first, rows, observed)
-    both = min(blend, old.end - first, len(rows))
-    if both > 0 and first >= old.start:
-        weight = (np.arange(1, both + 1, dtype=np.float32) / (blend + 1))[:, None]
-        past = old.rows[first - old.start : first - old.start + both]
-        rows[:both] = past + weight * (rows[:both] - past)
+        return made
+    both = old.between(first, made.end)
+    if ensemble is not None:
+        made = average(both, made, ensemble)
+        if old.start <= made.end < old.end:
+            made = made.then(old.between(made.end, old.end))
+    elif blend and first >= old.start:
+        rows, past = made.rows.copy(), both.rows[:blend]
+        weight = (np.arange(1, len(past) + 1, dtype=np.float32) / (blend + 1))[:, None]
+        rows[: len(past)] = past + weight * (rows[: len(past)] - past)
+        made = replace(made, rows=rows)
     if old.start <= seam < first <= old.end:  # the chunk begins later than what is next
-        kept = slice(seam - old.start, first - old.start)
-        rows = np.concatenate([old.rows[kept], rows])
-        observed = np.concatenate([old.observed[kept], observed])
-        first = seam
-    return Timeline(first, rows, observed)
+        made = old.between(seam, first).then(made)
+    return made
+
+
+def average(old: Timeline, new: Timeline, coefficient: float) -> Timeline:
+    """A chunk, with its mean with what others predicted for the same ticks.
+
+    The weights are ``exp(-coefficient * i)``, i = 0 for the oldest prediction of a tick ("Learning Fine-Grained
+    Bimanual Manipulation with Low-Cost Hardware", section IV, arXiv 2304.13705). The mean of n predictions and their
+    number are enough to add another one: of all weights it has the share ``w[n] / (w[0] + ... + w[n])``.
+
+    Args:
+        old: means so far, of ticks that ``new`` has.
+        new: the chunk.
+        coefficient: 0 for a plain mean; the larger, the more the oldest prediction counts.
+    """
+    n, rows, chunks = old.chunks, new.rows.copy(), new.chunks.copy()
+    if coefficient == 0:
+        share = 1 / (n + 1)
+    else:  # the sum of the geometric series, in a form that neither overflows nor cancels
+        share = np.expm1(-coefficient) / (np.expm1(-coefficient) - np.expm1(np.minimum(coefficient * n, 700)))
+    both = slice(old.start - new.start, old.end - new.start)
+    rows[both] = old.rows + share[:, None] * (rows[both] - old.rows)
+    chunks[both] += n
+    return replace(new, rows=rows, chunks=chunks)
