@@ -77,14 +77,17 @@ class Schedule:
         rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
         start = self.grid.tick(observed)
         new = Timeline.of(start, rows, observed)
+        if self._guard.clips:
+            new = new.clipped_to(self._guard.bounded(rows))
         seam = start if self.last is None else self.last[0] + 1
         blend = settings.blend_steps if settings.seam == "blend" else 0
         ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" else None
         spliced = splice(self.timeline, new, seam, blend, ensemble)
         if spliced is None or new.end <= self.grid.tick(now):
             return "overdue"
-        played = [action for _, action in list(self._played)[-3:]]
-        past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
+        past = self._past
+        if self._guard.clips:
+            spliced = spliced.clipped_to(self._guard.limited(past, spliced.rows))
         refusal = self._guard.refuse_motion(past, spliced.rows)
         if refusal is not None:  # without its reserve it may do, if anything is left then
             spliced = spliced.between(seam, start + resolved.horizon * resolved.ticks_per_step)
@@ -93,6 +96,18 @@ class Schedule:
                 return "refused"
         self.timeline = spliced
         return "scheduled"
+
+    def skip_to(self, tick: int) -> None:
+        """Have what follows keep the limits of a guard that clips, where nothing is given out for the ticks before."""
+        if self._guard.clips and self.timeline is not None and self.timeline.at(tick) is not None:
+            rest = self.timeline.between(tick, self.timeline.end)
+            self.timeline = rest.clipped_to(self._guard.limited(self._past, rest.rows))
+
+    @property
+    def _past(self) -> FloatArray:
+        """The last three actions that were given out, or as many as there are, oldest first."""
+        played = [action for _, action in list(self._played)[-3:]]
+        return np.stack(played) if played else np.empty((0, self._resolved.channels), np.float32)
 
     @property
     def executed(self) -> float:

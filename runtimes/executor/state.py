@@ -124,10 +124,13 @@ class ExecutorState:
             ExecutorError: an action for a later time was given out before, or the time is of another clock.
         """
         schedule, recorder = self._schedule, self.recorder
-        tick, last, timeline = schedule.tick(time, now), schedule.last, schedule.timeline
+        tick, last = schedule.tick(time, now), schedule.last
         if last is not None and tick == last[0]:
             recorder.tick(now)
             return last[1].copy()
+        if last is not None and tick > last[0] + 1:
+            schedule.skip_to(tick)
+        timeline = schedule.timeline
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
@@ -137,6 +140,7 @@ class ExecutorState:
             self._miss()
         recorder.queue_depth.add(max(schedule.due - tick - 1, 0))
         recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
+        recorder.counts.actions_clipped += int(timeline.clipped[tick - timeline.start])
         recorder.tick(now)
         self._holds, self._gap = 0, late
         schedule.give(tick, row, time)

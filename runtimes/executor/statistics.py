@@ -66,6 +66,7 @@ class Counts:
     ticks: int = 0
     reserve: int = 0
     holds: int = 0
+    actions_clipped: int = 0
     starved: int = 0
     frames: int = 0
     frames_late: int = 0
@@ -93,6 +94,8 @@ class ExecutorStatistics:
         ticks: actions that were given out, those in reserve and held ones included.
         reserve: of these, actions beyond what was planned with, because the next chunk was late.
         holds: of these, the last action given out again because there was no other.
+        actions_clipped: of these, scheduled actions that the guard had changed, or that were made from such; see
+            ``GuardLimits.clip``.
         starved: times that there was no action and none could be held, so that ``action`` raised. Before the first
             chunk of an episode this is no missed deadline.
         frames: observations taken.
@@ -124,6 +127,7 @@ class ExecutorStatistics:
     ticks: int
     reserve: int
     holds: int
+    actions_clipped: int
     starved: int
     frames: int
     frames_late: int

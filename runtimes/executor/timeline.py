@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import floor
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -65,17 +66,20 @@ class Timeline:
         rows: float32 ``[N, Da]``, one a tick.
         observed: float64 ``[N]``, time of the newest frame that each row was computed from.
         chunks: int64 ``[N]``, how many chunks each row is the mean of.
+        clipped: bool ``[N]``, whether the guard changed the row, or one that it was made from.
     """
 
     start: int
     rows: FloatArray
     observed: npt.NDArray[np.float64]
     chunks: npt.NDArray[np.int64]
+    clipped: npt.NDArray[np.bool_]
 
     @classmethod
     def of(cls, start: int, rows: FloatArray, observed: float) -> Timeline:
         """The actions of one chunk."""
-        return cls(start, rows, np.full(len(rows), observed), np.ones(len(rows), np.int64))
+        number = len(rows)
+        return cls(start, rows, np.full(number, observed), np.ones(number, np.int64), np.zeros(number, np.bool_))
 
     @property
     def end(self) -> int:
@@ -85,12 +89,20 @@ class Timeline:
     def between(self, first: int, end: int) -> Timeline:
         """What is scheduled from a tick on, and before another; views."""
         part = slice(max(first - self.start, 0), max(end - self.start, 0))
-        return Timeline(self.start + part.start, self.rows[part], self.observed[part], self.chunks[part])
+        return Timeline(self.start + part.start, *(each[part] for each in self._arrays))
 
     def then(self, other: Timeline) -> Timeline:
         """This, and after its end another."""
-        pairs = ((self.rows, other.rows), (self.observed, other.observed), (self.chunks, other.chunks))
+        pairs = zip(self._arrays, other._arrays, strict=True)
         return Timeline(self.start, *(np.concatenate(pair) for pair in pairs))
+
+    def clipped_to(self, rows: FloatArray) -> Timeline:
+        """The same with rows that the guard made of these."""
+        return replace(self, rows=rows, clipped=self.clipped | (rows != self.rows).any(axis=1))
+
+    @property
+    def _arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        return self.rows, self.observed, self.chunks, self.clipped
 
     def at(self, tick: int) -> FloatArray | None:
         """The action of a tick, a view; None if none is scheduled."""
@@ -141,10 +153,11 @@ def splice(
         if old.start <= made.end < old.end:
             made = made.then(old.between(made.end, old.end))
     elif blend and first >= old.start:
-        rows, past = made.rows.copy(), both.rows[:blend]
+        rows, clipped, past = made.rows.copy(), made.clipped.copy(), both.rows[:blend]
         weight = (np.arange(1, len(past) + 1, dtype=np.float32) / (blend + 1))[:, None]
         rows[: len(past)] = past + weight * (rows[: len(past)] - past)
-        made = replace(made, rows=rows)
+        clipped[: len(past)] |= both.clipped[:blend]
+        made = replace(made, rows=rows, clipped=clipped)
     if old.start <= seam < first <= old.end:  # the chunk begins later than what is next
         made = old.between(seam, first).then(made)
     return made
@@ -162,7 +175,7 @@ def average(old: Timeline, new: Timeline, coefficient: float) -> Timeline:
         new: the chunk.
         coefficient: 0 for a plain mean; the larger, the more the oldest prediction counts.
     """
-    n, rows, chunks = old.chunks, new.rows.copy(), new.chunks.copy()
+    n, rows, chunks, clipped = old.chunks, new.rows.copy(), new.chunks.copy(), new.clipped.copy()
     if coefficient == 0:
         share = 1 / (n + 1)
     else:  # the sum of the geometric series, in a form that neither overflows nor cancels
@@ -170,4 +183,5 @@ def average(old: Timeline, new: Timeline, coefficient: float) -> Timeline:
     both = slice(old.start - new.start, old.end - new.start)
     rows[both] = old.rows + share[:, None] * (rows[both] - old.rows)
     chunks[both] += n
-    return replace(new, rows=rows, chunks=chunks)
+    clipped[both] |= old.clipped
+    return replace(new, rows=rows, chunks=chunks, clipped=clipped)
