@@ -62,11 +62,12 @@ class Schedule:
         self.grid.follow(time, tick)
         self._played.append((tick, action))
 
-    def add(self, observed: float, actions: FloatArray, now: float) -> str:
+    def add(self, observed: float, actions: FloatArray, now: float, alone: bool = False) -> str:
         """Let a chunk join what is scheduled, if the guard has nothing against it.
 
         Args:
             actions: ``[horizon + reserve, Da]``; the reserve is left out where the guard refuses that alone.
+            alone: whether no mean of it and others is made.
         """
         settings, resolved = self._settings, self._resolved
         self.refusal = self._guard.refuse(actions[: resolved.horizon])
@@ -81,7 +82,7 @@ class Schedule:
             new = new.clipped_to(self._guard.bounded(rows))
         seam = start if self.last is None else self.last[0] + 1
         blend = settings.blend_steps if settings.seam == "blend" else 0
-        ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" else None
+        ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" and not alone else None
         spliced = splice(self.timeline, new, seam, blend, ensemble)
         if spliced is None or new.end <= self.grid.tick(now):
             return "overdue"

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from math import inf, isfinite
+from math import ceil, inf, isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
 
 from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
 from .guard import GuardLimits
+from .stall import StallRule
 from .window import FrameSpec
 
 if TYPE_CHECKING:
@@ -41,7 +44,7 @@ class Policy(Protocol):
         """Of ``PolicyInfo`` what is read here: ``observation, action, sample, plans, default_plan``."""
 
     def reset(self, seed: int | None = None) -> None:
-        """A new episode."""
+        """A new episode; or, without a seed, within one, where a call shall go on from nothing (``stall_after``)."""
 
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
         """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``.
@@ -90,6 +93,12 @@ class ExecutorSettings:
         tiers: plans from slow to fast; None: the policy's default plan alone.
         down_after: missed deadlines in a row after which the next faster plan is run.
         up_after: calls in time, in a row, after which the next slower plan is tried again.
+        stall_after: seconds. If the actions given out for as long stay within ``stall_range`` of the first of them, the
+            policy has stopped moving: it forgets all that a call goes on from, and the next call runs ``stall_plan``.
+            Then it is given as long again. None: nobody looks.
+        stall_range: for each channel, in units of the normalised actions: 2 is a channel's range in training where the
+            normaliser knows that, and 1 its standard deviation where it knows this. Without a normaliser, as it is.
+        stall_plan: whose latency is measured, too.
         guard: limits on actions.
         cores: processors that the policy's thread is pinned to; None: any.
         statistics_window: measurements that percentiles are made from.
@@ -115,6 +124,9 @@ class ExecutorSettings:
     tiers: tuple[str, ...] | None = None
     down_after: int = 1
     up_after: int = 20
+    stall_after: float | None = None
+    stall_range: float = 0.02
+    stall_plan: str = "dense"
     guard: GuardLimits = field(default_factory=GuardLimits)
     cores: tuple[int, ...] | None = None
     statistics_window: int = 4096
@@ -129,11 +141,14 @@ class ExecutorSettings:
         if self.cores is not None:
             cores = tuple(integer(core, "a processor in cores", ExecutorError) for core in self.cores)
             object.__setattr__(self, "cores", cores)
-        for name in ("policy_hz", "max_age"):
+        for name in ("policy_hz", "max_age", "stall_after"):
             value = getattr(self, name)
             if value is not None:
                 _require_number(value, name)
         _require_number(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
+        _require_number(self.stall_range, "stall_range")
+        if not isinstance(self.stall_plan, str):
+            raise ExecutorError(f"stall_plan must be the name of a plan; found {self.stall_plan!r}.")
         most, name = _MOST_COEFFICIENT, "ensemble_coefficient"
         _require_number(self.ensemble_coefficient, name, most, f"between {-most:g} and {most:g}", -most)
         if self.interpolation not in INTERPOLATIONS:
@@ -168,6 +183,7 @@ class Resolved:
         max_age: of the newest frame of a window when a call starts, seconds.
         tiers: plans, slowest first.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
+        stall: when the policy has stopped moving; None if nobody looks.
     """
 
     control_hz: float
@@ -181,6 +197,12 @@ class Resolved:
     max_age: float
     tiers: tuple[str, ...]
     margin_ticks: int
+    stall: StallRule | None
+
+    @property
+    def plans(self) -> tuple[str, ...]:
+        """All that calls may run: the tiers first."""
+        return tuple(dict.fromkeys(self.tiers if self.stall is None else (*self.tiers, self.stall.plan)))
 
     def feasibility(self, latency: float) -> Feasibility:
         """The arithmetic of calls of so many seconds."""
@@ -209,9 +231,17 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
             f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
             f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
         )
-    if unknown := [name for name in tiers if name.partition("@")[0] not in info.plans]:
+    stall = None
+    if settings.stall_after is not None:
+        scale = np.float32(1) if chunk.normalizer is None else np.abs(chunk.normalizer.scale)
+        reach = np.broadcast_to(np.float32(settings.stall_range) / scale, (chunk.action_dim,))
+        stall = StallRule(ceil(settings.stall_after * control_hz), reach, settings.stall_plan)
+    named = tiers if stall is None else (*tiers, stall.plan)
+    if unknown := [name for name in named if name.partition("@")[0] not in info.plans]:
         known = list(info.plans)
-        raise ExecutorError(f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers among these.")
+        raise ExecutorError(
+            f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
+        )
     return Resolved(
         control_hz=control_hz,
         policy_hz=policy_hz,
@@ -224,4 +254,5 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         max_age=settings.max_age or 3 / policy_hz,
         tiers=tiers,
         margin_ticks=settings.margin_ticks,
+        stall=stall,
     )

@@ -74,6 +74,7 @@ class Counts:
     frames_early: int = 0
     calls: int = 0
     calls_outside: int = 0
+    stalls: int = 0
     chunks: int = 0
     chunks_refused: int = 0
     chunks_overdue: int = 0
@@ -104,6 +105,7 @@ class ExecutorStatistics:
         frames_early: of these, handed to ``prepare_frame`` before the call that was expected to read them.
         calls: of the policy, finished; those that measured its latency at the start are not counted.
         calls_outside: of these, so far outside of what was recorded that they had no correction.
+        stalls: of these, made with ``stall_plan`` because the actions had stopped moving.
         chunks: of the calls, scheduled.
         chunks_refused: of these, refused by the guard.
         chunks_overdue: wholly in the past when they came.
@@ -135,6 +137,7 @@ class ExecutorStatistics:
     frames_early: int
     calls: int
     calls_outside: int
+    stalls: int
     chunks: int
     chunks_refused: int
     chunks_overdue: int
