@@ -6,6 +6,7 @@ Everything that decides is a state machine without clock or thread, driven by ``
 - ``schedule``: actions by control tick, and how chunks join.
 - ``feasibility``: whether a policy keeps up, when its next call must start, and which plan runs under pressure.
 - ``guard``: what a chunk must be before it is executed.
+- ``stall``: whether the policy has stopped moving.
 - ``state``: all of these together.
 - ``statistics``, ``trace``: what happened.
 - ``server``, ``protocol``: the executor for other processes.

@@ -54,7 +54,8 @@ class AsyncExecutor:
         control_hz: ticks a second of the control loop.
         settings: everything else.
         clock: what time it is; None for ``time.monotonic``.
-        latencies: seconds of the longest call of each tier, if they are known; None has them measured now.
+        latencies: seconds of the longest call of each tier, and of ``stall_plan`` where that may be run, if they are
+            known; None has them measured now.
         open_timeout: seconds, of real time, that this may take.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import copysign
 
 import numpy as np
 
@@ -22,8 +23,12 @@ class GuardLimits:
         margin: share of the normaliser's range by which an action may be outside of it. A normaliser by mean and
             deviation, or by quantiles, has no range, and sets no bounds: give ``low`` and ``high``.
         max_step: largest change of an action from one control tick to the next, seams included; None for no limit. A
-            loop that skips ticks, or goes on after an error without a reset, sees the changes of all of them at once.
+            loop that skips ticks, or goes on after an error without a reset, sees the changes of all of them at once,
+            unless ``clip`` is set.
         max_jerk: largest third difference over control ticks, ``a[3] - 3 a[2] + 3 a[1] - a[0]``; None for no limit.
+        clip: whether actions are changed where a chunk would be refused for its bounds or its steps: each number is
+            clipped to ``low`` and ``high``, and each action comes as near to what it was as it can within ``max_step``
+            of the one given out before. What is not finite, or exceeds ``max_jerk``, is refused all the same.
     """
 
     low: float | Sequence[float] | None = None
@@ -31,10 +36,13 @@ class GuardLimits:
     margin: float = 0.05
     max_step: float | Sequence[float] | None = None
     max_jerk: float | Sequence[float] | None = None
+    clip: bool = False
 
     def __post_init__(self) -> None:
         if not self.margin >= 0:
             raise ExecutorError(f"the guard's margin must not be negative; found {self.margin}.")
+        if not isinstance(self.clip, bool):
+            raise ExecutorError(f"the guard's clip must be True or False; found {self.clip!r}.")
         for name in ("max_step", "max_jerk"):
             limit = getattr(self, name)
             if limit is not None and not (_numbers(limit, name) > 0).all():
@@ -49,7 +57,10 @@ class Guard:
             no bounds but the ones in ``limits``.
 
     Raises:
-        ExecutorError: a limit has another number of channels, or the bounds leave no room.
+        ExecutorError: a limit has another number of channels, the bounds leave no room, or there is nothing to clip to.
+
+    Attributes:
+        clips: whether actions are changed so that they keep the limits.
     """
 
     def __init__(self, limits: GuardLimits, normalizer: Affine | None, channels: int) -> None:
@@ -65,17 +76,44 @@ class Guard:
             raise ExecutorError(f"the guard's bounds leave no room: low {self._low} is not below high {self._high}.")
         self._max_step = None if limits.max_step is None else _vector(limits.max_step, channels, "max_step", unlimited)
         self._max_jerk = None if limits.max_jerk is None else _vector(limits.max_jerk, channels, "max_jerk", unlimited)
+        self.clips = limits.clip
+        if self.clips and self._max_step is None and not np.isfinite([self._low, self._high]).any():
+            what = "the guard's clip has nothing to clip to: the normaliser of the actions has no range"
+            raise ExecutorError(f"{what}. Give low and high, or max_step.")
 
     def refuse(self, actions: FloatArray) -> str | None:
         """Why a chunk ``[Ta, Da]`` must not be executed; None if nothing is wrong with it by itself."""
         if not np.isfinite(actions).all():
             return f"{np.count_nonzero(~np.isfinite(actions))} of its {actions.size} numbers are not finite"
         outside = (actions < self._low) | (actions > self._high)
-        if outside.any():
+        if outside.any() and not self.clips:
             i, d = (int(n) for n in np.argwhere(outside)[0])
             bounds = f"{self._low[d]:.6g} to {self._high[d]:.6g}"
             return f"action {i}, channel {d}, is {actions[i, d]:.6g}; the bounds are {bounds}"
         return None
+
+    def bounded(self, rows: FloatArray) -> FloatArray:
+        """Actions ``[N, Da]``, clipped to the bounds."""
+        return np.clip(rows, self._low, self._high)
+
+    def limited(self, played: FloatArray, scheduled: FloatArray) -> FloatArray:
+        """A schedule that keeps the bounds and ``max_step``, with each action as near to what it was as they allow.
+
+        Args:
+            played: the last actions that were given out, ``[N, Da]``, oldest first; at most one counts.
+            scheduled: ``[M, Da]``, what follows.
+        """
+        joined = np.concatenate([played[-1:], self.bounded(scheduled)])
+        if self._max_step is not None:
+            over = np.abs(np.diff(joined.astype(np.float64), axis=0)) > self._max_step
+            for d in np.flatnonzero(over.any(axis=0)):
+                column, most = joined[:, d].tolist(), float(self._max_step[d])
+                room = max(most - float(np.spacing(np.abs(joined[:, d]).max())), 0.0)  # rounding changes less than that
+                for i in range(1, len(column)):
+                    if abs(step := column[i] - column[i - 1]) > most:
+                        column[i] = float(np.float32(column[i - 1] + copysign(room, step)))
+                joined[:, d] = column
+        return joined[-len(scheduled) :]
 
     def refuse_motion(self, played: FloatArray, scheduled: FloatArray) -> str | None:
         """Why a schedule must not follow what was played.
@@ -91,7 +129,7 @@ class Guard:
             return None
         for name, limit, order in (("step", self._max_step, 1), ("jerk", self._max_jerk, 3)):
             joined = np.concatenate([played[-order:], scheduled]).astype(np.float64)
-            if limit is None or len(joined) <= order:
+            if limit is None or len(joined) <= order or (order == 1 and self.clips):
                 continue
             size = np.abs(np.diff(joined, order, axis=0))
             excess = size - limit

@@ -62,11 +62,12 @@ class Schedule:
         self.grid.follow(time, tick)
         self._played.append((tick, action))
 
-    def add(self, observed: float, actions: FloatArray, now: float) -> str:
+    def add(self, observed: float, actions: FloatArray, now: float, alone: bool = False) -> str:
         """Let a chunk join what is scheduled, if the guard has nothing against it.
 
         Args:
             actions: ``[horizon + reserve, Da]``; the reserve is left out where the guard refuses that alone.
+            alone: whether no mean of it and others is made.
         """
         settings, resolved = self._settings, self._resolved
         self.refusal = self._guard.refuse(actions[: resolved.horizon])
@@ -76,27 +77,44 @@ class Schedule:
             actions = actions[: resolved.horizon]
         rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
         start = self.grid.tick(observed)
-        new = Timeline(start, rows, np.full(len(rows), observed))
+        new = Timeline.of(start, rows, observed)
+        if self._guard.clips:
+            new = new.clipped_to(self._guard.bounded(rows))
         seam = start if self.last is None else self.last[0] + 1
-        spliced = splice(self.timeline, new, seam, settings.blend_steps if settings.seam == "blend" else 0)
+        blend = settings.blend_steps if settings.seam == "blend" else 0
+        ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" and not alone else None
+        spliced = splice(self.timeline, new, seam, blend, ensemble)
         if spliced is None or new.end <= self.grid.tick(now):
             return "overdue"
-        played = [action for _, action in list(self._played)[-3:]]
-        past = np.stack(played) if played else np.empty((0, resolved.channels), np.float32)
+        past = self._past
+        if self._guard.clips:
+            spliced = spliced.clipped_to(self._guard.limited(past, spliced.rows))
         refusal = self._guard.refuse_motion(past, spliced.rows)
         if refusal is not None:  # without its reserve it may do, if anything is left then
-            spliced = spliced.until(start + resolved.horizon * resolved.ticks_per_step)
+            spliced = spliced.between(seam, start + resolved.horizon * resolved.ticks_per_step)
             self.refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
             if self.refusal is not None:
                 return "refused"
         self.timeline = spliced
         return "scheduled"
 
+    def skip_to(self, tick: int) -> None:
+        """Have what follows keep the limits of a guard that clips, where nothing is given out for the ticks before."""
+        if self._guard.clips and self.timeline is not None and self.timeline.at(tick) is not None:
+            rest = self.timeline.between(tick, self.timeline.end)
+            self.timeline = rest.clipped_to(self._guard.limited(self._past, rest.rows))
+
+    @property
+    def _past(self) -> FloatArray:
+        """The last three actions that were given out, or as many as there are, oldest first."""
+        played = [action for _, action in list(self._played)[-3:]]
+        return np.stack(played) if played else np.empty((0, self._resolved.channels), np.float32)
+
     @property
     def executed(self) -> float:
         """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
         assert self.timeline is not None
-        return float(self.timeline.observed[-1]) + self._resolved.horizon / self._resolved.policy_hz
+        return float(self.timeline.observed.max()) + self._resolved.horizon / self._resolved.policy_hz
 
     def need_by(self, time: float) -> None:
         """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from math import inf, isfinite
+from math import ceil, inf, isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
 
 from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
 from .guard import GuardLimits
+from .stall import StallRule
 from .window import FrameSpec
 
 if TYPE_CHECKING:
@@ -21,13 +24,16 @@ if TYPE_CHECKING:
     from ttscompile.runtimes.info import PolicyInfo
 
 INTERPOLATIONS = ("hold", "linear")
-SEAMS = ("replace", "blend", "prefix")
+SEAMS = ("replace", "blend", "ensemble", "prefix")
 
 _MAY_BE_ZERO = frozenset({"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"})
 """Of the whole numbers among the settings; the others are at least 1."""
 
 _MOST = 10**9
 """Of any of them: a week of ticks at a kilohertz, and a queue that Python can have."""
+
+_MOST_COEFFICIENT = 10.0
+"""Of a seam ``ensemble``, either way: one prediction then weighs more than 20,000 times as much as the next."""
 
 
 class Policy(Protocol):
@@ -38,7 +44,7 @@ class Policy(Protocol):
         """Of ``PolicyInfo`` what is read here: ``observation, action, sample, plans, default_plan``."""
 
     def reset(self, seed: int | None = None) -> None:
-        """A new episode."""
+        """A new episode; or, without a seed, within one, where a call shall go on from nothing (``stall_after``)."""
 
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
         """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``.
@@ -71,9 +77,12 @@ class ExecutorSettings:
             sooner, and nothing but the last action is left for a chunk that is late.
         rate_tolerance: how far from its place in the window a frame may be, as a share of the policy's period.
         max_age: of the newest frame of a window when a call starts; None: three periods of the policy.
-        seam: how a chunk joins the one before: ``replace``; ``blend``, linear over ``blend_steps``; or ``prefix``
-            (experimental), for policies that take ``prefix``, the actions that are committed already, and inpaint.
+        seam: how a chunk joins those before: ``replace``; ``blend``, linear over ``blend_steps``; ``ensemble``, each
+            action a weighted mean of what all chunks predicted for it; or ``prefix`` (experimental), for policies that
+            take ``prefix``, the actions that are committed already, and inpaint.
         blend_steps: control ticks.
+        ensemble_coefficient: m of the weights ``exp(-m * i)`` of ``ensemble``, i = 0 for the oldest prediction of a
+            tick: 0 for a plain mean, negative where new predictions shall count more than old ones.
         max_hold: control ticks for which the last action is repeated when there is no other, not even in reserve; then
             ``action`` raises. Right for positions; for velocities and differences set 0.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
@@ -84,6 +93,12 @@ class ExecutorSettings:
         tiers: plans from slow to fast; None: the policy's default plan alone.
         down_after: missed deadlines in a row after which the next faster plan is run.
         up_after: calls in time, in a row, after which the next slower plan is tried again.
+        stall_after: seconds. If the actions given out for as long stay within ``stall_range`` of the first of them, the
+            policy has stopped moving: it forgets all that a call goes on from, and the next call runs ``stall_plan``.
+            Then it is given as long again. None: nobody looks.
+        stall_range: for each channel, in units of the normalised actions: 2 is a channel's range in training where the
+            normaliser knows that, and 1 its standard deviation where it knows this. Without a normaliser, as it is.
+        stall_plan: whose latency is measured, too.
         guard: limits on actions.
         cores: processors that the policy's thread is pinned to; None: any.
         statistics_window: measurements that percentiles are made from.
@@ -99,6 +114,7 @@ class ExecutorSettings:
     max_age: float | None = None
     seam: str = "replace"
     blend_steps: int = 4
+    ensemble_coefficient: float = 0.01
     max_hold: int = 3
     margin_ticks: int = 1
     warm_up: int = 2
@@ -108,6 +124,9 @@ class ExecutorSettings:
     tiers: tuple[str, ...] | None = None
     down_after: int = 1
     up_after: int = 20
+    stall_after: float | None = None
+    stall_range: float = 0.02
+    stall_plan: str = "dense"
     guard: GuardLimits = field(default_factory=GuardLimits)
     cores: tuple[int, ...] | None = None
     statistics_window: int = 4096
@@ -122,11 +141,16 @@ class ExecutorSettings:
         if self.cores is not None:
             cores = tuple(integer(core, "a processor in cores", ExecutorError) for core in self.cores)
             object.__setattr__(self, "cores", cores)
-        for name in ("policy_hz", "max_age"):
+        for name in ("policy_hz", "max_age", "stall_after"):
             value = getattr(self, name)
             if value is not None:
-                _require_positive(value, name)
-        _require_positive(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
+                _require_number(value, name)
+        _require_number(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
+        _require_number(self.stall_range, "stall_range")
+        if not isinstance(self.stall_plan, str):
+            raise ExecutorError(f"stall_plan must be the name of a plan; found {self.stall_plan!r}.")
+        most, name = _MOST_COEFFICIENT, "ensemble_coefficient"
+        _require_number(self.ensemble_coefficient, name, most, f"between {-most:g} and {most:g}", -most)
         if self.interpolation not in INTERPOLATIONS:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
@@ -136,8 +160,10 @@ class ExecutorSettings:
             raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
 
 
-def _require_positive(value: object, name: str, below: float = inf, wanted: str = "positive and finite") -> None:
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < below:
+def _require_number(
+    value: object, name: str, below: float = inf, wanted: str = "positive and finite", above: float = 0.0
+) -> None:
+    if isinstance(value, bool) or not isinstance(value, Real) or not above < float(value) < below:
         raise ExecutorError(f"{name} must be a number, {wanted}; found {value!r}.")
 
 
@@ -157,6 +183,7 @@ class Resolved:
         max_age: of the newest frame of a window when a call starts, seconds.
         tiers: plans, slowest first.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
+        stall: when the policy has stopped moving; None if nobody looks.
     """
 
     control_hz: float
@@ -170,6 +197,12 @@ class Resolved:
     max_age: float
     tiers: tuple[str, ...]
     margin_ticks: int
+    stall: StallRule | None
+
+    @property
+    def plans(self) -> tuple[str, ...]:
+        """All that calls may run: the tiers first."""
+        return tuple(dict.fromkeys(self.tiers if self.stall is None else (*self.tiers, self.stall.plan)))
 
     def feasibility(self, latency: float) -> Feasibility:
         """The arithmetic of calls of so many seconds."""
@@ -178,7 +211,7 @@ class Resolved:
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy. Raises ExecutorError: they do not fit."""
-    _require_positive(control_hz, "control_hz")
+    _require_number(control_hz, "control_hz")
     policy_hz = settings.policy_hz or control_hz
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0
@@ -198,9 +231,17 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
             f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
             f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
         )
-    if unknown := [name for name in tiers if name.partition("@")[0] not in info.plans]:
+    stall = None
+    if settings.stall_after is not None:
+        scale = np.float32(1) if chunk.normalizer is None else np.abs(chunk.normalizer.scale)
+        reach = np.broadcast_to(np.float32(settings.stall_range) / scale, (chunk.action_dim,))
+        stall = StallRule(ceil(settings.stall_after * control_hz), reach, settings.stall_plan)
+    named = tiers if stall is None else (*tiers, stall.plan)
+    if unknown := [name for name in named if name.partition("@")[0] not in info.plans]:
         known = list(info.plans)
-        raise ExecutorError(f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers among these.")
+        raise ExecutorError(
+            f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
+        )
     return Resolved(
         control_hz=control_hz,
         policy_hz=policy_hz,
@@ -213,4 +254,5 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         max_age=settings.max_age or 3 / policy_hz,
         tiers=tiers,
         margin_ticks=settings.margin_ticks,
+        stall=stall,
     )

@@ -17,6 +17,7 @@ from .feasibility import LatencyWindow, Tiers
 from .guard import Guard
 from .schedule import Schedule
 from .settings import ExecutorSettings, Resolved
+from .stall import Watchdog
 from .statistics import Recorder
 from .window import Frame, ObservationWindow
 
@@ -38,6 +39,7 @@ class Job:
             be missed.
         prefix: actions that are committed, ``[N, Da]`` from the observation on, one a step of the policy; None unless
             the seam is ``prefix``.
+        stalled: whether the policy has stopped moving, so that it has to forget what a call goes on from.
     """
 
     epoch: int
@@ -47,6 +49,7 @@ class Job:
     started: float
     deadline: float | None
     prefix: FloatArray | None
+    stalled: bool
 
 
 class ExecutorState:
@@ -75,6 +78,7 @@ class ExecutorState:
         period = 1 / resolved.policy_hz
         self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
         self._schedule = Schedule(settings, resolved, self._guard)
+        self._watchdog = Watchdog(resolved.stall)
         self._early: deque[Frame] = deque(maxlen=2 * resolved.frames.steps)  # handed out
         self._used = float("-inf")  # time of the newest frame that a call was made from
         self._holds = 0
@@ -83,7 +87,7 @@ class ExecutorState:
     @property
     def plan(self) -> str:
         """Name of the plan that the next call runs."""
-        return self._tiers.plan
+        return self._watchdog.plan or self._tiers.plan
 
     @property
     def ready(self) -> bool:
@@ -124,10 +128,13 @@ class ExecutorState:
             ExecutorError: an action for a later time was given out before, or the time is of another clock.
         """
         schedule, recorder = self._schedule, self.recorder
-        tick, last, timeline = schedule.tick(time, now), schedule.last, schedule.timeline
+        tick, last = schedule.tick(time, now), schedule.last
         if last is not None and tick == last[0]:
             recorder.tick(now)
             return last[1].copy()
+        if last is not None and tick > last[0] + 1:
+            schedule.skip_to(tick)
+        timeline = schedule.timeline
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
@@ -137,9 +144,10 @@ class ExecutorState:
             self._miss()
         recorder.queue_depth.add(max(schedule.due - tick - 1, 0))
         recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
+        recorder.counts.actions_clipped += int(timeline.clipped[tick - timeline.start])
         recorder.tick(now)
         self._holds, self._gap = 0, late
-        schedule.give(tick, row, time)
+        self._give(tick, row, time)
         return row.copy()
 
     def hold(self, time: float, now: float) -> FloatArray | None:
@@ -155,8 +163,13 @@ class ExecutorState:
         self._holds = held
         counts.holds += 1
         self.recorder.tick(now)
-        schedule.give(tick, last[1], time)
+        self._give(tick, last[1], time)
         return last[1].copy()
+
+    def _give(self, tick: int, action: FloatArray, time: float) -> None:
+        self._schedule.give(tick, action, time)
+        if self._watchdog.give(action):  # then the next call takes another time
+            self._update_due()
 
     def starved(self, time: float, now: float) -> DeadlineMissedError:
         """Why there is no action for a time, as an error to raise."""
@@ -251,7 +264,8 @@ class ExecutorState:
         schedule, prefix = self._schedule, None
         if self._settings.seam == "prefix":
             prefix = schedule.committed(window.time, now + self._latency)
-        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, schedule.runs_out(now), prefix)
+        stalled, runs_out = self._watchdog.plan is not None, schedule.runs_out(now)
+        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, runs_out, prefix, stalled)
         return self._job
 
     def finish(self, job: Job, actions: FloatArray, now: float, far: bool = False) -> str:
@@ -269,13 +283,17 @@ class ExecutorState:
         counts, self._job = self.recorder.counts, None
         counts.calls += 1
         counts.calls_outside += far
+        counts.stalls += job.stalled
         latency = now - job.started
         self._latencies[job.plan].add(latency)
         self.recorder.latency_ms.add(1e3 * latency)
         if job.epoch != self.epoch:
             counts.chunks_discarded += 1
             return "discarded"
-        outcome = self._schedule.add(job.observed, actions, now)
+        if job.stalled:
+            self._watchdog.restart()
+            self._update_due()
+        outcome = self._schedule.add(job.observed, actions, now, alone=job.stalled)
         if outcome == "scheduled":
             counts.chunks += 1
             self._update_due()
@@ -288,6 +306,8 @@ class ExecutorState:
             self.recorder.slack_ms.add(1e3 * (job.deadline - now))
         late = job.deadline is not None and now > job.deadline
         if outcome == "refused" and not late:  # a faster plan is no remedy for that, nor has it kept up
+            return outcome
+        if job.stalled:  # it says nothing about the tier
             return outcome
         switched = self._tiers.after_call(missed=late or self._schedule.runs_out(now) is None)
         counts.switches_down += switched == 1

@@ -66,6 +66,7 @@ class Counts:
     ticks: int = 0
     reserve: int = 0
     holds: int = 0
+    actions_clipped: int = 0
     starved: int = 0
     frames: int = 0
     frames_late: int = 0
@@ -73,6 +74,7 @@ class Counts:
     frames_early: int = 0
     calls: int = 0
     calls_outside: int = 0
+    stalls: int = 0
     chunks: int = 0
     chunks_refused: int = 0
     chunks_overdue: int = 0
@@ -93,6 +95,8 @@ class ExecutorStatistics:
         ticks: actions that were given out, those in reserve and held ones included.
         reserve: of these, actions beyond what was planned with, because the next chunk was late.
         holds: of these, the last action given out again because there was no other.
+        actions_clipped: of these, scheduled actions that the guard had changed, or that were made from such; see
+            ``GuardLimits.clip``.
         starved: times that there was no action and none could be held, so that ``action`` raised. Before the first
             chunk of an episode this is no missed deadline.
         frames: observations taken.
@@ -101,6 +105,7 @@ class ExecutorStatistics:
         frames_early: of these, handed to ``prepare_frame`` before the call that was expected to read them.
         calls: of the policy, finished; those that measured its latency at the start are not counted.
         calls_outside: of these, so far outside of what was recorded that they had no correction.
+        stalls: of these, made with ``stall_plan`` because the actions had stopped moving.
         chunks: of the calls, scheduled.
         chunks_refused: of these, refused by the guard.
         chunks_overdue: wholly in the past when they came.
@@ -124,6 +129,7 @@ class ExecutorStatistics:
     ticks: int
     reserve: int
     holds: int
+    actions_clipped: int
     starved: int
     frames: int
     frames_late: int
@@ -131,6 +137,7 @@ class ExecutorStatistics:
     frames_early: int
     calls: int
     calls_outside: int
+    stalls: int
     chunks: int
     chunks_refused: int
     chunks_overdue: int

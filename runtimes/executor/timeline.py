@@ -11,8 +11,9 @@ the first tick that is not, however long its inference took::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import floor
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -64,21 +65,44 @@ class Timeline:
         start: tick of the first row.
         rows: float32 ``[N, Da]``, one a tick.
         observed: float64 ``[N]``, time of the newest frame that each row was computed from.
+        chunks: int64 ``[N]``, how many chunks each row is the mean of.
+        clipped: bool ``[N]``, whether the guard changed the row, or one that it was made from.
     """
 
     start: int
     rows: FloatArray
     observed: npt.NDArray[np.float64]
+    chunks: npt.NDArray[np.int64]
+    clipped: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, start: int, rows: FloatArray, observed: float) -> Timeline:
+        """The actions of one chunk."""
+        number = len(rows)
+        return cls(start, rows, np.full(number, observed), np.ones(number, np.int64), np.zeros(number, np.bool_))
 
     @property
     def end(self) -> int:
         """One past the last tick."""
         return self.start + len(self.rows)
 
-    def until(self, tick: int) -> Timeline:
-        """What is scheduled before a tick."""
-        kept = max(min(tick - self.start, len(self.rows)), 0)
-        return Timeline(self.start, self.rows[:kept], self.observed[:kept])
+    def between(self, first: int, end: int) -> Timeline:
+        """What is scheduled from a tick on, and before another; views."""
+        part = slice(max(first - self.start, 0), max(end - self.start, 0))
+        return Timeline(self.start + part.start, *(each[part] for each in self._arrays))
+
+    def then(self, other: Timeline) -> Timeline:
+        """This, and after its end another."""
+        pairs = zip(self._arrays, other._arrays, strict=True)
+        return Timeline(self.start, *(np.concatenate(pair) for pair in pairs))
+
+    def clipped_to(self, rows: FloatArray) -> Timeline:
+        """The same with rows that the guard made of these."""
+        return replace(self, rows=rows, clipped=self.clipped | (rows != self.rows).any(axis=1))
+
+    @property
+    def _arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        return self.rows, self.observed, self.chunks, self.clipped
 
     def at(self, tick: int) -> FloatArray | None:
         """The action of a tick, a view; None if none is scheduled."""
@@ -101,7 +125,9 @@ def expand(actions: FloatArray, ticks_per_step: int, interpolation: str) -> Floa
     return np.asarray(between.reshape(-1, actions.shape[1]), dtype=np.float32)
 
 
-def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Timeline | None:
+def splice(
+    old: Timeline | None, new: Timeline, seam: int, blend: int = 0, ensemble: float | None = None
+) -> Timeline | None:
     """The schedule after a chunk came.
 
     Args:
@@ -109,6 +135,8 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
         new: the whole chunk, from the tick of its observation on.
         seam: first tick that is not consumed.
         blend: ticks over which the old actions turn evenly into the new ones, where both are there; 0 to replace them.
+        ensemble: coefficient of ``average``, for what both have, and what only the old ones have stays; None for
+            neither.
 
     Returns:
         What is scheduled from ``seam`` on; None if the whole chunk is overdue.
@@ -116,17 +144,44 @@ def splice(old: Timeline | None, new: Timeline, seam: int, blend: int = 0) -> Ti
     if new.end <= seam:
         return None
     first = max(seam, new.start)
-    rows, observed = new.rows[first - new.start :].copy(), new.observed[first - new.start :]
+    made = new.between(first, new.end)
     if old is None:
-        return Timeline(first, rows, observed)
-    both = min(blend, old.end - first, len(rows))
-    if both > 0 and first >= old.start:
-        weight = (np.arange(1, both + 1, dtype=np.float32) / (blend + 1))[:, None]
-        past = old.rows[first - old.start : first - old.start + both]
-        rows[:both] = past + weight * (rows[:both] - past)
+        return made
+    both = old.between(first, made.end)
+    if ensemble is not None:
+        made = average(both, made, ensemble)
+        if old.start <= made.end < old.end:
+            made = made.then(old.between(made.end, old.end))
+    elif blend and first >= old.start:
+        rows, clipped, past = made.rows.copy(), made.clipped.copy(), both.rows[:blend]
+        weight = (np.arange(1, len(past) + 1, dtype=np.float32) / (blend + 1))[:, None]
+        rows[: len(past)] = past + weight * (rows[: len(past)] - past)
+        clipped[: len(past)] |= both.clipped[:blend]
+        made = replace(made, rows=rows, clipped=clipped)
     if old.start <= seam < first <= old.end:  # the chunk begins later than what is next
-        kept = slice(seam - old.start, first - old.start)
-        rows = np.concatenate([old.rows[kept], rows])
-        observed = np.concatenate([old.observed[kept], observed])
-        first = seam
-    return Timeline(first, rows, observed)
+        made = old.between(seam, first).then(made)
+    return made
+
+
+def average(old: Timeline, new: Timeline, coefficient: float) -> Timeline:
+    """A chunk, with its mean with what others predicted for the same ticks.
+
+    The weights are ``exp(-coefficient * i)``, i = 0 for the oldest prediction of a tick ("Learning Fine-Grained
+    Bimanual Manipulation with Low-Cost Hardware", section IV, arXiv 2304.13705). The mean of n predictions and their
+    number are enough to add another one: of all weights it has the share ``w[n] / (w[0] + ... + w[n])``.
+
+    Args:
+        old: means so far, of ticks that ``new`` has.
+        new: the chunk.
+        coefficient: 0 for a plain mean; the larger, the more the oldest prediction counts.
+    """
+    n, rows, chunks, clipped = old.chunks, new.rows.copy(), new.chunks.copy(), new.clipped.copy()
+    if coefficient == 0:
+        share = 1 / (n + 1)
+    else:  # the sum of the geometric series, in a form that neither overflows nor cancels
+        share = np.expm1(-coefficient) / (np.expm1(-coefficient) - np.expm1(np.minimum(coefficient * n, 700)))
+    both = slice(old.start - new.start, old.end - new.start)
+    rows[both] = old.rows + share[:, None] * (rows[both] - old.rows)
+    chunks[both] += n
+    clipped[both] |= old.clipped
+    return replace(new, rows=rows, chunks=chunks, clipped=clipped)

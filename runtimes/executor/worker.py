@@ -64,7 +64,8 @@ class Worker:
         """Start the thread, and wait until it has measured the policy.
 
         Args:
-            latencies: seconds of the longest call of each tier, if they are known; None has them measured.
+            latencies: seconds of the longest call of each of ``Resolved.plans``, if they are known; None has them
+                measured.
 
         Raises:
             ExecutorError: it takes longer than that, or something does not fit.
@@ -153,20 +154,20 @@ class Worker:
             self._ready.set()
 
     def _open(self) -> None:
-        """Pin the thread, measure the tiers, refuse what is infeasible."""
+        """Pin the thread, measure the plans, refuse what is infeasible."""
         settings, resolved, given = self._settings, self._resolved, self._latencies
         if settings.cores is not None:
             _pin(settings.cores)
         if given is None:
             self._policy.reset()
-            times = measure_latencies(self._policy, self._clock, settings, resolved.tiers)
+            times = measure_latencies(self._policy, self._clock, settings, resolved.plans)
             measured = {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
-        elif missing := [name for name in resolved.tiers if name not in given]:
-            raise ExecutorError(f"latencies lacks the tier {missing[0]!r}; give one for each of {resolved.tiers}.")
+        elif missing := [name for name in resolved.plans if name not in given]:
+            raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {resolved.plans}.")
         else:
-            measured = {name: [given[name]] for name in resolved.tiers}
+            measured = {name: [given[name]] for name in resolved.plans}
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
-        self.feasibility = {name: resolved.feasibility(max(values)) for name, values in measured.items()}
+        self.feasibility = {name: resolved.feasibility(max(measured[name])) for name in resolved.tiers}
         tiers = fast_enough(self.feasibility, settings.refuse_infeasible)
         action = self._policy.info.action
         normalizer = action.normalizer if action.ranged else None
@@ -213,7 +214,9 @@ class Worker:
         obs = resolved.frames.observation(job.frames)
         prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
         last = resolved.first + resolved.horizon + resolved.reserve
-        if (follow := getattr(self._policy, "follow", None)) is not None and job.epoch == self._followed[0]:
+        if job.stalled:  # all but the sequence of its noise is forgotten
+            self._policy.reset()
+        elif (follow := getattr(self._policy, "follow", None)) is not None and job.epoch == self._followed[0]:
             follow(round((job.observed - self._followed[1]) * resolved.policy_hz))
         self._followed = job.epoch, job.observed
         try:
@@ -231,7 +234,7 @@ class Worker:
             outcome = self._opened.finish(job, actions, now, getattr(report, "far", False))
             self.news.notify_all()
         if self._trace.on:
-            args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
+            args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome} | ({"stalled": True} if job.stalled else {})
             if self._seeing and report is not None:
                 frames = report.frames
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}

@@ -15,7 +15,7 @@ import pytest
 import ttscompile
 from tests.plans import store_schedules
 from tests.runtimes.toys import toy_program, written_artifact
-from ttscompile import AsyncExecutor, ExecutorSettings, Source
+from ttscompile import AsyncExecutor, ExecutorSettings, GuardLimits, Source
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.runtimes.policy import CompiledPolicy
 
@@ -42,7 +42,7 @@ class Slow:
 
     def __init__(self, policy: CompiledPolicy, clock: FakeClock, seed: int) -> None:
         self.info, self._policy, self._clock, self._chance = policy.info, policy, clock, random.Random(seed)
-        self.episodes: list[list[tuple[Mapping[str, Any], ttscompile.Noise, np.ndarray]]] = [[]]
+        self.episodes: list[list[tuple[Mapping[str, Any], ttscompile.Noise, str, np.ndarray]]] = [[]]
         self.read, self._waits = 0, threading.Condition()
 
     def reset(self, seed: int | None = None) -> None:
@@ -54,7 +54,8 @@ class Slow:
         made = self._policy.predict_action(obs_dict, noise=noise, plan=plan)
         assert self._policy.last_report is not None
         self.read += int((self._policy.last_report.plan == Source.ROLLOUT).sum())
-        self.episodes[-1].append(({key: np.array(one) for key, one in obs_dict.items()}, noise, made["action_pred"]))
+        obs = {key: np.array(one) for key, one in obs_dict.items()}
+        self.episodes[-1].append((obs, noise, plan, made["action_pred"]))
         until = self._clock.now() + TYPICAL * self._chance.choice([1, 1, 1, 20])  # the last is late for its chunk
         with self._waits:
             while self._clock.now() < until:
@@ -102,7 +103,43 @@ def test_late_calls_dropped_chunks_and_resets(pruned: Path, seed: int) -> None:
     assert policy.read > 20
     assert len(policy.episodes) > 3
     assert max(map(len, policy.episodes)) > 3
+    require_alone(pruned, policy)
+
+
+@pytest.mark.slow
+def test_a_call_after_a_stall_goes_on_from_nothing(pruned: Path) -> None:
+    """With a reach that no action leaves; what the calls before computed is read neither by this call nor later."""
+    clock = FakeClock()
+    policy = Slow(ttscompile.load(pruned), clock, 0)
+    settings = ExecutorSettings(
+        n_obs_steps=1, tiers=(PLAN,), stall_after=2.0, stall_range=1e9, guard=GuardLimits(low=-1e9, high=1e9)
+    )
+    latencies = {PLAN: TYPICAL, "dense": TYPICAL}
+    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies=latencies)
+    shape = next(iter(policy.info.observation.values())).shape
+    draw = np.random.default_rng(0)
+    clock.settle()
+    try:
+        for _ in range(250):
+            executor.observe({"obs": draw.standard_normal(shape[-1]).astype(np.float32)})
+            clock.settle()
+            if executor.ready:
+                with suppress(DeadlineMissedError):
+                    executor.action()
+            clock.advance(1 / HZ)
+    finally:
+        clock.free()
+        executor.close()
+    first, *others = policy.episodes[1:]  # the first reset is before the first call
+    assert len(others) == executor.statistics().stalls > 2
+    assert [episode[0][2] for episode in others] == ["dense"] * len(others)
+    assert {plan for episode in (first, *others) for _, _, plan, _ in episode[1:]} == {PLAN}
+    require_alone(pruned, policy)
+
+
+def require_alone(pruned: Path, policy: Slow) -> None:
+    """Require every episode to be what another policy answers to the same calls."""
     for episode in policy.episodes:
         alone = ttscompile.load(pruned)
-        for obs, noise, made in episode:
-            assert np.array_equal(alone.predict_action(obs, noise=noise, plan=PLAN)["action_pred"], made)
+        for obs, noise, plan, made in episode:
+            assert np.array_equal(alone.predict_action(obs, noise=noise, plan=plan)["action_pred"], made)

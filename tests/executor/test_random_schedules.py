@@ -28,7 +28,7 @@ class Schedule(RuleBasedStateMachine):
     ticks = 0
 
     @initialize(
-        seam=st.sampled_from(["replace", "blend"]),
+        seam=st.sampled_from(["replace", "blend", "ensemble"]),
         ticks_per_step=st.sampled_from([1, 2]),
         reserve=st.sampled_from([0, 5]),
     )
@@ -202,7 +202,7 @@ class Schedule(RuleBasedStateMachine):
             self.held = 0
         most = MAX_HOLD + round(world.hz / HZ)
         assert self.held <= most, f"held for {self.held} ticks"
-        # A blend of two chunks is a blend of two times of observation, and still an action for now.
+        # A mean of chunks is a mean of their times of observation, and still an action for now.
         ahead = seen + index / HZ - now
         assert abs(ahead + self.held / world.hz) <= 1.2 / HZ, f"stale by {-ahead} s"
         assert -1e-3 <= index <= TA - 1 + self.policy.reserve + 1e-3

@@ -11,8 +11,7 @@ from ttscompile.runtimes.executor.timeline import TickGrid, Timeline, expand, sp
 
 
 def line(start: int, *values: float, observed: float = 0.0) -> Timeline:
-    rows = np.array(values, np.float32)[:, None]
-    return Timeline(start, rows, np.full(len(rows), observed))
+    return Timeline.of(start, np.array(values, np.float32)[:, None], observed)
 
 
 def played(made: Timeline | None) -> tuple[int, list[float]]:

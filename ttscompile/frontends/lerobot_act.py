@@ -83,9 +83,10 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
             )
     if shared.settings.values.get("temporal_ensemble_coeff") is not None:
         warnings.warn(
-            f"{shared.settings.where}temporal_ensemble_coeff is set, and there is no temporal ensembling here:"
-            f" select_action and the executor take the first {shared.n_action_steps} of a chunk's actions from a queue."
-            " Set it to null and n_action_steps to as many as are to be executed, or average action_pred yourself.",
+            f"{shared.settings.where}temporal_ensemble_coeff is set, and select_action does no temporal ensembling: it"
+            f" takes the first {shared.n_action_steps} of a chunk's actions from a queue. The executor does it, with"
+            " ExecutorSettings(seam='ensemble', horizon=1). Otherwise set the coefficient to null, and n_action_steps"
+            " to as many as are to be executed.",
             stacklevel=6,
         )
     processors = read_processors(directory, shared.features)
