@@ -110,7 +110,7 @@ def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     if spec.image and array.dtype.kind in "iu":
         remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
     channels = spec.shape[-3] if spec.image and array.ndim > 3 else 0
-    if channels == array.shape[-1] and array.shape[-3] != channels:
+    if 0 < channels == array.shape[-1] and array.shape[-3] != channels:
         remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
     return remedy
 

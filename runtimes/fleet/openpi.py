@@ -116,17 +116,15 @@ class OpenPiServer(FleetServer):
         """As ``predict_action`` takes it, which refuses what does not fit."""
         obs = dict[str, Any]()
         for key, value in given.items():
-            if isinstance(value, str):
-                if value != self._manifest.spec.source.get("task"):  # who says what is compiled in is right
-                    obs[TASK if key == "prompt" else key] = value
-                continue
-            if (spec := self._specs.get(key)) is not None:
+            if (spec := self._specs.get(key)) is not None and not isinstance(value, str):
                 value = value if isinstance(value, np.ndarray) else read_arrays({key: value}, {key: spec.dtype})[key]
                 if value.ndim == 0 and prod(spec.shape) == 1:
                     value = value.reshape(spec.shape)
                 if spec.frames == 1 and value.ndim == len(spec.shape) - 1:
                     value = value[None]
-            obs[key] = np.asarray(value)[None]
+                obs[key] = value[None]
+            elif not isinstance(value, str) or value != self._manifest.spec.source.get("task"):
+                obs[TASK if key == "prompt" else key] = value
         return obs
 
 

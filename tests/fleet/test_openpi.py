@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
+import random
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -18,7 +21,8 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.server.serving import LIMITS, listening
+from tests.hostile.mutate import damaged
+from tests.server.serving import LIMITS, handshake, listening, raw
 from tests.server.watching import figures, get
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli import main
@@ -216,6 +220,8 @@ def test_the_prompt_may_be_the_task_that_is_compiled_in_and_no_other(planned: Pa
         (packed({"obs": GOOD[:1]}), "ObservationError: observation 'obs' has the wrong shape"),
         (packed({"obs": GOOD.astype(np.float64)}), "has the wrong dtype: expected float32"),
         (packed({"obs": GOOD, "more": {"a": GOOD}}), "unexpected: ['more']"),
+        (packed({"obs": GOOD, "more": [[1], [1, 2]]}), "unexpected: ['more']"),
+        (packed({"obs": GOOD, 7: GOOD, b"x": None}), "unexpected: ['7', \"b'x'\"]"),
         (packed({}), "missing: ['obs']"),
         (packed({"obs": None}), "ProtocolError: observation 'obs'"),
         (packed({"obs": b"12345678"}), "ProtocolError: observation 'obs'"),
@@ -236,11 +242,13 @@ def test_the_prompt_may_be_the_task_that_is_compiled_in_and_no_other(planned: Pa
         (b"\x81\x91\x01\x01", "unhashable"),
         (b"\x81\xa1\xff\x01", "utf-8"),
         (b"\x91" * 3000, "StackError"),
+        (b"\xdc\x10\0" * 3000, "StackError"),
         (b"\x81\xa1a" * 1200, "StackError"),
         (b"\xdd\xff\xff\xff\xff", "max_array_len"),
         (b"\xdf\xff\xff\xff\xff", "max_map_len"),
         (b"\xc6\xff\xff\xff\xffab", "incomplete"),
         (packed({"obs": [{}] * 2000}), "at most 1024 maps and lists"),
+        (packed({"obs": raw_array(b"", "<f4", [0])}), "ObservationError: observation 'obs' has the wrong shape"),
         (packed({"obs": raw_array(b"", "|O", [0])}), "an array has dtype (bool"),
         (packed({"obs": raw_array(bytes(8), "object", [1])}), "an array has dtype (bool"),
         (packed({"obs": raw_array(bytes(8), "(1000000000,)f4", [2])}), "an array has dtype (bool"),
@@ -268,6 +276,24 @@ def test_what_is_wrong_is_told_at_once_and_the_connection_goes_on(url: str, mess
         assert time.monotonic() - start < 1
         for each in (other, connection):
             assert np.isfinite(actions(ask(each, packed({"obs": GOOD})))).all()
+
+
+def test_no_damaged_message_is_more_than_an_error_of_ours(planned: Path) -> None:
+    """Bits, lengths and parts of the maps that stand for arrays are changed at random."""
+    rng, artifact = random.Random(0), load_artifact(planned)
+    server, outcomes = OpenPiServer(artifact, ttscompile.load(planned, seed=0)), Counter[str]()
+    whole = packed({"obs": GOOD, "step": 3})
+    parts = (None, True, 2, -1, 2**64 - 1, 2.5, "2", b"12345678", [], [2], [-1], [True], [None], {}, [[2]], GOOD, "<f4")
+    for _ in range(1500):
+        array = as_map(GOOD)
+        for key in rng.sample(sorted(array), rng.randrange(3)):
+            array[key] = rng.choice(parts)
+        message = rng.choice((damaged(rng, whole), packed({"obs": array}), packed({"obs": rng.choice(parts)})))
+        reply = asyncio.run(server._reply(message))
+        assert isinstance(reply, bytes) or reply.startswith(("ProtocolError: ", "ObservationError: ")), (message, reply)
+        outcomes[str(type(reply))] += 1
+    server.end()
+    assert min(outcomes.values()) > 100
 
 
 def test_a_byte_of_a_bool_is_true_or_false(planned: Path) -> None:
@@ -313,6 +339,15 @@ def wait_until(there: Any) -> None:
             return
         time.sleep(0.005)
     raise AssertionError("it did not come")
+
+
+def test_who_does_not_answer_pings_is_found_long_before_the_idle_timeout(planned: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(OpenPiServer, "ping_interval", 0.02)
+    with serving(planned, None) as url, raw(url) as sock:
+        sock.sendall(handshake())
+        told = b""
+        while b"\x89\x04" not in told.rpartition(b"\r\n\r\n")[2]:  # the head of a ping
+            told += sock.recv(4096)
 
 
 def test_the_lock_takes_the_token_in_either_form(planned: Path) -> None:
