@@ -1,14 +1,10 @@
-"""The server of openpi's clients: what it answers, and what strangers may send it. The bytes are written by hand."""
+"""The server of openpi's clients: what it answers, and whom it lets in."""
 
 from __future__ import annotations
 
-import asyncio
-import importlib.util
-import random
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -21,7 +17,6 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.hostile.mutate import damaged
 from tests.server.serving import LIMITS, handshake, listening, raw
 from tests.server.watching import figures, get
 from ttscompile.artifact.load import Artifact, load_artifact
@@ -33,68 +28,26 @@ from ttscompile.runtimes.fleet import OpenPiServer
 from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.lock import Lock, hashed
 
-if any(importlib.util.find_spec(name) is None for name in ("websockets", "msgpack")):
-    pytest.skip("NO TESTS OF OPENPI: websockets or msgpack is not installed; see CONTRIBUTING", allow_module_level=True)
-
-import msgpack
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from .openpi_clients import (
+    GOOD,
+    ConnectionClosed,
+    InvalidStatus,
+    actions,
+    ask,
+    at_once,
+    client,
+    packed,
+    raw_array,
+    received,
+    serving,
+)
 
 TOKEN = "a-token-of-these-tests-alone"
-GOOD = np.array([1.0, 2.0], np.float32)
 WORDS = {
     "obs": ObservationSpec((2,)),
     "tokens": ObservationSpec((4,), dtype="int64", window=False),
     "mask": ObservationSpec((4,), dtype="bool", window=False),
 }
-
-
-def at_once(clients: int) -> ServerLimits:
-    return replace(LIMITS, clients=clients, idle_timeout=30.0)
-
-
-def as_map(array: Any) -> Any:
-    """As the published client writes numpy's arrays and scalars."""
-    if isinstance(array, np.ndarray):
-        return raw_array(array.tobytes(), array.dtype.str, array.shape)
-    return {b"__npgeneric__": True, b"data": array.item(), b"dtype": array.dtype.str}
-
-
-def raw_array(data: Any, dtype: Any, shape: Any) -> dict[bytes, Any]:
-    return {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape}
-
-
-def packed(obs: Any) -> bytes:
-    made: bytes = msgpack.packb(obs, default=as_map)
-    return made
-
-
-@contextmanager
-def client(url: str, key: str | None = None, form: str = "Api-Key") -> Iterator[ClientConnection]:
-    """A connection; the metadata is still to be received."""
-    headers = {"Authorization": f"{form} {key}"} if key else None
-    with connect(url, compression=None, max_size=None, additional_headers=headers, close_timeout=1) as connection:
-        yield connection
-
-
-def ask(connection: ClientConnection, message: bytes | str) -> Any:
-    """The answer; of an error its text."""
-    connection.send(message)
-    found = connection.recv(10)
-    return found if isinstance(found, str) else msgpack.unpackb(found)
-
-
-def actions(answer: Any) -> Any:
-    found = answer["actions"]
-    assert found[b"__ndarray__"] is True
-    return np.ndarray(found[b"shape"], found[b"dtype"], found[b"data"])
-
-
-@contextmanager
-def serving(planned: Path, limits: ServerLimits | None = LIMITS, lock: Lock | None = None) -> Iterator[str]:
-    artifact = load_artifact(planned)
-    with listening(lambda: OpenPiServer(artifact, ttscompile.load(planned, seed=5), limits, lock), lock) as url:
-        yield url
 
 
 class Checked:
@@ -132,16 +85,10 @@ def checking(planned: Path, limits: ServerLimits = LIMITS, **changes: Any) -> It
         yield url, policy
 
 
-@pytest.fixture(scope="module")
-def url(planned: Path) -> Iterator[str]:
-    with serving(planned, replace(LIMITS, message_bytes=1 << 16, idle_timeout=30.0)) as address:
-        yield address
-
-
 def test_the_client_is_told_what_the_policy_is_and_answered_as_by_the_policy(planned: Path) -> None:
     policy = ttscompile.load(planned, seed=5)
     with serving(planned, None) as url, client(url) as connection:
-        told = msgpack.unpackb(connection.recv(10))
+        told = received(connection)
         assert told["observation"] == {"obs": {"shape": [2], "dtype": "float32"}}
         assert (told["plan"], told["identity"], told["idle_timeout"]) == ("evenly", policy.info.identity, 3600)
         for _ in range(2):  # each an episode, with other noise
@@ -213,89 +160,6 @@ def test_the_prompt_may_be_the_task_that_is_compiled_in_and_no_other(planned: Pa
         assert "unexpected: ['task']" in ask(connection, packed({"obs": GOOD, "prompt": "place"}))
 
 
-@pytest.mark.parametrize(
-    ("message", "told"),
-    [
-        (packed({"obs": np.array([np.nan, 0], np.float32)}), "ObservationError: observation 'obs' must be finite"),
-        (packed({"obs": GOOD[:1]}), "ObservationError: observation 'obs' has the wrong shape"),
-        (packed({"obs": GOOD.astype(np.float64)}), "has the wrong dtype: expected float32"),
-        (packed({"obs": GOOD, "more": {"a": GOOD}}), "unexpected: ['more']"),
-        (packed({"obs": GOOD, "more": [[1], [1, 2]]}), "unexpected: ['more']"),
-        (packed({"obs": GOOD, 7: GOOD, b"x": None}), "unexpected: ['7', \"b'x'\"]"),
-        (packed({}), "missing: ['obs']"),
-        (packed({"obs": None}), "ProtocolError: observation 'obs'"),
-        (packed({"obs": b"12345678"}), "ProtocolError: observation 'obs'"),
-        (packed({"obs": "12"}), "ObservationError: observation 'obs' is a str"),
-        (packed({"obs": {"a": 1}}), "ProtocolError: observation 'obs'"),
-        (packed({"obs": [[1], [1, 2]]}), "ProtocolError: observation 'obs'"),
-        (packed({"obs": [GOOD, GOOD[:1]]}), "ProtocolError: observation 'obs'"),
-        (packed([1, 2]), "an observation is a map; found list"),
-        (packed(GOOD), "an observation is a map; found ndarray"),
-        ("{}", "binary message with msgpack in it; found a text"),
-        (b"", "incomplete"),
-        (packed({"obs": GOOD})[:-3], "incomplete"),
-        (packed({"obs": GOOD}) + b"\0", "extra data"),
-        (b"\xc1", "FormatError"),
-        (b"\x81\xa3obs\xd4\x01a", "max_ext_len"),
-        (b"\x81\xa3obs\xd6\xff\0\0\0\0", "max_ext_len"),
-        (b"\x81\xa3obs\xc7\0\x01", "ProtocolError: observation 'obs'"),
-        (b"\x81\x91\x01\x01", "unhashable"),
-        (b"\x81\xa1\xff\x01", "utf-8"),
-        (b"\x91" * 3000, "StackError"),
-        (b"\xdc\x10\0" * 3000, "StackError"),
-        (b"\x81\xa1a" * 1200, "StackError"),
-        (b"\xdd\xff\xff\xff\xff", "max_array_len"),
-        (b"\xdf\xff\xff\xff\xff", "max_map_len"),
-        (b"\xc6\xff\xff\xff\xffab", "incomplete"),
-        (packed({"obs": [{}] * 2000}), "at most 1024 maps and lists"),
-        (packed({"obs": raw_array(b"", "<f4", [0])}), "ObservationError: observation 'obs' has the wrong shape"),
-        (packed({"obs": raw_array(b"", "|O", [0])}), "an array has dtype (bool"),
-        (packed({"obs": raw_array(bytes(8), "object", [1])}), "an array has dtype (bool"),
-        (packed({"obs": raw_array(bytes(8), "(1000000000,)f4", [2])}), "an array has dtype (bool"),
-        (packed({"obs": raw_array(bytes(8), ">f4", [2])}), "an array has dtype (bool"),
-        (packed({"obs": raw_array(bytes(8), ["<f4"], [2])}), "an array has dtype (bool"),
-        (packed({"obs": raw_array(bytes(8), "<f4", [2**62])}), "data of that size"),
-        (packed({"obs": raw_array(bytes(8), "<f4", [2**31, 2**31])}), "data of that size"),
-        (packed({"obs": raw_array(bytes(8), "<f4", [2**64 - 1, 2])}), "data of that size"),
-        (packed({"obs": raw_array(bytes(8), "<f4", [1] * 100)}), "data of that size"),
-        (packed({"obs": raw_array(bytes(8), "<f4", [3])}), "data of that size"),
-        (packed({"obs": raw_array(bytes(7), "<f4", [2])}), "data of that size"),
-        (packed({"obs": raw_array("12345678", "<f4", [2])}), "data of that size"),
-        (packed({"obs": raw_array(bytes(8), "<f4", [2.0])}), "data of that size"),
-        (packed({"obs": raw_array(bytes(8), "<f4", "2")}), "data of that size"),
-        (packed({"obs": {b"__ndarray__": True}}), "KeyError(b'dtype')"),
-        (packed({"obs": {b"__npgeneric__": True, b"data": [1, {}], b"dtype": "<f4"}}), "ProtocolError: observation"),
-    ],
-)
-def test_what_is_wrong_is_told_at_once_and_the_connection_goes_on(url: str, message: bytes | str, told: str) -> None:
-    with client(url) as connection, client(url) as other:
-        for each in (connection, other):
-            each.recv(10)
-        start = time.monotonic()
-        assert told in ask(connection, message)
-        assert time.monotonic() - start < 1
-        for each in (other, connection):
-            assert np.isfinite(actions(ask(each, packed({"obs": GOOD})))).all()
-
-
-def test_no_damaged_message_is_more_than_an_error_of_ours(planned: Path) -> None:
-    """Bits, lengths and parts of the maps that stand for arrays are changed at random."""
-    rng, artifact = random.Random(0), load_artifact(planned)
-    server, outcomes = OpenPiServer(artifact, ttscompile.load(planned, seed=0)), Counter[str]()
-    whole = packed({"obs": GOOD, "step": 3})
-    parts = (None, True, 2, -1, 2**64 - 1, 2.5, "2", b"12345678", [], [2], [-1], [True], [None], {}, [[2]], GOOD, "<f4")
-    for _ in range(1500):
-        array = as_map(GOOD)
-        for key in rng.sample(sorted(array), rng.randrange(3)):
-            array[key] = rng.choice(parts)
-        message = rng.choice((damaged(rng, whole), packed({"obs": array}), packed({"obs": rng.choice(parts)})))
-        reply = asyncio.run(server._reply(message))
-        assert isinstance(reply, bytes) or reply.startswith(("ProtocolError: ", "ObservationError: ")), (message, reply)
-        outcomes[str(type(reply))] += 1
-    server.end()
-    assert min(outcomes.values()) > 100
-
-
 def test_a_byte_of_a_bool_is_true_or_false(planned: Path) -> None:
     specs = {"open": ObservationSpec((3,), dtype="bool", window=False)}
     with checking(planned, observations=specs) as (url, policy), client(url) as connection:
@@ -329,7 +193,7 @@ def test_calls_are_made_one_by_one_and_a_client_that_vanishes_is_not_computed_fo
         wait_until(lambda: figures(get(url, "/metrics")[1])["ttscompile_waiting"] == 2)
         policy.may.set()
         for each in (clients[0], clients[2]):
-            assert "actions" in msgpack.unpackb(each.recv(10))
+            assert "actions" in received(each)
         assert [seen["obs"][0, 0] for seen in policy.seen] == [1.0, 3.0]
 
 
