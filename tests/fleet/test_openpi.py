@@ -141,7 +141,7 @@ def test_a_picture_of_bytes_is_refused_with_advice(planned: Path) -> None:
 
 
 def test_the_prompt_is_the_task_where_the_policy_has_a_tokenizer(planned: Path) -> None:
-    how = {"observations": WORDS, "instruction": Instruction("tokens", "mask", new_line=False)}
+    how: dict[str, Any] = {"observations": WORDS, "instruction": Instruction("tokens", "mask", new_line=False)}
     with checking(planned, **how) as (url, policy), client(url) as connection:
         connection.recv(10)
         refused = ask(connection, packed({"obs": GOOD, "prompt": "pick"}))

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,7 +99,25 @@ def test_no_damaged_message_is_more_than_an_error_of_ours(planned: Path) -> None
     rng, artifact = random.Random(0), load_artifact(planned)
     server, outcomes = OpenPiServer(artifact, ttscompile.load(planned, seed=0)), Counter[str]()
     whole = packed({"obs": GOOD, "step": 3})
-    parts = (None, True, 2, -1, 2**64 - 1, 2.5, "2", b"12345678", [], [2], [-1], [True], [None], {}, [[2]], GOOD, "<f4")
+    parts: tuple[Any, ...] = (
+        None,
+        True,
+        2,
+        -1,
+        2**64 - 1,
+        2.5,
+        "2",
+        b"12345678",
+        [],
+        [2],
+        [-1],
+        [True],
+        [None],
+        {},
+        [[2]],
+        GOOD,
+        "<f4",
+    )
     for _ in range(1500):
         array = as_map(GOOD)
         for key in rng.sample(sorted(array), rng.randrange(3)):
