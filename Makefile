@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo quick test lint types pytest test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot clean
+.PHONY: demo quick test lint types pytest test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot test-openpi clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -78,6 +78,14 @@ test-lerobot:
 		'lerobot[async,diffusion,multi-task-dit,pusht]==0.6.1' -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
 		hypothesis pytest pytest-benchmark
 	$(LEROBOT)/bin/python -m pytest tests/plugins tests/test_capture.py tests/frontends/test_lerobot.py tests/trajectories
+
+# The published client of openpi, which has numpy below 2 and so an environment of its own, against ttscompile serve --openpi.
+OPENPI := build/openpi-venv
+test-openpi: $(READY)
+	test -x $(OPENPI)/bin/python || $(PYTHON) -m venv $(OPENPI)
+	$(OPENPI)/bin/python -m pip install --quiet --disable-pip-version-check openpi-client==0.1.2 \
+		typing_extensions  # which it imports and does not ask for
+	$(BIN)/pytest tests/fleet/test_openpi_client.py
 
 # Python 3.11 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
 test-matrix: $(READY)

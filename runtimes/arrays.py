@@ -59,7 +59,7 @@ def read_observation(
         found = "{:.400} (missing: {:.400}, unexpected: {:.400})".format(*map(str, names))
         remedy = "Give exactly the keys that the policy was compiled for."
         if "task" in unexpected and any(specs[key].dtype == "int64" for key in missing):
-            remedy = "For a text in place of its tokens, load the policy with tokenizer=PATH."
+            remedy = "For a text in place of its tokens, load with tokenizer=PATH, or compile it in: convert --task."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)
     arrays = {}
@@ -110,7 +110,7 @@ def _image_remedy(array: Array, spec: ObservationSpec) -> str:
     if spec.image and array.dtype.kind in "iu":
         remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
     channels = spec.shape[-3] if spec.image and array.ndim > 3 else 0
-    if channels == array.shape[-1] and array.shape[-3] != channels:
+    if 0 < channels == array.shape[-1] and array.shape[-3] != channels:
         remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
     return remedy
 

@@ -84,4 +84,4 @@ def test_a_text_without_a_tokenizer_is_told_of() -> None:
     for specs, advised in (({"state": ObservationSpec((2,)), "tokens": tokens}, True), ({"state": tokens}, False)):
         with pytest.raises(ObservationError, match=r"unexpected: \['task'\]") as caught:
             read_observation({"state": np.zeros((1, 2), np.float32), "task": "push"}, specs)
-        assert ("load the policy with tokenizer=PATH" in str(caught.value)) == advised
+        assert ("load with tokenizer=PATH" in str(caught.value)) == advised

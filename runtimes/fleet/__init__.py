@@ -6,6 +6,7 @@ Whoever is outside of this package imports it from here.
 from __future__ import annotations
 
 from .copies import LOCAL, FleetSettings, ray_copies
+from .openpi import OpenPiServer
 from .server import FleetServer, Plans
 
-__all__ = ["LOCAL", "FleetServer", "FleetSettings", "Plans", "ray_copies"]
+__all__ = ["LOCAL", "FleetServer", "FleetSettings", "OpenPiServer", "Plans", "ray_copies"]

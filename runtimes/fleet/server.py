@@ -125,22 +125,24 @@ class FleetServer(Listener):
     async def do(self, request: Request) -> dict[str, Any]:
         """See ``Listener``."""
         if request.method == "info":
-            return {
-                "observation": {
-                    key: {"shape": list(one.shape), "dtype": one.dtype} for key, one in self._specs.items()
-                },
-                "plans": list(self._plans.names),
-                "default_plan": self._plans.default,
-                "identity": self._manifest.identity,
-                "max_message_bytes": self._limits.message_bytes,
-                "idle_timeout": self._limits.idle_timeout,
-            }
+            return {**self._facts(), "plans": list(self._plans.names), "default_plan": self._plans.default}
         plan = self._plans.known(request.params.get("plan") or self._plans.default)
         obs = await self.apart(request.large, self._checked, request.params["obs"])
         if self._waiting >= self._most:
             problem = f"{self._waiting} requests are under way, and that is how many may be"
             raise OverloadedError(f"{problem}. Ask again later, or let the fleet have more copies.")
         return {"action": (await self._ask(plan, obs)).tolist()}
+
+    def _facts(self) -> dict[str, Any]:
+        """What every client is told of the artifact and of the limits."""
+        chunk = self._manifest.spec.chunk
+        return {
+            "observation": {key: {"shape": list(one.shape), "dtype": one.dtype} for key, one in self._specs.items()},
+            "action": {"shape": [chunk.stop - chunk.start, chunk.action_dim], "dtype": "float32"},
+            "identity": self._manifest.identity,
+            "max_message_bytes": self._limits.message_bytes,
+            "idle_timeout": self._limits.idle_timeout,
+        }
 
     async def _ask(self, plan: str, obs: Mapping[str, Array]) -> Array:
         start, limit = time.monotonic(), self._limits.action_timeout

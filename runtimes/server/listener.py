@@ -14,7 +14,7 @@ import logging
 import socket
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import ExitStack
 from functools import partial
 from http import HTTPStatus
@@ -27,7 +27,7 @@ from .admission import Admission, AdmittingSocket, Pace
 from .limits import ServerLimits
 from .lock import Lock
 from .metrics import CONTENT_TYPE, Metric, exposition
-from .protocol import LARGE, Methods, Request, answer, failure, read_request
+from .protocol import LARGE, Message, Methods, Request, answer, read_request
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -53,6 +53,7 @@ class Listener(ABC):
     """
 
     methods: Methods
+    ping_interval: float | None = None  # without pings the idle timeout finds those that are gone: clients stay simple
 
     def __init__(self, limits: ServerLimits | None = None, lock: Lock | None = None) -> None:
         self._limits = limits or ServerLimits()
@@ -64,6 +65,18 @@ class Listener(ABC):
     @abstractmethod
     async def do(self, request: Request) -> dict[str, Any]:
         """The result of a request. Raises TtscompileError: told to the client that asked."""
+
+    def greeting(self) -> Message | None:
+        """What a client is sent first, before it asks anything; None for nothing."""
+        return None
+
+    def read(self, message: Message) -> Request:
+        """The request that a message is. Raises ProtocolError: it is none."""
+        return read_request(message, self.methods, self._limits.message_values)
+
+    def encode(self, request_id: int | str | None, outcome: Mapping[str, Any] | Exception) -> Message:
+        """The message that tells a client the result of its request, or what went wrong."""
+        return answer(request_id, outcome)
 
     @abstractmethod
     async def trouble(self) -> str:
@@ -104,6 +117,7 @@ class Listener(ABC):
             raise ExecutorError("cannot listen: host is empty. Give 127.0.0.1, or 0.0.0.0 for every address.")
         port = integer(port, "port", ExecutorError, 0, 65535)
         try:
+            self.greeting()  # may need a package, too
             from websockets.asyncio.server import serve
 
             from .connection import CountedConnection
@@ -127,7 +141,7 @@ class Listener(ABC):
                 process_response=self._answered,
                 open_timeout=limits.handshake_timeout,
                 close_timeout=limits.send_timeout,
-                ping_interval=None,  # clients stay simple; the idle timeout finds those that are gone
+                ping_interval=self.ping_interval,
                 max_size=limits.message_bytes,
                 max_queue=1,
                 create_connection=cast(Any, partial(CountedConnection, self._admission, limits)),
@@ -223,27 +237,29 @@ class Listener(ABC):
         loop, peer, own = asyncio.get_running_loop(), connection.remote_address, connection.local_address
         pace = Pace(self._limits.requests_per_second, loop.time())
         try:
+            reply = self.greeting()
             while True:
+                if reply is not None:
+                    try:
+                        async with asyncio.timeout(self._limits.send_timeout):
+                            await connection.send(reply)
+                    except TimeoutError:
+                        connection.transport.abort()
+                        return
                 try:
                     async with asyncio.timeout(self._limits.idle_timeout):
-                        text = await connection.recv()
+                        message = await connection.recv()
                 except TimeoutError:
                     await connection.close(1008, f"no complete request for {self._limits.idle_timeout:g} s")
                     return
                 self._admission.requested(peer, own)
                 if wait := pace.wait(loop.time()):
                     await asyncio.sleep(wait)
-                reply = await self._unless_gone(connection, self._reply(text))
-                try:
-                    async with asyncio.timeout(self._limits.send_timeout):
-                        await connection.send(reply)
-                except TimeoutError:
-                    connection.transport.abort()
-                    return
+                reply = await self._unless_gone(connection, self._reply(message))
         except ConnectionClosed:
             return
 
-    async def _unless_gone(self, connection: ServerConnection, reply: Coroutine[Any, Any, str]) -> str:
+    async def _unless_gone(self, connection: ServerConnection, reply: Coroutine[Any, Any, Message]) -> Message:
         """The reply; raises ``ConnectionClosed`` as soon as nobody waits for it any more."""
         replying = asyncio.ensure_future(reply)
         gone = asyncio.ensure_future(connection.wait_closed())
@@ -256,19 +272,18 @@ class Listener(ABC):
         finally:
             gone.cancel()
 
-    async def _reply(self, text: str | bytes) -> str:
+    async def _reply(self, message: Message) -> Message:
         request_id, method, outcome = None, "unknown", "ok"
         try:
-            large = len(text) > LARGE
-            request = await self.apart(large, read_request, text, self.methods, self._limits.message_values)
+            request = await self.apart(len(message) > LARGE, self.read, message)
             request_id, method = request.id, request.method
-            return answer(request_id, await self.do(request))
+            return self.encode(request_id, await self.do(request))
         except TtscompileError as error:
             outcome = type(error).__name__
-            return failure(getattr(error, "request_id", request_id), error)
+            return self.encode(getattr(error, "request_id", request_id), error)
         except Exception as error:
             outcome = "defect"
             self._log.exception("a request failed for a reason of the server's own")
-            return failure(request_id, error)
+            return self.encode(request_id, error)
         finally:
             self._answers[method, outcome] += 1

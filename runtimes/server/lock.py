@@ -20,7 +20,7 @@ MOST_BYTES = 4096
 TOKEN = re.compile(r"[A-Za-z0-9\-._~+/]+=*")
 """What may stand after ``Bearer`` (RFC 6750)."""
 _MAKE = "openssl rand -base64 33"
-_BEARER = re.compile(r"bearer +(\S+) *", re.IGNORECASE)
+_GIVEN = re.compile(r"(?:bearer|api-key) +(\S+) *", re.IGNORECASE)  # the latter is openpi's
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Lock:
         """
         if self.token_hash is None:
             return True
-        found = _BEARER.fullmatch(authorization or "")
+        found = _GIVEN.fullmatch(authorization or "")
         given = hashlib.sha256((found[1] if found else "").encode(errors="replace")).digest()
         return hmac.compare_digest(given, self.token_hash)
 

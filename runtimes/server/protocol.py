@@ -13,6 +13,7 @@ from ttscompile.core.untrusted_json import MAX_VALUES, most_values
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import Array, FrameSpec
 
+Message = str | bytes
 Methods = Mapping[str, frozenset[str]]
 """Method -> the parameters that it may have."""
 
@@ -145,14 +146,11 @@ def _packed(key: str, value: dict[str, Any]) -> Array:
         raise ProtocolError(f"observation {key[:40]!r} must be {expected}: {str(error)[:200]}.") from error
 
 
-def answer(request_id: int | str | None, result: Mapping[str, Any]) -> str:
-    """The text of an answer."""
-    return json.dumps({"id": request_id, "result": result}, allow_nan=False)
-
-
-def failure(request_id: int | str | None, error: Exception) -> str:
-    """The text of an answer that says what went wrong."""
-    return json.dumps({"id": request_id, "error": {"type": type(error).__name__, "message": str(error)}})
+def answer(request_id: int | str | None, outcome: Mapping[str, Any] | Exception) -> str:
+    """The text of an answer: a result, or what went wrong."""
+    if isinstance(outcome, Exception):
+        return json.dumps({"id": request_id, "error": {"type": type(outcome).__name__, "message": str(outcome)}})
+    return json.dumps({"id": request_id, "result": outcome}, allow_nan=False)
 
 
 def _no_number(name: str) -> float:

@@ -36,10 +36,10 @@ ray_needed = pytest.mark.skipif(
         (("--plan", "memory"), "another robot's"),
         (("--plan", "nothing"), "expected one of ['dense', 'evenly']"),
         (("--copies", "0"), "0 is not in the range"),
-        (("--control-hz", "10"), "give --control-hz HZ to drive one robot, or --copies N to answer many"),
+        (("--control-hz", "10"), "give --control-hz HZ to drive one robot, or --copies N or --openpi to answer many"),
         (("--margin-ticks", "0"), "--margin-ticks is for --control-hz: give it too"),
-        (("--device", "cpu"), "--device is for --control-hz: give it too"),
-        (("--plan", "dense", "--plan", "evenly"), "--copies takes one --plan"),
+        (("--device", "cpu"), "--device is for --control-hz or --openpi: give one of them too"),
+        (("--plan", "dense", "--plan", "evenly"), "--copies and --openpi take one --plan"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_starts(

@@ -221,6 +221,7 @@ def with_value(value: float) -> np.ndarray:
         (OBS, r"a ndarray; expected a dictionary with the keys \['obs'\]"),
         ({"obs": OBS[0]}, r"'obs' has the wrong shape: expected float32 \[B, 2\]; found float32 \[2\].*obs\[None\]"),
         ({"obs": OBS[:, :1]}, r"wrong shape: expected float32 \[B, 2\]; found float32 \[2, 1\]"),
+        ({"obs": OBS[:, :0]}, r"wrong shape: .*found float32 \[2, 0\]"),
         ({"obs": OBS[:0]}, r"wrong shape: .*found float32 \[0, 2\]"),
         ({"obs": OBS.astype(np.float64)}, r"wrong dtype: expected float32 .*found float64 .*astype\(np.float32\)"),
         ({"obs": OBS.astype(np.int32)}, "wrong dtype"),

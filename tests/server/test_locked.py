@@ -328,8 +328,7 @@ def test_the_client_sends_no_token_in_the_clear() -> None:
 
 @pytest.fixture
 def command(toy_compiled: Path) -> list[str]:
-    words = ["serve", str(toy_compiled), "--control-hz", "10", "--port", "0", "--margin-ticks", "0"]
-    return [*words, "--max-hold", "1000"]
+    return ["serve", str(toy_compiled), "--control-hz", "10", "--port", "0", "--margin-ticks", "0"]
 
 
 @pytest.mark.parametrize(

@@ -355,7 +355,7 @@ def test_the_server_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_serves_the_example_client_until_it_is_interrupted(toy_compiled: Path) -> None:
     code = "from ttscompile.cli import main; main()"
     command = [sys.executable, "-P", "-c", code, "serve", str(toy_compiled), "--control-hz", "10", "--port", "0"]
-    command += ["--max-hold", "1000", "--margin-ticks", "0"]
+    command += ["--margin-ticks", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None

@@ -26,7 +26,8 @@ from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.server_options import FLEET_CLIENTS, ROBOT_CLIENTS, SERVER_OPTIONS, ServerOptions, server_options
 from ttscompile.cli.types import ANY_TEXT, RATE, TEXT, Number
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, Plans, ray_copies
+from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, OpenPiServer, Plans, ray_copies
+from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.server.executor_server import ExecutorServer
 from ttscompile.runtimes.server.limits import ServerLimits
 
@@ -34,7 +35,8 @@ BATCHES_WAITING = 16
 """Requests of a fleet that may be under way, in full batches of every copy; further ones are refused at once."""
 
 SECTIONS = (
-    Section("One robot", (*LOOP_OPTIONS, "max_hold", "runtime", "device"), ("control_hz",)),
+    Section("One robot", LOOP_OPTIONS, ("control_hz",)),
+    Section("The policy in this process", ("runtime", "device"), ("control_hz", "openpi")),
     Section("Many robots", ("ray", "wait_ms"), ("copies",)),
     Section("Who may connect", SERVER_OPTIONS),
 )
@@ -46,6 +48,7 @@ SECTIONS = (
 @count_option(
     "--copies", "Answer many robots, with so many copies of the policy, which run on Ray.", default=None, most=4096
 )
+@click.option("--openpi", is_flag=True, help="Answer clients of openpi, in openpi's protocol.")
 @click.option(
     "--plan",
     "plans",
@@ -53,13 +56,10 @@ SECTIONS = (
     multiple=True,
     help="Run this plan. Without this option it is the default plan. With --control-hz it may be repeated, from the"
     " slowest plan to the fastest: a faster one is run when calls are late. With --copies it is the plan of requests"
-    " that name none.",
+    " that name none, with --openpi that of all.",
 )
 @threads_option("Threads that the policy, or each copy of it, computes with.")
 @loop_options
-@count_option(
-    "--max-hold", "Repeat the last action for so many control ticks when there is no other.", default=3, least=0
-)
 @runtime_options
 @click.option(
     "--ray",
@@ -80,6 +80,7 @@ def serve(
     directory: Path,
     control_hz: float | None,
     copies: int | None,
+    openpi: bool,
     plans: tuple[str, ...],
     threads: int,
     runtime: str,
@@ -91,19 +92,21 @@ def serve(
     """Serve the artifact DIRECTORY on a WebSocket until it is interrupted.
 
     With --control-hz it drives one robot, in a control loop; docs/serve.md has the protocol. With --copies it answers
-    many robots, each request by itself; docs/howto/fleet.md has that protocol. The first line on standard output is a
-    JSON object with the url and the artifact's identity. Standard error gets a line for each connection.
+    many robots, each request by itself; docs/howto/fleet.md has that protocol. With --openpi it answers clients of
+    openpi. The first line on standard output is a JSON object with url and identity; standard error gets the audit.
     """
-    if (control_hz is None) == (copies is None):
-        raise click.UsageError("give --control-hz HZ to drive one robot, or --copies N to answer many.")
+    if (control_hz is not None) + (copies is not None) + openpi != 1:
+        raise click.UsageError("give --control-hz HZ to drive one robot, or --copies N or --openpi to answer many.")
+    if len(plans) > 1 and control_hz is None:
+        raise click.UsageError("--copies and --openpi take one --plan.")
     server = ServerOptions.taken(options, progress())
     with server.audited():
+        how = {"runtime": runtime, "threads": threads, "device": device}
         if control_hz is not None:
-            policy = {"runtime": runtime, "threads": threads, "device": device}
-            _serve_robot(directory, server, control_hz, ExecutorSettings(tiers=plans or None, **options), policy)
-        elif copies is not None:
-            if len(plans) > 1:
-                raise click.UsageError("--copies takes one --plan, that of requests that name none.")
+            _serve_robot(directory, server, control_hz, ExecutorSettings(tiers=plans or None, **options), how)
+        elif copies is None:
+            _serve_openpi(directory, server, how, *plans)
+        else:
             _serve_fleet(directory, server, ray, FleetSettings(copies, threads, wait_ms=wait_ms), *plans)
 
 
@@ -120,6 +123,15 @@ def _serve_robot(
         limits = ServerLimits.of(policy.info.observation, ROBOT_CLIENTS)
         asyncio.run(server.serve(ExecutorServer(executor, limits, server.lock), policy.info.identity))
     click.echo(json.dumps({"statistics": executor.statistics().to_json()}, allow_nan=False))
+
+
+def _serve_openpi(directory: Path, server: ServerOptions, how: dict[str, Any], plan: str | None = None) -> None:
+    """To clients of openpi, with a policy that is loaded so."""
+    console, artifact = progress(), load_artifact(directory)
+    with console.status("loading"):
+        openpi = OpenPiServer(artifact, open_policy(artifact, plan=plan, **how), lock=server.lock)
+    server.warn(console)
+    asyncio.run(server.serve(openpi, artifact.manifest.identity))
 
 
 def _serve_fleet(
