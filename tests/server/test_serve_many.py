@@ -56,13 +56,17 @@ def test_memory_files_and_threads_stay_as_they_were() -> None:
         try:
             talk_often(url, 20, 10)
             files, threads = opened()
-            bytes_before = python_bytes()
-            count = talk_often(url, 30, 25)
-            assert most(files, threads), f"{opened()} files and threads are open, and {files, threads} were before"
-            bytes_after = python_bytes()
+            grown = []
+            for _ in range(3):  # what leaks does so every time; what is imported or kept once does not
+                bytes_before = python_bytes()
+                count = talk_often(url, 30, 25)
+                assert most(files, threads), f"{opened()} files and threads are open, and {files, threads} were before"
+                grown.append((python_bytes() - bytes_before) / count)
+                if grown[-1] < MOST_BYTES_EACH:
+                    break
         finally:
             tracemalloc.stop()
-    assert bytes_after - bytes_before < MOST_BYTES_EACH * count
+    assert min(grown) < MOST_BYTES_EACH
 
 
 @pytest.mark.soak

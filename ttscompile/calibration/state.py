@@ -39,8 +39,10 @@ class StateFile:
         progress: how far the work is, as JSON.
     """
 
+    WORK, AGAIN = "calibration", "Calibrate"
+
     def __init__(self, directory: Path | None, settings: Mapping[str, Any]) -> None:
-        self._path = None if directory is None else directory / FILE
+        self._path = None if directory is None else directory / f"{self.WORK}-state.safetensors"
         self._settings = json.dumps(settings, sort_keys=True)
         self.arrays: dict[str, Array] = {}
         self.progress: dict[str, Any] = {}
@@ -65,7 +67,7 @@ class StateFile:
             _check_progress(Value(progress, _PROGRESS))
         except (ArtifactError, ValueError) as error:
             raise CalibrationError(
-                f"{self._path}: cannot be read ({error}). Calibrate again without --resume: that begins anew."
+                f"{self._path}: cannot be read ({error}). {self.AGAIN} again without --resume: that begins anew."
             ) from error
         asked = json.loads(self._settings)
         if settings != asked:
@@ -73,7 +75,7 @@ class StateFile:
             differing = {key: (settings.get(key), asked.get(key)) for key in keys}
             told = "; ".join(f"{key} was {was}, now {now}" for key, (was, now) in differing.items())
             raise CalibrationError(
-                f"{self._path}: the calibration that was interrupted had other settings: {told}. Give the same ones to"
+                f"{self._path}: the {self.WORK} that was interrupted had other settings: {told}. Give the same ones to"
                 " resume it, or leave --resume out to begin anew."
             )
         self.arrays, self.progress = arrays, progress
@@ -90,7 +92,7 @@ class StateFile:
         try:
             replace_file(self._path, tensors.serialize(arrays))
         except OSError as error:
-            raise CalibrationError(f"{self._path}: the state of the calibration cannot be written: {error}.") from error
+            raise CalibrationError(f"{self._path}: the state of the {self.WORK} cannot be written: {error}.") from error
 
     def remove(self) -> None:
         """Forget everything. Raises CalibrationError: the directory cannot be written."""
@@ -115,7 +117,7 @@ class StateFile:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:
             raise CalibrationError(
-                f"{self._path}: does not fit this calibration ({str(error)[:200]}). Calibrate again without"
+                f"{self._path}: does not fit this {self.WORK} ({str(error)[:200]}). {self.AGAIN} again without"
                 " --resume: that begins anew."
             ) from error
 
