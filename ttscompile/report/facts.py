@@ -254,7 +254,7 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
         where, lost = "within a quarter", "they lost at most 10.5"
     told = f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes"
     page = "docs/evidence/results.md, 'What a distance means'"
-    return (f"{told}. Where such plans were driven {lost} points of success ({page}).",)
+    return (f"{told}. Where such plans were driven, {lost} points of success ({page}).",)
 
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
