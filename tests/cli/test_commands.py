@@ -108,7 +108,7 @@ def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
 
 def test_inspect_tells_the_same_in_tables(scheduled: Path) -> None:
     text = run("inspect", scheduled).stdout
-    for expected in ("K = 100", "self_attention", "cross_attention", "feed_forward", "uniform (default)", "95.0%"):
+    for expected in ("100 steps", "self_attention", "cross_attention", "feed_forward", "uniform (default)", "95.0%"):
         assert expected in text
 
 

@@ -29,7 +29,7 @@ def test_inspect_tells_what_is_computed_once_a_frame(seeing: Path, toy_compiled:
     assert sorted(piece["rows"] for piece in made["frames"]) == [1, 4]
     frames = sum(piece["rows"] * piece["flops"] for piece in made["frames"])
     assert 0.9 * made["flops"]["prologue"] < frames < made["flops"]["prologue"]
-    assert "computed once a frame, 4 a call" in run("inspect", seeing)
+    assert "of 5 frames" in run("inspect", seeing)
     assert json.loads(run("inspect", toy_compiled, "--json"))["frames"] == []
     assert "once a frame" not in run("inspect", toy_compiled)
 

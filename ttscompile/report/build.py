@@ -69,7 +69,7 @@ def build(
     sections = (
         *[frontier] * bool(chosen),
         facts.provenance(artifact),
-        facts.policy(manifest),
+        facts.policy(artifact),
         facts.hoisting(artifact),
         facts.blocks(manifest),
         _plans(artifact, course),

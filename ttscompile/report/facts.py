@@ -11,9 +11,10 @@ from ..artifact.ceiling import BOUND, FARTHEST, few_steps
 from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
+from ..core.envelope import FAR
 from ..core.lattice import dense_plan
 from ..core.plan import DENSE
-from ..core.spec import SamplerTable
+from ..core.spec import ObservationSpec, SamplerTable
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
 from ..measure.units import flops, ms, plain, share
@@ -40,28 +41,37 @@ def provenance(artifact: Artifact) -> Section:
     return Section("Identity", (f"{text} one computes the same.",), (Table(("", ""), rows, prose=True),))
 
 
-def policy(manifest: Manifest) -> Section:
-    """What goes in, what comes out, and the loop between."""
-    spec = manifest.spec
-    chunk = spec.chunk
-    horizon, channels = spec.sample
+def policy(artifact: Artifact) -> Section:
+    """What goes in, what comes out, the loops between, and what is kept for them."""
+    manifest, envelope = artifact.manifest, artifact.envelope
+    spec, needs = manifest.spec, rollout_needs(view_of(artifact))
+    (horizon, channels), chunk = spec.sample, spec.chunk
+    action = f"{chunk.action_dim} numbers, {horizon} steps predicted, {chunk.start}..{chunk.stop - 1} executed"
+    action += f"; {spec.left_out} more are left out" * bool(spec.left_out)
+    action += f"; the sample has {channels} channels" * (channels != chunk.action_dim)
+    kept = (
+        f"{needs.read} of {needs.cells} residuals a stream, {needs.bytes_read / 1e6:.1f} MB, for its plans;"
+        f" {needs.bytes_most / 1e6:.1f} MB for plans that you give"
+    )
     rows = [
-        (
-            f"observation {key!r}",
-            f"{one.dtype}{list(one.shape)} a stream, {'as it is' if one.normalizer is None else 'normalised inside'}",
-        )
-        for key, one in spec.observations.items()
-    ]
-    rows += [
-        ("action", f"{chunk.action_dim} numbers, {horizon} steps predicted, {chunk.start}..{chunk.stop - 1} executed"),
-        ("sample", f"[{horizon}, {channels}]"),
+        *((f"observation {key!r}", _observation(one)) for key, one in spec.observations.items()),
+        ("action", action),
         *((f"loop {name!r}", told_sampler(table)) for name, table in spec.all_loops.items()),
         *starts(manifest),
         ("precision", precision(manifest)),
         *tokens(manifest),
-        ("default plan", manifest.default_plan),
+        ("rollout cache", kept),
     ]
+    if envelope is not None:
+        far = f"beyond {FAR:g} times the furthest call there is no correction"
+        rows.append(("envelope", f"{len(envelope.center)} components of what was recorded; {far}"))
+    rows.append(("default plan", manifest.default_plan))
     return Section("Policy", (), (Table(("", ""), tuple(rows), prose=True),))
+
+
+def _observation(one: ObservationSpec) -> str:
+    inside = "as it is" if one.normalizer is None else "normalised inside"
+    return f"{one.dtype}{list(one.shape)} a stream, {inside}" + ", from pictures of any size" * (one.fit is not None)
 
 
 def starts(manifest: Manifest) -> list[tuple[str, str]]:

@@ -22,7 +22,8 @@ class Table:
     def text(self) -> tuple[bool, ...]:
         """Which columns hold words."""
         columns = [[row[i] for row in self.rows if row[i]] for i in range(len(self.head))]
-        return tuple(i == 0 or self.prose or any(not c[0].isdigit() for c in cells) for i, cells in enumerate(columns))
+        words = [any(not cell[0].isdigit() or cell.count(" ") > 1 for cell in cells) for cells in columns]
+        return tuple(i == 0 or self.prose or of_words for i, of_words in enumerate(words))
 
 
 @dataclass(frozen=True)
