@@ -8,7 +8,7 @@ import pytest
 
 from ttscompile import SamplerTable
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.ceiling import few_steps, many_steps, usual_sparsity
+from ttscompile.artifact.ceiling import few_steps, usual_sparsity
 from ttscompile.artifact.manifest import FlopsRecord, Manifest
 from ttscompile.core.lattice import dense_plan
 
@@ -49,14 +49,3 @@ def test_few_steps_are_warned_about(written: Path, flops: FlopsRecord) -> None:
     assert "1/7 of the FLOPs" in told
     assert few_steps(with_steps(manifest, flops, 19)) is not None
     assert few_steps(with_steps(manifest, flops, 20)) is None
-
-
-def test_a_long_loop_is_told_of_a_solver_with_fewer_steps(written: Path, flops: FlopsRecord) -> None:
-    manifest = load_artifact(written).manifest
-    told = many_steps(with_steps(manifest, flops, 100))
-    assert told is not None
-    assert "ddim with K = 100 steps" in told
-    assert many_steps(with_steps(manifest, flops, 31)) is None
-    solver = with_steps(manifest, flops, 100)
-    sampler = replace(solver.spec.sampler, name="euler")
-    assert many_steps(replace(solver, spec=replace(solver.spec, sampler=sampler))) is None

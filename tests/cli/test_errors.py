@@ -68,7 +68,7 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["bench", "out", "--runtime", ""], "--runtime: nothing was given"),
         (["predict", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
         (["serve", "out"], "give --control-hz HZ to drive one robot, or --copies N or --openpi to answer many"),
-        (["serve", "out", "--control-hz", "10", "--wait-ms", "1"], "--wait-ms is for --copies: give it too"),
+        (["serve", "out", "--control-hz", "10", "--ray", "local"], "--ray is for --copies: give it too"),
         (["inspect", "out", "-o", "page.pdf"], "ends in .html"),
         (["inspect", "out", "--verify"], "--verify is for --output: give it too"),
         (["inspect", "out", "-t", "calls.npz"], "--trajectories is for --output or --plot: give one of them too"),

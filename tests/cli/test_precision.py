@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,12 @@ from click.testing import CliRunner
 import ttscompile
 from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_plans
 from ttscompile.cli import main
+from ttscompile.cli.choosing import choosable, choose_again
 from ttscompile.cli.contestants import Way, contestants
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.report.timing import Measurement
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.verification.precision import EIGHT_BITS
 
@@ -48,7 +54,7 @@ def test_convert_and_inspect_say_the_precision(converted: tuple[Path, dict[str, 
     assert (record["parts"], record["asked"]) == (["blocks"], [])
     assert 0.85e6 < record["bytes"] < 1.0e6
     text = " ".join(run("inspect", directory).stdout.split())
-    assert "int8 weights in 3 of 3 blocks" in text
+    assert "precision int8 in blocks" in text
 
 
 @pytest.mark.slow
@@ -105,3 +111,26 @@ def test_bench_times_the_dense_plan_in_fp32_and_names_the_precision(converted: t
     np.testing.assert_array_equal(answers[0], expected[0])
     assert not np.array_equal(answers[1], expected[0])
     np.testing.assert_array_equal(answers[2], expected[1])
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_faster_in_fp32_gets_the_default_in_fp32(
+    converted: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    directory = shutil.copytree(converted[0], tmp_path / "compiled")
+    full = load_artifact(directory).plans["full"]
+    plan = replace(full, cells=uniform_plan(STEPS, 3, 2))
+    score = {"distance": 0.05, "interval": [0.0, 0.06], "sparsity": 0.5, "flops_saved": 0.5}
+    update_plans(directory, {"full": full, "schedule": plan}, "schedule", {"plans": {"schedule": score}})
+    artifact = load_artifact(directory)
+    assert list(choosable(artifact)) == ["schedule", "schedule@fp32"]
+    times = [Measurement(name, name, (took,)) for name, took in (("schedule", 3.0), ("schedule@fp32", 1.0))]
+    told = choose_again(directory, artifact, times, None, 1)
+    assert told == "The default is 'schedule', in fp32. schedule 3 ms, schedule@fp32 1 ms."
+    after = load_artifact(directory)
+    assert (after.manifest.default_plan, dict(after.default.precision)) == ("schedule", {})
+    assert after.manifest.identity != artifact.manifest.identity
+    obs, noise = random_calls(after.manifest.spec, 1, 0)[0]
+    found = ttscompile.load(directory).predict_action(obs, noise=noise)["action"]
+    before = ttscompile.load(converted[0]).predict_action(obs, noise=noise, plan=replace(plan, precision={}))["action"]
+    np.testing.assert_array_equal(found, before)

@@ -262,7 +262,7 @@ def test_a_plan_that_reads_the_call_before_is_refused(planned: Path) -> None:
         (("--copies", "1"), "or --copies N or --openpi to answer many"),
         (("--plan", "dense", "--plan", "evenly"), "take one --plan"),
         (("--policy-hz", "10"), "--policy-hz is for --control-hz: give it too"),
-        (("--wait-ms", "1"), "--wait-ms is for --copies: give it too"),
+        (("--ray", "local"), "--ray is for --copies: give it too"),
     ],
 )
 def test_what_cannot_be_is_one_error(planned: Path, options: tuple[str, ...], message: str) -> None:

@@ -1,4 +1,4 @@
-"""How far a plan may go: from the original, and with a number of denoising steps; and when fewer of them are better."""
+"""How far a plan may go: from the original, and with a number of denoising steps."""
 
 from __future__ import annotations
 
@@ -24,9 +24,6 @@ NOTHING = (
 )
 """Said of a policy of one step."""
 
-SOLVER_STEPS = 16
-"""Of DPM-Solver++, as suggested in place of many steps."""
-
 
 def usual_sparsity(steps: int) -> float:
     """Share of the cells of K steps to reuse where no budget is given."""
@@ -50,19 +47,3 @@ def uncalibrated(manifest: Manifest) -> str:
     """What it means that an artifact is not calibrated."""
     dense = "Not calibrated: every call is dense. Run 'ttscompile calibrate' to give it a plan."
     return NOTHING if manifest.steps == 1 else dense
-
-
-def many_steps(manifest: Manifest) -> str | None:
-    """A hint where a solver of higher order takes fewer steps for as good actions; None where there is none.
-
-    On Push-T five of the 16 steps of DPM-Solver++ are a little faster than five of the 100 of DDPM, and score no less
-    (`docs/decisions.md`).
-    """
-    sampler = manifest.spec.sampler
-    if sampler.name not in ("ddpm", "ddim") or sampler.steps < 2 * SOLVER_STEPS:
-        return None
-    return (
-        f"{sampler.name} with K = {sampler.steps} steps. '--sampler dpmsolver++ --steps {SOLVER_STEPS}' needs no"
-        " training, and reuse comes on top: faster at an equal score where we measured it (docs/howto/sampler.md)."
-        " Convert both, and compare them on your task."
-    )

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.plan import DENSE, FULL, Plan
 from ..errors import CalibrationFailedError
-from ..measure.points import Point, efficient
+from ..measure.points import ALIKE, Point, efficient, fastest
 from ..measure.timer import Times
 from .judge import Score, judge, timed
 from .kept import Kept
@@ -16,10 +16,6 @@ from .proposer import SAFER, Request, near
 from .proposers.loops import too_far
 from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
-
-ALIKE = 1.1
-"""Plans that take at most so many times as long as the fastest count as equally fast: the nearest of them is chosen.
-Where little is left to compute, a further step costs less than timing is off, and makes a plan much nearer."""
 
 
 @dataclass(frozen=True)
@@ -125,9 +121,10 @@ def _chosen(
         name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
         raise CalibrationFailedError(too_far(name, scores[name], request.farthest))
     if request.deadline_ms is None:
-        most = ALIKE * min((times[name].median for name in close), default=float("inf"))
-        alike = [name for name in close or allowed if times[name].median <= most]
-        return min(alike, key=lambda name: scores[name].distance)
+        distances = {name: score.distance for name, score in scores.items()}
+        if close:
+            return fastest({name: times[name].median for name in close}, distances)
+        return min(allowed, key=distances.__getitem__)
     in_time = [name for name in allowed if max(times[name].ms) <= request.deadline_ms]
     if not in_time:
         name = min(allowed, key=lambda name: max(times[name].ms))

@@ -12,6 +12,7 @@ import numpy as np
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.bench_report import BenchReport, PrecisionError
+from ttscompile.cli.choosing import choosable, choose_again
 from ttscompile.cli.comparison import compare, draw_comparison
 from ttscompile.cli.contestants import Way, contestants, originals
 from ttscompile.cli.loop import Loop
@@ -26,7 +27,7 @@ from ttscompile.cli.options import (
     number_option,
     several_threads_option,
 )
-from ttscompile.cli.output import print_identity, print_json, progress, results, say
+from ttscompile.cli.output import print_identity, print_json, progress, results, say, warn_if_busy
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
@@ -99,6 +100,13 @@ SECTIONS = (
 @trajectories_options(
     required=False, what="Hold the actions of the plans against those of the dense policy on these recorded episodes."
 )
+@click.option(
+    "--choose",
+    "chooses",
+    is_flag=True,
+    help="Make the plan the default that 'ttscompile build' would choose by these times, without calibrating again."
+    " With --control-hz it is the nearest plan that keeps up. The exit status is 1 if none does.",
+)
 @click.option("--plot", "picture", type=PICTURE, help="Draw error against latency into this file (.png, .svg or .pdf).")
 @click.pass_context
 def bench(
@@ -117,6 +125,7 @@ def bench(
     control_hz: float | None,
     trajectories: tuple[Path, ...],
     sources: Sources,
+    chooses: bool,
     picture: Path | None,
     **settings: Any,
 ) -> None:
@@ -125,14 +134,10 @@ def bench(
     The plans take turns on the same random observations. Every figure is of whole calls, for one robot at a time.
     Warm-up calls are not counted. With --control-hz and -t there is more to know about the same plans.
     """
-    if not runtime:
-        raise click.UsageError("--runtime: nothing was given.")
-    if len(threads) > 1 and "torch" in runtime:
-        raise click.UsageError("--runtime torch has one number of threads in a process: give --threads one number.")
-    artifacts = _artifacts(directory, others)
+    ways, artifacts = _ways(runtime, device, threads), _artifacts(directory, others)
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
-    ways = [_way(one, runtime, device, number) for one in runtime for number in threads]
+    plans = tuple(choosable(artifact)) if chooses and not plans else plans
     loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings))
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
@@ -141,6 +146,7 @@ def bench(
         if checkpoint is not None:
             entered = [*originals(checkpoint, encoders, threads[0], artifact), *entered]
     default = artifact.manifest.default_plan
+    warn_if_busy(console)
     if default == DENSE and artifact.manifest.steps > 1:
         say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
     with console.status("timing") as status:
@@ -148,18 +154,12 @@ def bench(
         status.update("judging")
         judged = None if loop is None else loop.judge(entered, measured)
         error = _precision_error(artifact, plans, ways[0])
-    how = {"runtime": ways[0].runtime, "device": ways[0].device, "threads": ways[0].threads}
-    record = artifact.manifest.calibration or {}  # of the same seed: the same episodes are held out
-    asked: dict[str, Any] = {
-        "observation": sources,
-        "plans": plans,
-        "calls": calls,
-        "seed": record.get("seed", 0),
-        **how,
-    }
+    asked = {"observation": sources, "plans": plans, "calls": calls, "seed": _seed(artifact), **vars(ways[0])}
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
+    limit = None if judged is None else judged.may_take_ms
+    chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
-    report = BenchReport(measured, default, calls, by_threads, error, judged, compared)
+    report = BenchReport(measured, default, calls, by_threads, error, judged, compared, chosen)
     identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
         of = {"identity": artifact.manifest.identity, "machine": fingerprint()}
@@ -173,7 +173,7 @@ def bench(
         say(output, *(f"{path}: identity {abbreviated(identity)}" for path, identity in identities.items()))
     if compared is not None and picture is not None:
         say(console, draw_comparison(compared, directory, picture))
-    if judged is not None and not judged.keeps_up:
+    if (judged is not None and not judged.keeps_up) or (chooses and chosen is None):
         context.exit(1)
 
 
@@ -206,9 +206,23 @@ def _precision_error(artifact: Artifact, plans: Sequence[str], way: Way) -> Prec
     return PrecisionError(found[0], COMPARED, *numbers)
 
 
-def _way(runtime: str, of: Sequence[str], device: str | None, threads: int) -> Way:
-    """The device is torch's where it is one of the runtimes."""
-    return Way(runtime, device, threads) if runtime == "torch" or "torch" not in of else Way(threads=threads)
+def _ways(runtimes: Sequence[str], device: str | None, threads: Sequence[int]) -> list[Way]:
+    """Each runtime with each number of threads; the device is torch's where it is one of the runtimes.
+
+    Raises:
+        click.UsageError: no runtime; or several numbers of threads for torch.
+    """
+    if not runtimes:
+        raise click.UsageError("--runtime: nothing was given.")
+    if len(threads) > 1 and "torch" in runtimes:
+        raise click.UsageError("--runtime torch has one number of threads in a process: give --threads one number.")
+    others = None if "torch" in runtimes else device
+    return [Way(one, device if one == "torch" else others, number) for one in runtimes for number in threads]
+
+
+def _seed(artifact: Artifact) -> int:
+    """Of its calibration: with the same seed the same episodes are held out."""
+    return int((artifact.manifest.calibration or {}).get("seed", 0))
 
 
 def _by_threads(entered: Sequence[Contestant], measured: Sequence[Measurement], plan: str) -> dict[int, float]:

@@ -52,6 +52,7 @@ class BenchReport:
         error: of dense calls in a precision that a runtime makes; None if no plan asks for one.
         loop: which plans keep up; None if that was not asked.
         compared: action errors; None without recordings.
+        chosen: which plan is the default now; None if that was not asked, or no plan is fast enough.
     """
 
     measured: Sequence[Measurement]
@@ -61,6 +62,7 @@ class BenchReport:
     error: PrecisionError | None
     loop: LoopReport | None
     compared: Comparison | None
+    chosen: str | None
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
@@ -72,6 +74,7 @@ class BenchReport:
             "precision_error": None if self.error is None else asdict(self.error),
             "loop": None if self.loop is None else self.loop.to_json(),
             "comparison": None if self.compared is None else self.compared.to_json(),
+            "chosen": self.chosen,
         }
 
     def print(self, output: Console) -> None:
@@ -91,3 +94,5 @@ class BenchReport:
             self.loop.print(output)
         if self.compared is not None:
             print_comparison(self.compared, output)
+        if self.chosen is not None:
+            say(output, self.chosen)

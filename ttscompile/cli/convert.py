@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import ttscompile
-from ttscompile.artifact.ceiling import few_steps, many_steps
+from ttscompile.artifact.ceiling import few_steps
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.options import count_option, json_option, lerobot_options
@@ -111,8 +111,6 @@ def convert(
             say(console, " ".join(["hint:", *stage["notes"]]))
         if stage["stage"] == "lower_precision":
             say(console, f"precision: {told_precision(artifact.manifest)}")
-    if of_checkpoint["sampler"] is None and (hint := many_steps(artifact.manifest)) is not None:
-        say(console, f"hint: {hint}")
     if as_json:
         print_json(document(artifact) | {"stages": stages})
     else:

@@ -28,6 +28,11 @@ class LoopReport:
         """Whether some plan does."""
         return any(one.feasible for one in self.judged.values())
 
+    @property
+    def may_take_ms(self) -> float:
+        """Milliseconds that the longest call may take, of whatever plan."""
+        return 1e3 * max(min(one.max_latency for one in self.judged.values()), 0.0)
+
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
         return {"control_hz": self.control_hz, "plans": {label: one.to_json() for label, one in self.judged.items()}}

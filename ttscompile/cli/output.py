@@ -19,6 +19,7 @@ from rich.table import Table
 from ttscompile.artifact.load import load_artifact, read_manifest, require_artifact_path
 from ttscompile.artifact.manifest import Manifest, abbreviated
 from ttscompile.errors import TtscompileError
+from ttscompile.measure.machine import busy
 
 _WIDTH = 110
 """Columns of a table that goes to a file or a pipe; a terminal's own width is used where there is one."""
@@ -81,6 +82,12 @@ def say(console: Console, *lines: str) -> None:
     """Write lines without breaking them where the console ends."""
     for line in lines:
         console.print(line, soft_wrap=True)
+
+
+def warn_if_busy(console: Console) -> None:
+    """Say so where other programs keep the machine busy: what is timed then says little."""
+    if (warning := busy()) is not None:
+        say(console, f"warning: {warning}")
 
 
 def table(*columns: str, rows: Iterable[Iterable[str]] = ()) -> Table:

@@ -24,7 +24,7 @@ from ttscompile.cli.options import (
 from ttscompile.cli.output import only_results_on_stdout, progress
 from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.server_options import FLEET_CLIENTS, ROBOT_CLIENTS, SERVER_OPTIONS, ServerOptions, server_options
-from ttscompile.cli.types import ANY_TEXT, RATE, TEXT, Number
+from ttscompile.cli.types import ANY_TEXT, RATE, TEXT
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, OpenPiServer, Plans, ray_copies
 from ttscompile.runtimes.load import open_policy
@@ -37,7 +37,7 @@ BATCHES_WAITING = 16
 SECTIONS = (
     Section("One robot", LOOP_OPTIONS, ("control_hz",)),
     Section("The policy in this process", ("runtime", "device"), ("control_hz", "openpi")),
-    Section("Many robots", ("ray", "wait_ms"), ("copies",)),
+    Section("Many robots", ("ray",), ("copies",)),
     Section("Who may connect", SERVER_OPTIONS),
 )
 
@@ -69,12 +69,6 @@ SECTIONS = (
     show_default=True,
     help="Run the copies on this Ray cluster, or on cores of this machine.",
 )
-@number_option(
-    "--wait-ms",
-    Number(0, 10_000),
-    "Let a request wait so many milliseconds for others of its plan, to be one call with them.",
-    default=5.0,
-)
 @server_options
 def serve(
     directory: Path,
@@ -86,7 +80,6 @@ def serve(
     runtime: str,
     device: str | None,
     ray: str,
-    wait_ms: float,
     **options: Any,
 ) -> None:
     """Serve the artifact DIRECTORY on a WebSocket until it is interrupted.
@@ -107,7 +100,7 @@ def serve(
         elif copies is None:
             _serve_openpi(directory, server, how, *plans)
         else:
-            _serve_fleet(directory, server, ray, FleetSettings(copies, threads, wait_ms=wait_ms), *plans)
+            _serve_fleet(directory, server, ray, FleetSettings(copies, threads), *plans)
 
 
 def _serve_robot(

@@ -39,6 +39,14 @@ def fingerprint() -> dict[str, Any]:
     }
 
 
+def busy() -> str | None:
+    """A warning where other programs keep the cores busy, so that times say little; None where they do not."""
+    machine = fingerprint()
+    load, cores = machine["load_average"], machine["cores"]
+    told = f"other programs keep this machine busy (load {load:g} on {cores} cores), so times say little"
+    return f"{told}. Measure again when they are done." if load > cores else None
+
+
 def memory_bytes(limit: Path | None = None) -> int:
     """What this machine has, or what its container may take of it, whichever is less."""
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,0 +1,138 @@
+"""``ttscompile bench --choose``: the default of another machine, without another calibration."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+import ttscompile
+from tests.plans import store_schedules
+from ttscompile.artifact.default_plan import choose_default
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.cli import main
+from ttscompile.cli.choosing import choosable, choose_again
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.errors import ArtifactError
+from ttscompile.measure.points import fastest
+from ttscompile.report.timing import Measurement
+
+PLANS = {"schedule": 0.08, "safe": 0.03, "fast": 0.2, "uniform": 0.01, "far": 0.4}
+"""How far each is from the original; ``far`` is beyond what is offered."""
+
+
+def score(distance: float, most: float | None = None) -> dict[str, Any]:
+    interval = [0.0, distance if most is None else most]
+    return {"distance": distance, "interval": interval, "sparsity": 0.6, "flops_saved": 0.6}
+
+
+@pytest.fixture
+def built(toy_compiled: Path, tmp_path: Path) -> Path:
+    return made(toy_compiled, tmp_path, {name: score(distance) for name, distance in PLANS.items()})
+
+
+def made(toy: Path, folder: Path, scores: Mapping[str, Any], **record: Any) -> Path:
+    directory = shutil.copytree(toy, folder / "built")
+    cells = {name: uniform_plan(5, 5, 1 + number % 4) for number, name in enumerate(scores)}
+    store_schedules(directory, None, cells, "schedule", {"strategy": "tts", "plans": scores, **record})
+    return directory
+
+
+def bench(directory: Path, *options: object) -> Result:
+    return CliRunner().invoke(main, ["bench", str(directory), "--calls", "2", "--choose", *map(str, options)])
+
+
+def timed(**milliseconds: float | tuple[float, ...]) -> list[Measurement]:
+    pairs = milliseconds.items()
+    return [Measurement(name, name, took if isinstance(took, tuple) else (took,)) for name, took in pairs]
+
+
+def again(directory: Path, measured: list[Measurement], deadline: float | None = None) -> tuple[str | None, Artifact]:
+    told = choose_again(directory, load_artifact(directory), measured, deadline, 1)
+    return told, load_artifact(directory)
+
+
+def test_the_fastest_that_is_near_or_the_nearest_of_those_that_are_as_fast() -> None:
+    distances = {"a": 0.09, "b": 0.05, "c": 0.01}
+    assert fastest({"a": 10.0, "b": 10.9, "c": 11.1}, distances) == "b"
+    assert fastest({"a": 10.0, "b": 11.1, "c": 11.2}, distances) == "a"
+
+
+def test_another_machine_has_another_default(built: Path) -> None:
+    told, after = again(built, timed(dense=9.0, schedule=4.0, safe=2.0, fast=1.0, uniform=0.1, far=0.2))
+    assert told == "The default was 'schedule', and is 'safe'. schedule 4 ms, safe 2 ms, fast 1 ms."
+    assert after.manifest.default_plan == "safe"
+    record = after.manifest.calibration
+    assert record is not None
+    assert record["default_plan"] == "safe"
+    assert record["chosen_on"].endswith("1 thread: schedule 4 ms, safe 2 ms, fast 1 ms")
+
+
+def test_the_same_times_choose_the_same(built: Path) -> None:
+    before = load_artifact(built).manifest
+    told, after = again(built, timed(schedule=1.0, safe=2.0, fast=0.5))
+    assert told is not None
+    assert told.startswith("The default is 'schedule'.")
+    assert (after.manifest.default_plan, after.manifest.identity) == ("schedule", before.identity)
+
+
+def test_with_a_deadline_it_is_the_nearest_whose_longest_call_keeps_it(built: Path) -> None:
+    times = timed(schedule=(2.0, 2.5), safe=(2.0, 3.5), fast=(1.0, 1.0))
+    assert again(built, times, 3.0)[1].manifest.default_plan == "schedule"
+    assert again(built, times, 4.0)[1].manifest.default_plan == "safe"
+    assert again(built, times, 2.0)[1].manifest.default_plan == "fast"
+
+
+def test_where_none_keeps_the_deadline_nothing_is_changed(built: Path) -> None:
+    before = (built / "manifest.json").read_bytes()
+    assert again(built, timed(schedule=2.0, safe=3.0, fast=1.0), 0.5)[0] is None
+    assert (built / "manifest.json").read_bytes() == before
+
+
+def test_the_deadline_of_the_build_holds(toy_compiled: Path, tmp_path: Path) -> None:
+    scores = {name: score(PLANS[name]) for name in ("schedule", "safe")}
+    directory = made(toy_compiled, tmp_path, scores, budget={"latency_ms": 3.0})
+    assert again(directory, timed(schedule=2.0, safe=4.0))[1].manifest.default_plan == "schedule"
+    assert again(directory, timed(schedule=2.0, safe=2.9))[1].manifest.default_plan == "safe"
+
+
+def test_a_plan_whose_limit_is_far_is_not_near(toy_compiled: Path, tmp_path: Path) -> None:
+    scores = {"schedule": score(0.08), "safe": score(0.05, 0.3)}
+    directory = made(toy_compiled, tmp_path, scores)
+    assert choosable(load_artifact(directory)) == {"schedule": 0.08, "safe": 0.05}
+    assert again(directory, timed(schedule=2.0, safe=1.0))[1].manifest.default_plan == "schedule"
+
+
+def test_the_command_times_what_can_be_chosen(built: Path) -> None:
+    result = bench(built, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert [one["plan"] for one in document["contestants"]] == ["dense", "schedule", "safe", "fast"]
+    assert document["chosen"].split("'")[-2] == load_artifact(built).manifest.default_plan in ("schedule", "safe")
+    assert "chosen on" in CliRunner().invoke(main, ["inspect", str(built)]).stdout
+    assert ttscompile.load(built).info.identity == load_artifact(built).manifest.identity
+
+
+def test_a_control_loop_that_no_plan_keeps_up_with_is_exit_status_1(built: Path) -> None:
+    before = (built / "manifest.json").read_bytes()
+    result = bench(built, "--control-hz", 20000)
+    assert result.exit_code == 1
+    assert (built / "manifest.json").read_bytes() == before
+
+
+def test_without_a_calibration_there_is_nothing_to_choose(toy_compiled: Path) -> None:
+    result = bench(toy_compiled)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "no plan was judged to be within 0.25. Run 'ttscompile build'" in " ".join(result.stderr.split())
+
+
+def test_another_artifact_that_took_its_place_is_left_alone(built: Path) -> None:
+    seen = load_artifact(built)
+    again(built, timed(schedule=4.0, safe=2.0, fast=1.0))
+    with pytest.raises(ArtifactError, match="was replaced meanwhile"):
+        choose_default(built, "schedule", {}, None, seen)
