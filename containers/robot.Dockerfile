@@ -8,6 +8,7 @@ COPY CHANGELOG.md LICENSE MANIFEST.in README.md constraints.txt pyproject.toml .
 COPY ttscompile ttscompile
 COPY passes passes
 COPY runtimes runtimes
+COPY plugins/rivals plugins/rivals
 ARG PIP_FLAGS=""
 RUN python3 -m venv /opt/ttscompile \
     && /opt/ttscompile/bin/python -m pip install --no-cache-dir $PIP_FLAGS -c constraints.txt '.[hub,serve]'

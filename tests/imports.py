@@ -7,8 +7,13 @@ from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-PACKAGES = {"ttscompile": "ttscompile", "passes": "ttscompile.passes", "runtimes": "ttscompile.runtimes"}
-"""Folder at the top of the tree -> package that it is installed as."""
+PACKAGES = {
+    "ttscompile": "ttscompile",
+    "passes": "ttscompile.passes",
+    "runtimes": "ttscompile.runtimes",
+    "plugins/rivals": "ttscompile.rivals",
+}
+"""Folder of the tree -> package that it is installed as."""
 
 
 @dataclass(frozen=True)

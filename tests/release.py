@@ -25,9 +25,10 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == "__main__":
     sys.path.insert(0, str(ROOT))
 
+from tests.imports import PACKAGES  # noqa: E402
 from ttscompile.measure.versions import VERSION  # noqa: E402
 
-HOMES = {"ttscompile": "ttscompile", "passes": "ttscompile/passes", "runtimes": "ttscompile/runtimes"}
+HOMES = {folder: package.replace(".", "/") for folder, package in PACKAGES.items()}
 """Folder of the tree -> where it is installed."""
 BESIDE = ("CHANGELOG.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml")
 CALLS = """

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from .imports import PACKAGES
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -13,6 +15,6 @@ def source_copy(target: Path) -> Path:
     target.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, target)
-    for name in ("ttscompile", "passes", "runtimes"):
+    for name in PACKAGES:
         shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
     return target

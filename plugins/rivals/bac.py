@@ -22,10 +22,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..calibration.calls import Calls
-from ..calibration.execute import Executor
-from ..calibration.task import Found, Task
-from ..core.lattice import BoolArray, PlanArray, Source
+from ttscompile.calibration.calls import Calls
+from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.task import Found, Task
+from ttscompile.core.lattice import BoolArray, PlanArray, Source
+
 from .fixed import best_of, fixed
 
 Scores = npt.NDArray[np.float64]

@@ -10,9 +10,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..calibration.calls import Actions, Calls, IntArray
-from ..calibration.execute import Executor, last
-from ..core.lattice import PlanArray, Source
+from ttscompile.calibration.calls import Actions, Calls, IntArray
+from ttscompile.calibration.execute import Executor, last
+from ttscompile.core.lattice import PlanArray, Source
 
 BYTES = 2**28
 """Memory for what the blocks compute; gradients and what they need take three to four times as much."""

@@ -16,8 +16,9 @@ decide.
 
 from __future__ import annotations
 
-from ..calibration.task import Found, Task
-from ..core.lattice import PlanArray, Source, uniform_plan
+from ttscompile.calibration.task import Found, Task
+from ttscompile.core.lattice import PlanArray, Source, uniform_plan
+
 from .fixed import best_of, fixed
 
 BOUNDARIES = (0.25, 0.5, 0.75)

@@ -21,8 +21,9 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from ..calibration.task import Array, Found, NothingAfter, Task
-from ..core.lattice import BoolArray, PlanArray, Source, uniform_plan
+from ttscompile.calibration.task import Array, Found, NothingAfter, Task
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, uniform_plan
+
 from .fixed import COMPARED
 from .slopes import slopes
 

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.spacing import spacings
-from ..calibration.task import Array, Found, NothingAfter, Task
-from ..core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
+from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.task import Array, Found, NothingAfter, Task
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 
 POPULATION, GENERATIONS = 30, 100
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.task import Array, Found, NothingAfter, Task
-from ..core.lattice import PlanArray, dense_plan
+from ttscompile.calibration.task import Array, Found, NothingAfter, Task
+from ttscompile.core.lattice import PlanArray, dense_plan
 
 COMPARED = 16
 """Calls on which candidates are compared; fewer if there are fewer."""

@@ -29,11 +29,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..calibration.calls import Calls, FloatArray
-from ..calibration.execute import Executor, State, last
-from ..calibration.task import Array, Found, Task
-from ..core.lattice import BoolArray, PlanArray, Source
-from ..errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
+from ttscompile.calibration.calls import Calls, FloatArray
+from ttscompile.calibration.execute import Executor, State, last
+from ttscompile.calibration.task import Array, Found, Task
+from ttscompile.core.lattice import BoolArray, PlanArray, Source
+from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
+
 from .fixed import COMPARED, best_of, fixed
 
 HALVINGS, DOUBLINGS = 9, 20
