@@ -69,7 +69,7 @@ def choose_again(
     name, before = chosen.removesuffix(IN_FP32), artifact.manifest.default_plan
     told = ", ".join(f"{each} {ms(one.median_ms)} ms" for each, one in times.items())
     here = f"{fingerprint()['processor']}, {threads} thread{'s' * (threads > 1)}: {told}"
-    precision = {} if chosen != name else None
+    precision: dict[str, str] | None = {} if chosen != name else None
     choose_default(directory, name, {**record, "default_plan": name, "chosen_on": here}, precision, artifact)
     changed = "is" if name == before else f"was {before!r}, and is"
     return f"The default {changed} {name!r}{', in fp32' * (chosen != name)}. {told}."
