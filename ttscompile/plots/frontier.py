@@ -16,6 +16,9 @@ COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0
 
 MARKERS = "osD^vP*"
 
+MOST_NAMES = 12
+"""Of more points only those that no other beats have their names beside them: the others would cover each other."""
+
 _TITLE_WIDTH = 105
 """Characters."""
 
@@ -48,8 +51,9 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
             label=series,
         )
     first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))
-    for i, p in enumerate(shown):
-        above = 4 + 8 * sum(_near(p, other) for other in shown[:i])
+    told = shown if len(shown) <= MOST_NAMES else [p for p in shown if p in efficient]
+    for i, p in enumerate(told):
+        above = 4 + 8 * sum(_near(p, other) for other in told[:i])
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
         axes.annotate(p.name, (p.latency_ms, p.error), fontsize=8, **beside(place, p.name, above))
     best = [point for point in efficient if point.error > 0]
