@@ -44,6 +44,7 @@ class PolicyInfo:
         frames: how many pieces depend on one frame alone, and are remembered by its content; 0 where there are none, or
             where the runtime computes all of them in every call.
         reuses_tokens: whether of new frames only some tokens are computed, so that a call depends on the frames before.
+        noise: what a loop begins with: numbers of the ``normal`` distribution, or ``uniform`` ones of -1..1.
         follows: whether that plan begins with the chunk of the call before, so that each call has to be one chunk later
             than the one before (``CompiledPolicy.follow`` tells it of one that is not).
     """
@@ -67,3 +68,4 @@ class PolicyInfo:
     frames: int = 0
     reuses_tokens: bool = False
     follows: bool = False
+    noise: str = "normal"

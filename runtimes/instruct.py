@@ -57,6 +57,5 @@ class Instruct:
     def _tokens(self, text: str) -> list[int]:
         """Of one text; the last is kept, since an episode has one."""
         if text not in self._made:
-            line = text if text.endswith("\n") or not self._told.new_line else f"{text}\n"
-            self._made = {text: self._tokenizer(line)}
+            self._made = {text: self._tokenizer(self._told.line(text))[self._told.skipped :]}
         return self._made[text]

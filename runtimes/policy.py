@@ -107,6 +107,7 @@ class CompiledPolicy:
             frames=self._runtime.frame_pieces,
             reuses_tokens=self._runtime.reuses_tokens,
             follows=default.otherwise is not None,
+            noise=manifest.spec.noise,
         )
 
     @property

@@ -30,7 +30,7 @@ def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
     As many numbers are drawn whether or not a sampler is stochastic.
     """
     loops = spec.all_loops.values()
-    initial = rng.standard_normal((1, *spec.sample), dtype=np.float32)
+    initial = spec.draw_initial(rng, (1, *spec.sample))
     draws = rng.standard_normal((max(loop.steps for loop in loops), *initial.shape), dtype=np.float32)
     return Noise(initial, draws if any(loop.stochastic for loop in loops) else None)
 
@@ -38,7 +38,7 @@ def random_noise(spec: PolicySpec, rng: np.random.Generator) -> Noise:
 def noise_of_any_horizon(spec: PolicySpec, rng: np.random.Generator, streams: int) -> Noise:
     """Noise of calls in a loop. It is drawn for the original's whole horizon, so a seed means the same for any."""
     shape, predicted = (streams, *spec.whole_horizon.sample), spec.sample[0]
-    initial = rng.standard_normal(shape, dtype=np.float32)[:, :predicted]
+    initial = spec.draw_initial(rng, shape)[:, :predicted]
     if not spec.sampler.stochastic:
         return Noise(initial)
     return Noise(initial, rng.standard_normal((spec.sampler.steps, *shape), dtype=np.float32)[:, :, :predicted])

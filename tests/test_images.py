@@ -1,4 +1,4 @@
-"""Images of any size are resized with their proportions, as torch and openpi do it."""
+"""Images of any size are resized as torch, openpi and torchvision do it."""
 
 from __future__ import annotations
 
@@ -28,6 +28,28 @@ def test_it_is_torchs_bilinear_with_a_black_rest(size: tuple[int, int], fit: str
     before = (left, up) if fit == "start" else (left // 2, up // 2)
     expected = functional.pad(resized, (before[0], left - before[0], before[1], up - before[1]))[:, None]
     np.testing.assert_allclose(fitted(image, spec), expected.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(30, 50), (96, 17), (20, 20), (3, 40), (61, 61)])
+def test_stretched_it_is_torchs_cubic_of_bytes(size: tuple[int, int]) -> None:
+    """A sum at the middle between two steps may be rounded another way on another processor."""
+    spec = ObservationSpec((1, 3, 20, 20), bounds=(0.0, 1.0), fit="stretch")
+    image = np.random.RandomState(0).uniform(0, 1, (2, 1, 3, *size)).astype(np.float32)
+    whole = torch.from_numpy(np.trunc(image[:, 0] * np.float32(255)))
+    expected = functional.interpolate(whole, (20, 20), mode="bicubic", antialias=True, align_corners=False)
+    expected = (expected if size != (20, 20) else whole).clamp(0, 255).round()[:, None] / 255
+    found = fitted(image, spec)
+    off = np.abs(found - expected.numpy())
+    assert off.max() < 1.01 / 255
+    assert np.count_nonzero(off > 1e-6) < 4
+    np.testing.assert_array_equal(fitted(found, spec), found)
+
+
+def test_random_images_of_a_policy_that_rounds_them_are_rounded() -> None:
+    spec = ObservationSpec((1, 3, 8, 8), bounds=(0.0, 1.0), fit="stretch")
+    drawn = spec.draw(np.random.default_rng(0))
+    np.testing.assert_array_equal(fitted(np.asarray(drawn, np.float32), spec), drawn)
+    assert len(np.unique(drawn)) > 50
 
 
 def test_only_images_of_another_size_change() -> None:

@@ -16,7 +16,7 @@ from ttscompile.artifact import codec
 from ttscompile.artifact.manifest import SCHEMA_VERSION, Manifest, PlanRecord
 from ttscompile.artifact.strict_json import Value, dump, parse
 from ttscompile.artifact.typed_json import from_json, read_as, to_json
-from ttscompile.core.spec import Affine, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.core.spec import Affine, Instruction, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Batch, TensorType
 
@@ -76,6 +76,18 @@ def test_types_come_back(kind: TensorType) -> None:
 def test_sizes_that_are_none(size: object) -> None:
     with pytest.raises(ArtifactError, match=r"t\.shape\[1\]"):
         from_json(TensorType, Value({"dtype": "float32", "shape": ["B", size]}, "t"))
+
+
+def test_what_a_record_leaves_out_has_its_default() -> None:
+    """Manifests of policies without it are as they were before there was such a field."""
+    spec, instruction = tiny_spec(), Instruction("obs", "obs", False)
+    assert "noise" not in to_json(spec)
+    assert to_json(instruction) == {"tokens": "obs", "mask": "obs", "new_line": False}
+    uniform = replace(spec, noise="uniform", instruction=replace(instruction, before=("a line",), skipped=3))
+    found = through_json(uniform)
+    assert (found.noise, found.instruction) == ("uniform", uniform.instruction)
+    with pytest.raises(ArtifactError, match="noise"):
+        from_json(PolicySpec, parse(dump({**to_json(spec), "noise": "pink"}), "spec"))
 
 
 def test_manifest_comes_back(manifest: Manifest) -> None:

@@ -1,9 +1,10 @@
 """Records to JSON by the types of their fields, and strictly back.
 
-A frozen dataclass is an object with a member a field, a mapping an object, a tuple a list, an enumeration its value. A
-vector of float32 is a list of numbers; another array is ``{"dtype", "shape", "values"}``. Floats are written as the
-shortest decimal of the double that equals the float32, so that they come back bit by bit. A tensor type has the sizes
-that depend on the batch as text: ``{"dtype": "float32", "shape": ["B", 16, 64]}``.
+A frozen dataclass is an object with a member a field, but for those that ``core.rules.OMITTED`` leaves out; a mapping
+is an object, a tuple a list, an enumeration its value. A vector of float32 is a list of numbers; another array is
+``{"dtype", "shape", "values"}``. Floats are written as the shortest decimal of the double that equals the float32, so
+that they come back bit by bit. A tensor type has the sizes that depend on the batch as text:
+``{"dtype": "float32", "shape": ["B", 16, 64]}``.
 
 What a type does not say stands beside it as a ``core.rules.Rule``.
 """
@@ -36,7 +37,10 @@ def to_json(value: Any) -> Any:
     if isinstance(value, TensorType):
         return {"dtype": value.dtype, "shape": [str(n) if isinstance(n, Batch) else n for n in value.shape]}
     if is_dataclass(value):
-        return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
+        told = (
+            one for one in fields(value) if not one.metadata.get("omitted") or getattr(value, one.name) != one.default
+        )
+        return {field.name: to_json(getattr(value, field.name)) for field in told}
     if isinstance(value, Mapping):
         return {key: to_json(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
@@ -105,8 +109,9 @@ def _origin(kind: Any) -> Any:
 
 def _record(kind: Any, value: Value) -> Any:
     hints = _hints(kind)
-    members = value.keys(*hints)
-    read = {name: read_as(hint, members[name]) for name, hint in hints.items()}
+    left_out = {field.name for field in fields(kind) if field.metadata.get("omitted")} - value.members().keys()
+    members = value.keys(*(name for name in hints if name not in left_out))
+    read = {name: read_as(hints[name], member) for name, member in members.items()}
     try:
         return kind(**read)
     except SpecError as error:

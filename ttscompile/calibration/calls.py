@@ -193,7 +193,7 @@ def draw_noise(spec: PolicySpec, count: int, seed: tuple[int, ...]) -> tuple[Ten
     """``initial`` and ``noise`` of so many ``Calls``."""
     draw = np.random.default_rng(seed)
     shape = (count, *spec.sample)
-    initial = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
+    initial = torch.from_numpy(spec.draw_initial(draw, shape))
     if not spec.sampler.stochastic:
         return initial, None
     return initial, torch.from_numpy(draw.standard_normal((spec.sampler.steps, *shape), dtype=np.float32))

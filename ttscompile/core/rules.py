@@ -24,6 +24,9 @@ class Rule:
     holds: Callable[[Any], object]
 
 
+OMITTED = {"omitted": True}
+"""Metadata of a field that records leave out where it has its default."""
+
 MAX_RANK = 16
 """Sizes of a shape that somebody else wrote: the product of thousands takes minutes, and cannot be printed."""
 

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from ..errors import SpecError
 from .coercion import integer, numbers
-from .rules import LOOP_NAME, DType, LoopName, Positive, Shape
+from .pictures import in_bytes
+from .rules import LOOP_NAME, OMITTED, DType, LoopName, Positive, Shape
 from .sampler import FloatArray as FloatArray
 from .sampler import SamplerTable as SamplerTable
 
@@ -85,8 +86,9 @@ class ObservationSpec:
         bounds: the range of the values that random observations are drawn from, low and high, each a number or one for
             each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
             embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
-        fit: of an image: one of another size is resized to this shape with its proportions (``core.values``). What is
-            left is black: ``start``, at the top and the left; ``centre``, on both sides. None: no other size is taken.
+        fit: of an image: one of another size is resized to this shape (``core.values``). With ``start`` and ``centre``
+            it keeps its proportions, and the rest is black: after it, or on both sides. With ``stretch`` it fills the
+            shape, and is rounded to 256 steps, whatever its size. None: no other size is taken.
     """
 
     shape: Shape
@@ -94,7 +96,7 @@ class ObservationSpec:
     dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
-    fit: Literal["start", "centre"] | None = None
+    fit: Literal["start", "centre", "stretch"] | None = None
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in an observation's shape", SpecError, 1) for n in self.shape)
@@ -148,6 +150,7 @@ class ObservationSpec:
         drawn = rng.uniform(low, high, shape).astype(np.float32)
         if self.bounds is None and self.normalizer is not None:
             drawn = self.normalizer.unnormalize(drawn)
+        drawn = in_bytes(drawn) if self.fit == "stretch" else drawn
         return drawn.astype(self.dtype)
 
     def draw_normalized(self, rng: np.random.Generator, streams: int) -> npt.NDArray[Any]:
@@ -167,11 +170,20 @@ class Instruction:
         tokens: key of the tokens, int64 ``[B, L]``, padded at the end.
         mask: key of what says which of them count, bool ``[B, L]``.
         new_line: whether the text ends with a new line before it is tokenized.
+        before: lines before the text, of a policy that has some. The text is then stripped.
+        skipped: the first so many tokens of both together are no part of the observation.
     """
 
     tokens: str
     mask: str
     new_line: bool
+    before: tuple[str, ...] = field(default=(), metadata=OMITTED)
+    skipped: int = field(default=0, metadata=OMITTED)
+
+    def line(self, text: str) -> str:
+        """What is tokenized."""
+        text = "\n".join([*self.before, text.strip()]) if self.before else text
+        return f"{text}\n" if self.new_line and not text.endswith("\n") else text
 
 
 @dataclass(frozen=True)
@@ -222,6 +234,7 @@ class PolicySpec:
         instruction: of a policy that is told its task in words, which a text alone gives; None for all others.
         loops: further denoising loops of the same network, by name: lower-case letters, digits, ``+ . -``. Sample,
             observations and chunk are common to all.
+        noise: what a loop begins with: numbers of the ``normal`` distribution, or ``uniform`` ones of -1..1.
     """
 
     sample: tuple[Positive, Positive]
@@ -234,6 +247,7 @@ class PolicySpec:
     left_out: int = 0
     instruction: Instruction | None = None
     loops: Mapping[LoopName, SamplerTable] = field(default_factory=dict)
+    noise: Literal["normal", "uniform"] = field(default="normal", metadata=OMITTED)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)
@@ -285,6 +299,12 @@ class PolicySpec:
     def all_loops(self) -> dict[str, SamplerTable]:
         """Every loop by name, ``original`` first."""
         return {ORIGINAL: self.sampler, **self.loops}
+
+    def draw_initial(self, rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
+        """Random samples of this shape that loops begin with."""
+        if self.noise == "uniform":
+            return np.asarray(2 * rng.random(shape, dtype=np.float32) - 1)
+        return rng.standard_normal(shape, dtype=np.float32)
 
     def in_loop(self, name: str) -> PolicySpec:
         """The policy that has this loop alone, as its own. Raises SpecError: there is no such loop."""

@@ -85,7 +85,7 @@ class _Recorder:
             normalized = one.normalized(whole)
             self._observations[key], self._normalized[key] = (pattern(each, one.shape) for each in (whole, normalized))
             self._tensors[key] = torch.from_numpy(normalized)
-        self._initial = self._draw.standard_normal((streams, *spec.whole_horizon.sample), dtype=np.float32)
+        self._initial = spec.draw_initial(self._draw, (streams, *spec.whole_horizon.sample))
         self._program, self._module = program, sharing_copy(module)
         self._inside = _Inside(program, self._tensors, streams)
 
