@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import nn
@@ -24,11 +24,12 @@ from .settings import Settings, read_json
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
 _MOST_OTHERWISE = 2**20
 _MOST_LETTERS = 200
-_ACTIVATIONS: Mapping[str, Callable[[torch.Tensor], torch.Tensor]] = {
+ACTIVATIONS: Mapping[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "quick_gelu": lambda x: x * torch.sigmoid(1.702 * x),
     "gelu": functional.gelu,
     "gelu_pytorch_tanh": lambda x: functional.gelu(x, approximate="tanh"),
 }
+"""By the names of transformers."""
 
 NAME_FOLDER = "Name the folder that has it: encoders= in Python, --encoders on the command line."
 
@@ -40,8 +41,10 @@ class TowerConfig:
     Attributes:
         intermediate_size: width inside the feed-forward layers.
         hidden_act: ``quick_gelu``, ``gelu``, or ``gelu_pytorch_tanh``, which approximates it.
+        SCALED: whether what a layer adds is first multiplied, channel by channel.
     """
 
+    SCALED: ClassVar[bool] = False
     hidden_size: int
     intermediate_size: int
     num_hidden_layers: int
@@ -54,7 +57,7 @@ class TowerConfig:
         for field in fields(self):
             if field.type == "int":
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
-        settings.choice("hidden_act", *_ACTIVATIONS)
+        settings.choice("hidden_act", *ACTIVATIONS)
         if self.hidden_size % self.num_attention_heads:
             raise settings.refusal("hidden_size", f"a multiple of num_attention_heads = {self.num_attention_heads}")
         if not isinstance(self.layer_norm_eps, float) or not 0 < self.layer_norm_eps < 1:
@@ -208,7 +211,7 @@ class _FeedForward(nn.Module):
         self.fc2 = nn.Linear(config.intermediate_size, config.hidden_size)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.fc2(_ACTIVATIONS[self.activation](self.fc1(x)))  # type: ignore[no-any-return]
+        return self.fc2(ACTIVATIONS[self.activation](self.fc1(x)))  # type: ignore[no-any-return]
 
 
 class _Layer(nn.Module):
@@ -220,14 +223,19 @@ class _Layer(nn.Module):
         self.self_attn = _SelfAttention(config)
         self.layer_norm2 = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
         self.mlp = _FeedForward(config)
+        self.scaled = config.SCALED
+        if self.scaled:
+            self.lambda_1, self.lambda_2 = (nn.Parameter(torch.ones(config.hidden_size)) for _ in range(2))
 
     def forward(self, x: torch.Tensor, mask: torch.Tensor | None, read: int) -> torch.Tensor:
-        x = x[:, :read] + self.self_attn(self.layer_norm1(x), mask, read)
-        return x + self.mlp(self.layer_norm2(x))  # type: ignore[no-any-return]
+        seen = self.self_attn(self.layer_norm1(x), mask, read)
+        x = x[:, :read] + (self.lambda_1 * seen if self.scaled else seen)
+        made = self.mlp(self.layer_norm2(x))
+        return x + (self.lambda_2 * made if self.scaled else made)  # type: ignore[no-any-return]
 
 
 class Layers(nn.Module):
-    """A tower's layers, one after the other; SigLIP has the same."""
+    """A tower's layers, one after the other; SigLIP and InternViT have the same."""
 
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
-from .clip import NAME_FOLDER
+from .clip import NAME_FOLDER, find_encoder
 
 _NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
 
@@ -17,19 +17,33 @@ def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) ->
     return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
 
 
-def task_tokens(text: str, name: str, folder: Path | None, most: int, vocabulary: int) -> list[int]:
+def language_model_folder(name: str, folders: list[Path], kind: str) -> Path:
+    """The folder of a language model whose ``model_type`` begins with ``kind``."""
+    found = find_encoder(name, folders, kind)
+    if found is None:
+        raise CheckpointError(
+            f"the language model {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
+            f" config.json in {', '.join(dict.fromkeys(map(str, folders)))}. {NAME_FOLDER}"
+        )
+    return found
+
+
+def task_tokens(
+    text: str, name: str, folder: Path | None, most: int | None, vocabulary: int, remedy: str = _NO_TASK
+) -> list[int]:
     """The tokens of an instruction, without padding: nothing reads that.
 
     Args:
         folder: that has its ``tokenizer.json``; None if there is none.
-        most: tokens that the policy reads; what is longer is cut, as lerobot does.
+        most: tokens that the policy reads; what is longer is cut, as lerobot does. None cuts nothing.
         vocabulary: tokens that the language model knows.
+        remedy: where there is no tokenizer.
     """
     path = None if folder is None else find_tokenizer(folder)
     if path is None:
         raise CheckpointError(
             f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put its"
-            f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {_NO_TASK}"
+            f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {remedy}".rstrip()
         )
     tokens = Tokenizer(path, CheckpointError)(text)[:most]
     if not tokens or max(tokens) >= vocabulary:

@@ -1,4 +1,4 @@
-"""Layers of the language models Llama and Gemma, for a prefix that is read once and an action expert that reads it.
+"""Layers of the language models Llama, Gemma and Qwen2, for a prefix that is read once and an expert that reads it.
 
 Attribute names are those under which the weights of transformers load. Keys and values are ``[B, heads, tokens,
 channels]`` with every head written out, so that what depends on the prefix alone is repeated once a call.
@@ -27,6 +27,7 @@ class LanguageConfig:
         groups: heads of keys and values.
         epsilon: of the norms.
         gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
+        biased: whether queries, keys and values have a bias, as in Qwen2.
     """
 
     width: int
@@ -37,6 +38,7 @@ class LanguageConfig:
     channels: int
     epsilon: float = 1e-6
     gemma: bool = False
+    biased: bool = False
 
 
 class Seen(NamedTuple):
@@ -67,9 +69,9 @@ class Attention(nn.Module):
         super().__init__()
         self.channels, self.groups, self.repeats = config.channels, config.groups, config.heads // config.groups
         queries, keys = config.heads * config.channels, config.groups * config.channels
-        self.q_proj = nn.Linear(config.width, queries, bias=False)
-        self.k_proj = nn.Linear(source or config.width, keys, bias=False)
-        self.v_proj = nn.Linear(source or config.width, keys, bias=False)
+        self.q_proj = nn.Linear(config.width, queries, bias=config.biased)
+        self.k_proj = nn.Linear(source or config.width, keys, bias=config.biased)
+        self.v_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.o_proj = nn.Linear(queries, config.width, bias=False)
 
     def split(self, x: Tensor) -> Tensor:
@@ -164,9 +166,9 @@ class Rotation(NamedTuple):
     sin: Tensor
 
 
-def rotation(positions: Tensor, channels: int) -> Rotation:
+def rotation(positions: Tensor, channels: int, base: float = 10_000) -> Rotation:
     """The rotary embedding of positions ``[B, T]``."""
-    rates = 10_000 ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32))
+    rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32))
     angles = (positions[..., None].to(torch.float32) * rates)[:, None]
     return Rotation(angles.cos(), angles.sin())
 

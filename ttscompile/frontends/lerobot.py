@@ -13,7 +13,7 @@ from typing import Any
 from torch import nn
 
 from ..core.spec import PolicySpec
-from . import lerobot_act, lerobot_diffusion, lerobot_multi_task_dit, lerobot_pi, lerobot_smolvla
+from . import lerobot_act, lerobot_diffusion, lerobot_evo1, lerobot_multi_task_dit, lerobot_pi, lerobot_smolvla
 from .families import LoadOptions
 from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
@@ -22,6 +22,7 @@ from .settings import read_json
 TYPES: Mapping[str, Callable[[Path, Mapping[str, Any], LoadOptions], tuple[nn.Module, PolicySpec]]] = {
     "act": lerobot_act.load,
     "diffusion": lerobot_diffusion.load,
+    "evo1": lerobot_evo1.load,
     "multi_task_dit": lerobot_multi_task_dit.load,
     "pi0": lerobot_pi.load,
     "pi05": lerobot_pi.load,

@@ -32,11 +32,13 @@ def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
     """The files of a compiled policy by name; the same policy gives the same bytes.
 
     None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
-    normalises with, and without that step tokens would be wrong.
+    normalises with, and without that step tokens would be wrong. None of one that has words before the instruction
+    (evo1), which no step writes, unless that is compiled in.
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]
-    if entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps):
+    worded = spec.instruction is not None and spec.instruction.before
+    if worded or entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps):
         return {}
     renamed = {
         new: old

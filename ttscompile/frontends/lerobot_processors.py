@@ -26,9 +26,12 @@ _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", 
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
 PROMPT = "pi05_prepare_state_tokenizer_processor_step"
 _RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
+_PAD = ("evo1_pad_state_processor", "evo1_pad_action_processor")
+_CROP = "evo1_action_processor"
+"""What it does is in the policy's configuration, which lerobot prefers to the step's own."""
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, PROMPT, _RELATIVE}),
-    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, _RELATIVE}),
+    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE, _CROP}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, NORMALIZE, _UNNORMALIZE})
 
@@ -43,6 +46,9 @@ STATISTICS = {
     "QUANTILE10": ("q10", "q90"),
 }
 """The two statistics of each mode."""
+
+_NEUTRAL = {"mean": 0.0, "std": 1.0, **dict.fromkeys(("min", "q01", "q10"), -1.0)}
+"""What evo1 pads statistics with; 1 for the others."""
 
 _LEAST_STD = 1e-30
 """Stands for a standard deviation of zero, which gives the mean whatever the network says."""
@@ -143,10 +149,11 @@ class Processors:
 def read_processors(directory: Path, features: Features) -> Processors:
     """The pipelines of a policy that LeRobot saved, with these features."""
     before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
+    padded = any(step["registry_name"] in _PAD for step in before)
     return Processors(
         renamed=_renamed(directory, before, features),
-        normalizers=_statistics(directory, before, NORMALIZE, features),
-        action=_statistics(directory, after, _UNNORMALIZE, features).get("action"),
+        normalizers=_statistics(directory, before, NORMALIZE, features, padded),
+        action=_statistics(directory, after, _UNNORMALIZE, features, padded).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
         state_in_prompt=any(step["registry_name"] == PROMPT for step in before),
@@ -209,9 +216,13 @@ def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -
 
 
 def _statistics(
-    directory: Path, steps: list[dict[str, Any]], registered: str, features: Features
+    directory: Path, steps: list[dict[str, Any]], registered: str, features: Features, padded: bool
 ) -> dict[str, Statistics]:
-    """Statistics of each feature that a normalising step changes; without any lerobot changes nothing."""
+    """Statistics of each feature that a normalising step changes; without any lerobot changes nothing.
+
+    Args:
+        padded: whether vectors may be padded, by zeros that stay zeros.
+    """
     step = next((step for step in steps if step["registry_name"] == registered), None)
     if step is None:
         raise CheckpointError(f"{directory}: expected one step {registered}; found none.")
@@ -243,11 +254,19 @@ def _statistics(
         missing = [name for name in names if name not in tensors]
         if missing:
             raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
-        first, second = (_broadcast(directory, name, tensors[name], kind, shape) for name in names)
+        own_numbers = {name: _unpadded(name, tensors[name], shape) if padded else tensors[name] for name in names}
+        first, second = (_broadcast(directory, name, value, kind, shape) for name, value in own_numbers.items())
         if mode == "MEAN_STD" and (second < 0).any():
             raise CheckpointError(f"{directory}: {names[1]} has a deviation below 0. Compute the statistics again.")
         result[key] = Statistics(mode, first, second, eps)
     return result
+
+
+def _unpadded(name: str, value: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+    """The statistic of the vector's own numbers, where the others are what evo1 pads with."""
+    neutral = _NEUTRAL.get(name.rpartition(".")[2], 1.0)
+    own = value[: shape[0]] if value.ndim == len(shape) == 1 else value
+    return own if bool((value[len(own) :] == neutral).all()) else value
 
 
 def _broadcast(directory: Path, name: str, value: torch.Tensor, kind: str, shape: tuple[int, ...]) -> torch.Tensor:

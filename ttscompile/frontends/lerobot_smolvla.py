@@ -14,16 +14,17 @@ from torch import nn
 
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
-from .clip import NAME_FOLDER, find_encoder
+from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
-from .instruction import encoder_folders, task_tokens
+from .instruction import encoder_folders, language_model_folder, task_tokens
 from .language_layers import LanguageConfig
-from .lerobot_config import MOST, MOST_PIXELS, LeRobotConfig
+from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import read_weights
 from .lerobot_vla import (
     Gathered,
     padded_size,
+    part_of,
     positive_number,
     read_vla_config,
     read_vla_processors,
@@ -96,7 +97,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     for entry, expected in (("add_image_special_tokens", False), ("use_delta_joint_actions_aloha", False)):
         if settings.flag(entry, expected) != expected:
             raise settings.refusal(entry, f"{expected}: the other is not rebuilt".lower())
-    vision_entries, text = _part(model, "vision_config"), _part(model, "text_config")
+    vision_entries, text = part_of(model, "vision_config"), part_of(model, "text_config")
     names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
     vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
     layers = _layers(settings, text.number("num_hidden_layers", None, _MOST_LAYERS))
@@ -167,20 +168,7 @@ def _crosses(settings: Settings, layers: int) -> tuple[bool, ...]:
 
 def _language_model(name: str, folders: list[Path]) -> Settings:
     """The entries of the language model's ``config.json``."""
-    found = find_encoder(name, folders, "smolvlm")
-    if found is not None:
-        return Settings(read_json(found / "config.json"), f"{found / 'config.json'}: ")
-    if name in RELEASED:
+    if name in RELEASED and find_encoder(name, folders, "smolvlm") is None:
         return Settings(RELEASED[name], f"{name}: ")
-    raise CheckpointError(
-        f"the language model {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
-        f" config.json in {', '.join(dict.fromkeys(map(str, folders)))}. {NAME_FOLDER}"
-    )
-
-
-def _part(model: Settings, name: str) -> Settings:
-    """One of the two configurations inside."""
-    inner = model.values.get(name)
-    if not isinstance(inner, dict):
-        raise model.refusal(name, "the entries of a SmolVLM model")
-    return Settings(inner, f"{model.where}{name}.")
+    path = language_model_folder(name, folders, "smolvlm") / CONFIG
+    return Settings(read_json(path), f"{path}: ")

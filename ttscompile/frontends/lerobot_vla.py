@@ -21,7 +21,7 @@ from .families import LoadOptions
 from .lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
 from .lerobot_policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
 from .lerobot_processors import Normalizer, Processors, read_processors
-from .loops import loops_of
+from .loops import Make, loops_of
 from .settings import Settings
 
 _EMPTY = "observation.images.empty_camera_"
@@ -67,9 +67,10 @@ def vla_spec(
     config: LeRobotConfig,
     processors: Processors,
     image: tuple[int, int] | None,
-    fit: Literal["start", "centre"],
+    fit: Literal["start", "centre", "stretch"],
     sizes: Mapping[str, int],
     options: LoadOptions,
+    table: Make | None = None,
 ) -> PolicySpec:
     """The specification of a policy.
 
@@ -78,12 +79,13 @@ def vla_spec(
         fit: where the rest of a resized image is.
         sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
             absent where it is compiled in.
+        table: the loop; None for ten steps, or as many as are configured, from time 1 to time 0.
     """
     language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if "tokens" in sizes else {}
     source = {"policy": str(config.settings.values["type"])}
     source |= {} if options.task is None else {"task": options.task}
     source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
-    loops = loops_of(lambda each: _sampler(config.settings, each), options, "its own integration")
+    loops = loops_of(table or (lambda each: _sampler(config.settings, each)), options, "its own integration")
     spec = policy_spec(config, processors, loops, source, language)
     observations = dict(spec.observations)
     if image is not None:
@@ -99,17 +101,21 @@ def vla_spec(
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     """From time 1, noise, to time 0, actions."""
     name = "num_steps" if "num_steps" in settings.values else "num_inference_steps"
-    count = integration_steps(settings, options, name, 10)
+    return flow_matching(integration_steps(settings, options, name, 10), options, start=1.0, end=0.0)
+
+
+def flow_matching(count: int, options: LoadOptions, start: float, end: float) -> SamplerTable:
+    """So many steps from noise at ``start`` to actions at ``end``, by Euler's method unless another is asked for."""
     if options.sampler not in (None, *METHODS):
         raise SpecError(f"sampler {options.sampler!r} is of diffusion; expected {' or '.join(METHODS)} of this policy.")
-    return flow_matching_table(count, options.sampler or "euler", start=1.0, end=0.0)
+    return flow_matching_table(count, options.sampler or "euler", start=start, end=end)
 
 
-def padded_size(settings: Settings, name: str, own: int) -> int:
+def padded_size(settings: Settings, name: str, own: int, default: int = 32) -> int:
     """The width that states or actions are padded to, which has to hold the robot's own."""
-    size = settings.number(name, 32, MOST)
+    size = settings.number(name, default, MOST)
     if own > size:
-        raise settings.refusal(name, f"at least the {own} numbers that the robot has", 32)
+        raise settings.refusal(name, f"at least the {own} numbers that the robot has", default)
     return size
 
 
@@ -162,3 +168,11 @@ def require_square(settings: Settings, name: str, image: Sequence[int], multiple
         raise settings.error(
             f"{name}: images reach the encoder as {list(image)}; expected a square of a multiple of {multiple}"
         )
+
+
+def part_of(model: Settings, name: str) -> Settings:
+    """One of the two configurations inside of a language model's, of images or of text."""
+    inner = model.values.get(name)
+    if not isinstance(inner, dict):
+        raise model.refusal(name, "its entries")
+    return Settings(inner, f"{model.where}{name}.")

@@ -69,6 +69,19 @@ class Siglip(nn.Module):
         return self.post_layernorm(self.encoder(self.embeddings(pixels, self.positions)))  # type: ignore[no-any-return]
 
 
+def squares(patches: torch.Tensor, side: int, scale: int) -> torch.Tensor:
+    """Squares of ``scale`` by ``scale`` patches as one row each.
+
+    Args:
+        patches: ``[N, side ** 2, C]``; of them come ``[N, squares, scale ** 2 * C]``.
+        side: patches along a side of the image.
+    """
+    count = side // scale
+    grid = patches.reshape(-1, count, scale, count, scale, patches.shape[-1])
+    # Rows and columns of a square stand beside each other, and its features one patch after the other.
+    return grid.transpose(2, 3).flatten(3).flatten(1, 2)
+
+
 def _buckets(count: int, side: int) -> list[int]:
     """Which of ``side`` positions each of ``count`` patches has: by its share of the image, as SmolVLM rounds it."""
     step = torch.tensor(1.0, device="cpu") / count

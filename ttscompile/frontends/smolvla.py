@@ -29,7 +29,7 @@ from .language_layers import (
     rotation,
     waves,
 )
-from .siglip import Siglip, SiglipConfig
+from .siglip import Siglip, SiglipConfig, squares
 
 _MULTIPLE = 256
 """Of the expert's feed-forward layers."""
@@ -83,10 +83,7 @@ class _Connector(nn.Module):
 
     def forward(self, patches: Tensor) -> Tensor:
         """``[N, patches, width]`` -> ``[N, tokens, width of the language model]``."""
-        squares = self.rows // self.scale
-        grid = patches.reshape(-1, squares, self.scale, squares, self.scale, patches.shape[-1])
-        # Rows and columns of a square stand beside each other, and its features one patch after the other.
-        return self.modality_projection.proj(grid.transpose(2, 3).flatten(3).flatten(1, 2))  # type: ignore[no-any-return]
+        return self.modality_projection.proj(squares(patches, self.rows, self.scale))  # type: ignore[no-any-return]
 
 
 class _Text(nn.Module):
