@@ -4,6 +4,7 @@
     python examples/benchmark/large.py --unet 512,1024,2048 --horizon 64        # LeRobot's U-Net
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
+    python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
@@ -102,6 +103,19 @@ def convert_smolvla(folder: Path) -> None:
     stages.end()
 
 
+def convert_evo1(folder: Path) -> None:
+    """Save an evo1 of its real size, as lerobot does, and convert it for one instruction."""
+    import large_evo1
+
+    import ttscompile
+
+    directory = large_evo1.save(folder)
+    print(f"{peak():5.2f} GiB before compiling")
+    stages = Stages()
+    ttscompile.convert(directory, folder / "compiled", precision="int8", task=large_evo1.TASK, explain=stages)
+    stages.end()
+
+
 def convert_clip(folder: Path) -> None:
     """Compile a ``multi_task_dit`` of its real size."""
     import large_clip
@@ -123,8 +137,27 @@ def run_smolvla(folder: Path) -> None:
     from ttscompile.frontends import load_checkpoint_policy
 
     module, spec = load_checkpoint_policy(folder / "smolvla")
-    large_calls.compare(folder, "vision, prefix, loop", large_smolvla.eager(module, spec), spec, 2)
+    large_calls.compare(folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2)
     large_calls.reusing(folder, spec, 2)
+
+
+def run_evo1(folder: Path) -> None:
+    """See ``large_calls``; two of 32 steps are computed."""
+    import large_calls
+    import large_evo1
+    import large_smolvla
+
+    from ttscompile.frontends import load_checkpoint_policy
+    from ttscompile.frontends.families import LoadOptions
+
+    module, spec = load_checkpoint_policy(folder / "evo1", options=LoadOptions(task=large_evo1.TASK))
+    large_calls.compare(folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, 3)
+    large_calls.reusing(folder, spec, 2, 3)
+
+
+def _vision(module: nn.Module) -> nn.Module:
+    """The image encoder of a vision-language-action model."""
+    return next(one for name, one in module.named_modules() if name.endswith(("vision_model", "vision_tower")))
 
 
 def run_clip(folder: Path) -> None:
@@ -179,6 +212,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
     parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
+    parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
     parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
@@ -186,6 +220,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.smolvla and options.only is not None:
         (convert_smolvla if options.only == "convert" else run_smolvla)(options.output)
+    elif options.evo1 and options.only is not None:
+        (convert_evo1 if options.only == "convert" else run_evo1)(options.output)
     elif options.clip and options.only is not None:
         (convert_clip if options.only == "convert" else run_clip)(options.output)
     elif options.only == "convert":
@@ -202,7 +238,7 @@ def main() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             for part in ("convert", "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
-                own += ["--smolvla"] * options.smolvla + ["--clip"] * options.clip
+                own += ["--smolvla"] * options.smolvla + ["--evo1"] * options.evo1 + ["--clip"] * options.clip
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

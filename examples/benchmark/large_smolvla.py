@@ -23,7 +23,7 @@ from ttscompile.frontends.smolvla import SmolVLA
 MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 STATE, CAMERAS, ACTION = "observation.state", ("observation.images.front", "observation.images.wrist"), "action"
 
-_FEATURES = {
+FEATURES = {
     STATE: {"type": "STATE", "shape": [6]},
     **{key: {"type": "VISUAL", "shape": [3, 480, 640]} for key in CAMERAS},
     ACTION: {"type": "ACTION", "shape": [6]},
@@ -49,56 +49,62 @@ def save(directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     entries = {
         "type": "smolvla",
-        "input_features": {key: each for key, each in _FEATURES.items() if key != ACTION},
-        "output_features": {ACTION: _FEATURES[ACTION]},
+        "input_features": {key: each for key, each in FEATURES.items() if key != ACTION},
+        "output_features": {ACTION: FEATURES[ACTION]},
         "vlm_model_name": MODEL,
         **_SIZES,
     }
-    _write(directory / "config.json", entries)
-    statistics = {f"{key}.{name}": torch.full((6,), float(name == "std")) for key in (STATE, ACTION) for name in _NAMES}
-    save_file(statistics, directory / "statistics.safetensors")
-    own = {"config": {"eps": 1e-8, "features": _FEATURES, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
-    for name, kind in (("pre", "normalizer_processor"), ("post", "unnormalizer_processor")):
-        _write(directory / f"policy_{name}processor.json", {"steps": [{"registry_name": kind, **own}]})
+    write_json(directory / "config.json", entries)
+    write_processors(directory)
     config = read_config(read_vla_config(directory, entries, AS_SAVED), Settings(RELEASED[MODEL], f"{MODEL}: "))
     with torch.device("meta"):
         shapes = SmolVLA(config).state_dict()
     draw = torch.Generator().manual_seed(0)
-    weights = {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()}
+    weights = {f"model.{name}": random_weight(name, value.shape, draw) for name, value in shapes.items()}
     # As in released checkpoints: embeddings in bf16, and a norm that no action depends on.
     weights[f"{_TEXT}.embed_tokens.weight"] = weights[f"{_TEXT}.embed_tokens.weight"].bfloat16()
     weights[f"{_TEXT}.norm.weight"] = torch.ones_like(weights[f"{_TEXT}.layers.0.input_layernorm.weight"])
     save_file(weights, directory / "model.safetensors")
 
 
-_NAMES = ("mean", "std")
+def write_processors(directory: Path) -> None:
+    """Normalisers that change nothing."""
+    numbers = {"mean": 0.0, "std": 1.0}
+    statistics = {f"{key}.{n}": torch.full((6,), value) for key in (STATE, ACTION) for n, value in numbers.items()}
+    save_file(statistics, directory / "statistics.safetensors")
+    own = {"config": {"eps": 1e-8, "features": FEATURES, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
+    for name, kind in (("pre", "normalizer_processor"), ("post", "unnormalizer_processor")):
+        write_json(directory / f"policy_{name}processor.json", {"steps": [{"registry_name": kind, **own}]})
+
+
 _TEXT = "model.vlm_with_expert.vlm.model.text_model"
 
 
-def _weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
+def random_weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
     """Such that the numbers in the network neither vanish nor explode."""
     if len(shape) > 1:
         return torch.randn(shape, generator=draw) * shape[1:].numel() ** -0.5
     return torch.ones(shape) if "norm" in name and name.endswith("weight") else torch.zeros(shape)
 
 
-def _write(path: Path, content: Any) -> None:
+def write_json(path: Path, content: Any) -> None:
+    """A file of a checkpoint."""
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
 def call(spec: PolicySpec) -> tuple[dict[str, np.ndarray], Noise]:
     """One observation, and the noise of a call."""
     rng = np.random.default_rng(0)
-    noise = Noise(rng.standard_normal((1, *spec.sample), dtype=np.float32))
+    noise = Noise(spec.draw_initial(rng, (1, *spec.sample)))
     return {key: each.draw(rng) for key, each in spec.observations.items()}, noise
 
 
-def eager(module: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
+def eager(module: nn.Module, vision: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
     """A call in eager PyTorch: the actions; and the seconds, of the processor, of image encoder, prefix and loop."""
     obs, noise = call(spec)
     given = {spec.arguments[key]: torch.from_numpy(value) for key, value in obs.items()}
     parts: Any = module
-    took = [0.0]
+    took, table = [0.0], spec.sampler
 
     def timed(_: nn.Module, __: Any) -> None:
         took[0] -= process_time()
@@ -106,8 +112,8 @@ def eager(module: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray,
     def done(_: nn.Module, __: Any, ___: Any) -> None:
         took[0] += process_time()
 
-    parts.encoder.prefix.vision_model.register_forward_pre_hook(timed)
-    parts.encoder.prefix.vision_model.register_forward_hook(done)
+    vision.register_forward_pre_hook(timed)
+    vision.register_forward_hook(done)
 
     @torch.inference_mode()
     def run() -> tuple[np.ndarray, list[float]]:
@@ -115,8 +121,8 @@ def eager(module: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray,
         encoded = parts.encoder(given)
         prefix = process_time()
         x = torch.from_numpy(noise.initial)
-        for t in spec.sampler.timesteps:
-            x = x - parts.denoiser(x, torch.full((1,), float(t)), encoded) / spec.sampler.steps
+        for length, time in zip(table.out_to_next, torch.from_numpy(table.timesteps), strict=True):
+            x = x + float(length) * parts.denoiser(x, time[None], encoded)
         return spec.chunk.unnormalized(x.numpy()), [took[0], prefix - start - took[0], process_time() - prefix]
 
     return run

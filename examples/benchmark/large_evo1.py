@@ -1,0 +1,81 @@
+"""Evo-1 at its real size with random weights, for ``large.py``: the checkpoint, and its language model's files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, random_weight, write_json, write_processors
+from safetensors.torch import save_file
+
+from ttscompile.frontends.evo1 import Evo1
+from ttscompile.frontends.families import AS_SAVED
+from ttscompile.frontends.internvl import Prompt
+from ttscompile.frontends.lerobot_evo1 import read_config
+from ttscompile.frontends.lerobot_vla import read_vla_config
+from ttscompile.frontends.settings import Settings
+
+TASK = "put the red cup on the shelf"
+MODEL: dict[str, Any] = {
+    "model_type": "internvl",
+    "image_token_id": 151667,
+    "vision_config": {"attention_bias": True},
+    "text_config": {
+        "model_type": "qwen2",
+        "hidden_size": 896,
+        "intermediate_size": 4864,
+        "num_hidden_layers": 24,
+        "num_attention_heads": 14,
+        "num_key_value_heads": 2,
+        "rope_theta": 1e6,
+        "vocab_size": 151674,
+    },
+}
+"""InternVL3-1B; other entries are the defaults."""
+_STEPS = {"chunk_size": 50, "num_inference_timesteps": 32}
+_MARKS = {"<img>": 151665, "</img>": 151666, "<IMG_CONTEXT>": 151667}
+
+
+def save(folder: Path) -> Path:
+    """What lerobot's ``save_pretrained`` writes of an evo1 with its default configuration. Returns the directory."""
+    directory, model = folder / "evo1", folder / "InternVL3-1B-hf"
+    for each in (directory, model):
+        each.mkdir(parents=True, exist_ok=True)
+    write_json(model / "config.json", MODEL)
+    letters = {chr(code): code for code in range(32, 127)}
+    marks = [{"id": number, "content": text, "special": True} for text, number in _MARKS.items()]
+    flags = dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized"), False)
+    split = {"type": "Split", "pattern": {"Regex": "."}, "behavior": "Isolated", "invert": False}
+    words = {"type": "WordLevel", "vocab": {**letters, **_MARKS}, "unk_token": "?"}
+    tokenizer = {"version": "1.0", "added_tokens": [{**mark, **flags} for mark in marks]}
+    tokenizer |= {"pre_tokenizer": split, "model": words}  # a letter is a token: this is nobody's text
+    tokenizer |= dict.fromkeys(("truncation", "padding", "normalizer", "post_processor", "decoder"))
+    write_json(model / "tokenizer.json", tokenizer)
+    entries = {
+        "type": "evo1",
+        "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
+        "output_features": {ACTION: FEATURES[ACTION]},
+        "vlm_model_name": f"OpenGVLab/{model.name}",
+        **_STEPS,
+    }
+    write_json(directory / "config.json", entries)
+    write_processors(directory)
+    shared = read_vla_config(directory, entries, AS_SAVED)
+    with torch.device("meta"):
+        shapes = Evo1(read_config(shared, Settings(MODEL, "")), Prompt((), len(CAMERAS))).state_dict()
+    draw = torch.Generator().manual_seed(0)
+    weights = {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()}
+    save_file(weights, directory / "model.safetensors")
+    return directory
+
+
+def _weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
+    """As ``random_weight``; of the language model in bf16, as released ones are."""
+    if name.endswith((".times", ".places")):
+        count, width = shape[1:]
+        angles = torch.arange(count)[:, None] * torch.exp(torch.arange(0, width, 2) * (-math.log(10000.0) / width))
+        return torch.stack([angles.sin(), angles.cos()], -1).reshape(shape)
+    drawn = torch.full(shape, 0.1) if "lambda" in name else random_weight(name, shape, draw)
+    return drawn.bfloat16() if name.startswith("embedder.") else drawn
