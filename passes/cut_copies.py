@@ -88,7 +88,6 @@ def _slice(node: Node, types: Mapping[str, TensorType]) -> _Found | None:
 
 
 def _item(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> _Found | None:
-    """One part of a split."""
     if node.op != GETITEM or not isinstance(node.args[0], Ref) or not isinstance(node.args[1], int):
         return None
     split = producers.get(node.args[0].name)

@@ -130,7 +130,6 @@ def _p(name: str) -> Ref:
 
 
 def _stream(type_: TensorType) -> tuple[int, ...]:
-    """Sizes of one stream's feature, without the axis of streams."""
     axis = type_.batch_axis
     sizes = type_.at(1)
     return sizes if axis is None else sizes[:axis] + sizes[axis + 1 :]

@@ -51,7 +51,6 @@ def _with_skips(spec: PolicySpec) -> PolicySpec:
 
 
 def _network(graph: Graph, sample: str) -> str | None:
-    """Name of f."""
     (output,) = graph.outputs
     node, types = graph.producers().get(output), graph.types()
     if node is None or node.op != _ADD or node.kwargs:

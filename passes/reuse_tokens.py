@@ -155,7 +155,6 @@ class _Changed:
         return replace(type_, shape=tuple(sizes))
 
     def _gather(self, name: str, axis: int) -> Ref:
-        """The rows of some tokens, of a value that has them all."""
         if not any(node.name == f"{name}.changed" for node in self.nodes):
             args = (Ref(name), axis, Ref(INDEX))
             type_ = self._part(self.types[name], axis)
@@ -163,7 +162,6 @@ class _Changed:
         return Ref(f"{name}.changed")
 
     def _changed(self, node: Node) -> None:
-        """A node for the rows of some tokens."""
         axes, axis = self.stream.axes, self.stream.axes[node.name]
         types = tuple(self._part(type_, axis) for type_ in node.types)
         elementwise, behind = operation(node.op).elementwise, len(node.type.shape) - axis

@@ -68,7 +68,6 @@ def _parts(node: Node, producers: Mapping[str, Node], types: Mapping[str, Tensor
 
 
 def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType]) -> list[Node]:
-    """The nodes that make the layer's value from its parts."""
     weight = node.args[1]
     assert isinstance(weight, Ref)
     rows = types[weight.name].shape[0]

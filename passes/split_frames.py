@@ -120,7 +120,6 @@ def _is_frame(spec: ObservationSpec) -> bool:
 def _largest(
     graph: Graph, found: Collection[_Tower], frames: Collection[str], declined: Collection[str]
 ) -> _Tower | None:
-    """The tower with the most FLOPs among what is in no other."""
     taken = {name for tower in found for name in (*tower.inside, *tower.before)}
     observed, starts = reachable_from(graph, graph.inputs), list[tuple[str, ...]]()
     types = graph.types()
@@ -195,7 +194,6 @@ def _is_exit(graph: Graph, name: str, rows: int) -> bool:
 
 
 def _crossing(name: str) -> str:
-    """The name of what a tower gives."""
     return f"{name}.frame"
 
 
@@ -255,7 +253,6 @@ def _reading_all(group: list[_Tower]) -> Graph:
 
 
 def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:
-    """The condition graph that reads what the towers give."""
     types, inputs, nodes = graph.types(), dict(graph.inputs), list[Node]()
     for group in groups:
         first, count = group[0], len(group)

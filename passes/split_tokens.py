@@ -93,7 +93,6 @@ class _Splitter:
         self.nodes.append(node)
 
     def _need(self, name: str) -> None:
-        """Make a split value whole, under its own name."""
         parts = self.parts.get(name)
         if parts is None or name in self.whole:
             return

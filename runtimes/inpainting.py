@@ -90,7 +90,6 @@ def noise_levels(sampler: SamplerTable) -> Levels | None:
 
 
 def _levels(sampler: SamplerTable) -> Levels | None:
-    """Of a table as samplers make it."""
     sample, out = sampler.sample_to_x0.astype(np.float64), sampler.out_to_x0.astype(np.float64)
     if (sample > 0).all() and _keeps_variance(1 / sample, -out / sample):
         return 1 / sample, -out / sample

@@ -284,7 +284,6 @@ class CompiledPolicy:
     def _chunk(
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
-        """What is executed of a call, ``[B, Ta, Da]``."""
         chunk = self._spec.chunk
         return self._predict(obs, noise, plan, prefix)[:, chunk.start : chunk.stop]
 
@@ -319,7 +318,6 @@ class CompiledPolicy:
         return actions
 
     def _plan(self, plan: str | Plan | npt.ArrayLike | None) -> Plan:
-        """The plan that a caller means."""
         if plan is None:
             return self._default
         if isinstance(plan, str | Plan):

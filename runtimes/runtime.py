@@ -52,8 +52,6 @@ class _Settled:
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """What a call gave, and how."""
-
     sample: FloatArray
     settled: _Settled
     outside: FloatArray  # ``CallReport.outside``
@@ -300,7 +298,6 @@ class Runtime:
         return self.view(plan if plan.otherwise is None else plan.otherwise).manifest.spec
 
     def _opened_for(self, plan: Plan) -> _Opened:
-        """What computes a plan."""
         if plan.variant not in self._opened:
             view = self.view(plan)
             self._opened[plan.variant] = _Opened(view, self._open_backend(view))
@@ -357,5 +354,4 @@ def _prune(backend: Backend[Any], lowering: LoweringCache[Any], written: BoolArr
 
 
 def _milliseconds(start: float, stop: float) -> float:
-    """Milliseconds between two readings of ``time.perf_counter``."""
     return 1000.0 * (stop - start)

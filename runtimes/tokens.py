@@ -112,7 +112,6 @@ class TokenTower:
         return values, len(index)
 
     def _blank(self) -> dict[str, Array]:
-        """What is kept of a new lane, before its first frame."""
         return {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
 
     def _changed(self, kept: _Kept | None, pixels: Array) -> Array:

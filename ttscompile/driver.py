@@ -251,7 +251,6 @@ def _require_apart(single_file: str | os.PathLike[str], directory: str | os.Path
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Put a file in its place, whole."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, content)

@@ -192,7 +192,6 @@ def place_of(artifact: Artifact) -> tuple[str, str]:
 def _run(
     key: str, elsewhere: Callable[..., Callable[[Any], Any]], threads: int, given: tuple[Any, ...], part: Any
 ) -> Any:
-    """One part, in a process of Ray."""
     import torch
 
     torch.set_num_threads(threads)

@@ -277,7 +277,6 @@ class AsyncExecutor:
         return self._state
 
     def _raise_failure(self) -> None:
-        """Raise if the worker has ended by an error."""
         failure = self._worker.failure
         if failure is not None:
             self._failure_told = True

@@ -145,7 +145,6 @@ def _numbers(limit: float | Sequence[float], name: str) -> FloatArray:
 
 
 def _vector(limit: float | Sequence[float] | None, channels: int, name: str, default: FloatArray) -> FloatArray:
-    """A limit as one number a channel."""
     if limit is None:
         return default
     array = _numbers(limit, name)

@@ -154,7 +154,6 @@ class Worker:
             self._ready.set()
 
     def _open(self) -> None:
-        """Pin the thread, measure the plans, refuse what is infeasible."""
         settings, resolved, given = self._settings, self._resolved, self._latencies
         if settings.cores is not None:
             _pin(settings.cores)
@@ -247,7 +246,6 @@ class Worker:
 
 
 def _pin(cores: tuple[int, ...]) -> None:
-    """Keep the calling thread on these processors."""
     if not hasattr(os, "sched_setaffinity"):
         raise ExecutorError("cores cannot be set on this system. Leave ExecutorSettings.cores at None.")
     try:

@@ -112,7 +112,6 @@ class OnnxBackend:
         return self._work.result()
 
     def _open_frames(self) -> FramePieces:
-        """Frame pieces that remember nothing yet."""
         towers = token_towers(self._manifest, self._view.variant.tokens, self._run, self._renew)
         return FramePieces(self._manifest.pieces, self._run, towers)
 

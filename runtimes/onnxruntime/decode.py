@@ -27,7 +27,6 @@ def decode_first(work: Workspace, keep: BoolArray) -> None:
 
 
 def _run_dense(work: Workspace, k: int, keep: BoolArray) -> None:
-    """A step that computes all blocks."""
     work.run_dense(k)
     for b in np.flatnonzero(keep[k]).tolist():
         np.copyto(work.rollout.entry(k * len(work.current) + b), work.current[b])
@@ -141,7 +140,6 @@ def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) ->
 def _run_dense_apart(
     work: Workspace, operands: Sequence[_Operands], streams: Sequence[int], k: int, keep: BoolArray
 ) -> None:
-    """All blocks at step k for these streams, all of the batch or some."""
     if len(streams) == work.streams:
         work.run_dense(k)
     else:

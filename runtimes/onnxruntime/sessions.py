@@ -152,7 +152,6 @@ class Sessions:
         return {piece: self._session(view, piece) for piece in sorted(pieces)}
 
     def _session(self, view: View, piece: str, first_step: bool = False) -> Any:
-        """The session of a piece's model, opened once."""
         file = view.onnx_file(piece, first_step)
         threads = 1 if piece in SINGLE_THREADED else self.threads
         spins = piece in OF_ALL_BLOCKS

@@ -220,7 +220,6 @@ class Workspace:
         return some.rows
 
     def _bound_block(self, b: int, stream: Array, residual: Array, count: int) -> BoundBlock:
-        """The session of block b on these arrays, which are of so many streams."""
         session, piece = self._sessions[block_name(b)], self._manifest.pieces[block_name(b)]
         return BoundBlock(session, piece, self._contexts, self.axis, stream, residual, count)
 

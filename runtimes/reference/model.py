@@ -324,7 +324,6 @@ class ReferenceModel:
     def _contexts(
         self, types: Mapping[str, TensorType], k: int, contexts: Contexts, streams: Sequence[int] | None = None
     ) -> dict[str, Tensor]:
-        """Values of these contexts at step k."""
         bound: dict[str, Tensor] = {}
         for name, kind in types.items():
             binding = self._pieces.bindings[name]
@@ -349,7 +348,6 @@ def _tensor(array: npt.NDArray[np.generic]) -> Tensor:
 
 
 def _select(value: Tensor, kind: TensorType, streams: Sequence[int] | None) -> Tensor:
-    """The part of a value that belongs to these streams."""
     if streams is None or kind.batch_axis is None:
         return value
     return value.index_select(kind.batch_axis, torch.tensor(streams, device=value.device))

@@ -211,7 +211,6 @@ class Listener(ABC):
         return None
 
     async def _told(self, connection: ServerConnection, path: str) -> Response:
-        """The answer to a plain GET."""
         if path == HEALTH:
             trouble = await self.trouble()
             status = HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK

@@ -148,7 +148,6 @@ class TorchBackend:
             return np.asarray(self.workspace.result.cpu().numpy()).copy()
 
     def _apart(self, streams: dict[Instructions, list[int]]) -> None:
-        """Streams of one plan are a batch of their own."""
         whole = self.workspace
         for plan, some in streams.items():
             if len(some) not in self._some:
@@ -196,7 +195,6 @@ class TorchBackend:
 
 
 def _after(first: Line, then: Line) -> None:
-    """Both, one after the other."""
     first()
     then()
 

@@ -275,7 +275,6 @@ class _Writer:
         return name
 
     def _value(self, node: Node, argument: Argument) -> Any:
-        """An argument for the examples."""
         if isinstance(argument, Ref):
             if argument.name not in self._values:
                 raise CaptureError(f"node {node} reads %{argument.name}, which nothing before it computes.")
@@ -290,7 +289,6 @@ class _Writer:
 
 
 def _storage(value: Tensor) -> int:
-    """Which memory a tensor sees; a packed weight has none that can be seen."""
     return -1 if value.is_mkldnn else int(value.untyped_storage()._cdata)
 
 

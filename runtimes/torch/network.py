@@ -125,7 +125,6 @@ class StreamsNetwork:
             self.values[name].copy_(split.movedim(1, axis + 1))
 
     def _write_and_run(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
-        """A piece that runs before the condition, written for inputs such as these."""
         graph = self._parts.pieces.once()[name]
         rows = self.streams if name == FRAMES else len(next(iter(given.values())))
         self._once[name] = self._written(graph, list(given.values()), rows, order=list(given))
@@ -210,7 +209,6 @@ class StreamsNetwork:
         return self._written(piece.graph, [value, *reads[0]], self.streams, narrow, order, weights), reads
 
     def _at(self, name: str, k: int) -> Tensor:
-        """The value of a context at step k."""
         stepwise = self._parts.manifest.contexts[name].binding is not Binding.CONDITION
         return self.values[name][k] if stepwise else self.values[name]
 
@@ -228,7 +226,6 @@ class StreamsNetwork:
         return found
 
     def _axis(self, name: str) -> int:
-        """The axis of the streams in a value of the step piece."""
         axis = self._parts.manifest.contexts[name].type.batch_axis
         if axis is None:
             problem = f"step value {name!r} has no axis for the streams"

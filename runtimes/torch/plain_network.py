@@ -142,12 +142,10 @@ class PlainNetwork:
         return self._repeated(name, self._tables[name][k])
 
     def _repeated(self, name: str, row: Tensor) -> Tensor:
-        """A row of a table for all streams."""
         axis = self._axes[name]
         return row.expand([self._streams if i == axis else n for i, n in enumerate(row.shape)])
 
     def _step(self, k: int) -> dict[str, Tensor]:
-        """The step values of step k."""
         step = self._pieces.step
         assert step is not None
         if k not in self._by_step:
@@ -216,7 +214,6 @@ class CallModule(nn.Module):
         return self._spec
 
     def _network(self, obs: Mapping[str, Tensor], initial: Tensor) -> PlainNetwork:
-        """The network of a call."""
         spec = self._spec
         horizon, dimensions = spec.sample
         if initial.ndim != 3 or tuple(initial.shape[1:]) != spec.sample or initial.dtype != torch.float32:
@@ -290,14 +287,12 @@ class CallModule(nn.Module):
         return (actions - normalizer["offset"]) / normalizer["scale"] if normalizer else actions.clone()
 
     def _keep(self, kind: str, arrays: Mapping[str, object]) -> None:
-        """Make buffers of arrays or tensors."""
         for name, value in arrays.items():
             buffer = f"constant_{len(self._names)}"  # names of weights have dots
             self._names[f"{kind}/{name}"] = buffer
             self.register_buffer(buffer, value if isinstance(value, Tensor) else torch.tensor(np.asarray(value)))
 
     def _kept(self, kind: str) -> dict[str, Tensor]:
-        """The buffers of a kind, by name."""
         start = f"{kind}/"
         found = {n.removeprefix(start): b for n, b in self._names.items() if n.startswith(start)}
         return {name: self.get_buffer(buffer) for name, buffer in found.items()}

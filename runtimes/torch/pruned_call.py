@@ -104,7 +104,6 @@ class PrunedCall(CallModule):
         written: Tensor,
         keeps: bool,
     ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Rollout]:
-        """The call, with a batch for each different plan."""
         logits = network.logits().detach().cpu().numpy()
         plans, _ = repair_plan(pruner_plan(logits), written.cpu().numpy())
         far = np.zeros(len(plans), np.bool_) if self._far is None else self._is_far(network).cpu().numpy()

@@ -126,7 +126,6 @@ class Advance:
         return moved._replace(history=self._longer(state, prediction)) if self._anchors[k] else moved
 
     def _moved(self, state: State, prediction: Tensor, clean: Tensor | None, matrix: Tensor, offset: Tensor) -> State:
-        """Sample and memories after a step."""
         sample, history, memory = state
         read = [sample, prediction, history, *([] if clean is None else [clean]), *[memory] * bool(self.memories)]
         following = torch.baddbmm(offset, torch.cat(read, 2), matrix)
@@ -135,7 +134,6 @@ class Advance:
         return State(following, history, memory)
 
     def _longer(self, state: State, prediction: Tensor) -> Tensor:
-        """The history after an anchor."""
         return torch.cat([state.sample, prediction, state.history[..., : 2 * self.horizon]], 2)
 
 

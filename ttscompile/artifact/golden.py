@@ -186,7 +186,6 @@ def _start(loop: str) -> str:
 
 
 def _length(arrays: Mapping[str, Array], name: str) -> int:
-    """Of the first axis of an array that may be missing."""
     return len(arrays[name]) if name in arrays and arrays[name].ndim else 0
 
 

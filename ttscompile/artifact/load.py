@@ -315,7 +315,6 @@ def table_prefix(loop: str) -> str:
 def _tables(
     stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, loop: str, where: Path
 ) -> Mapping[str, npt.NDArray[Any]]:
-    """The TABLE contexts of a loop that begins with noise."""
     prefix, steps = table_prefix(loop), manifest.sampler_of(loop).steps
     tables = {n.removeprefix(prefix): np.array(array) for n, array in stored.items() if n.startswith(prefix)}
     kinds = {n: c.type for n, c in manifest.contexts.items() if c.binding is Binding.TABLE}
@@ -325,7 +324,6 @@ def _tables(
 
 
 def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
-    """All plans by name, with their cells and corrections."""
     stored = _optional(directory, manifest.stores.plans)
     where = directory / (manifest.stores.plans or MANIFEST)
     schedules = {name: array for name, array in stored.items() if not name.startswith((PREFIX, ENVELOPE))}

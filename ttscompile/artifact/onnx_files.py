@@ -156,7 +156,6 @@ def _read(message: memoryview, left: _Left) -> Iterator[tuple[int, memoryview | 
 
 
 def _varint(message: memoryview, position: int) -> tuple[int, int]:
-    """A number, and where it ends."""
     value = shift = 0
     while True:
         byte = message[position]

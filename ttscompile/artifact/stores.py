@@ -134,7 +134,6 @@ def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockW
 
 
 def _put(directory: Path, name: str, content: bytes, files: dict[str, FileRecord]) -> Path:
-    """Write a file, and list it among others."""
     path = directory / name
     replace_file(path, content)
     files[name] = describe(path)

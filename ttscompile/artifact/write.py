@@ -234,7 +234,6 @@ def _fill(
     golden: Golden | None,
     loop: str,
 ) -> Manifest:
-    """Write all files of a new artifact into an empty folder."""
     graphs = program.pieces.graphs()
     values = records.constants(program, graphs)
     contexts = records.context_records(program)

@@ -115,7 +115,6 @@ def named_plans(artifact: Artifact, names: Sequence[str] = ()) -> dict[str, Plan
 
 
 def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> tuple[MeasuredPoint, ...]:
-    """All entrants judged, and then timed in turn."""
     scores = []
     for number, one in enumerate(entrants):
         progress("held-out calls", number, len(entrants))

@@ -262,7 +262,6 @@ def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock) -> None:
 
 
 def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
-    """Say what is bad for a calibration, before it begins."""
     bar, view, (fewest, _) = trials.bar, trials.executor.view, trials.limits
     if (warning := few_steps(view.manifest)) is not None:
         bar.warn(warning)

@@ -119,7 +119,6 @@ class Task:
 
 
 def _of_correction(correction: Correction | None) -> dict[str, int]:
-    """What the notes say of it."""
     reads, jumps = (0, 0) if correction is None else (correction.reads, len(correction.jumps))
     return {"numbers_read_of_the_observation": reads, "jumps": jumps}
 

@@ -93,7 +93,6 @@ class Tts:
         return [steps for offset in (-distance, distance) if (steps := self._moved(i, offset)) is not None]
 
     def _try(self, candidates: list[tuple[int, ...]]) -> None:
-        """Take the best of the candidates if it is better than the schedule so far."""
         for steps in candidates:
             error = self._whole.errors(steps).normalised
             if not error >= self.loss:  # the first one beats NaN

@@ -163,7 +163,6 @@ class WholeSteps:
         return (1 + 2 * share) * self.comparing(full_steps)  # without jumps, and with them
 
     def _errors(self, samples: Tensor) -> Errors:
-        """Of the samples that the calls to compare on end with."""
         normalised, units = (
             float(self._actions.errors(samples, self._compared.targets, units=u).mean()) for u in (False, True)
         )

@@ -178,7 +178,6 @@ def bench(
 
 
 def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
-    """By name."""
     found = {THIS: load_artifact(directory)}
     for other in others:
         if (name := other.resolve().name) in found:

@@ -63,7 +63,6 @@ class Loop:
             self._with(one)
 
     def _with(self, one: Contestant) -> Resolved:
-        """The loop with this contestant."""
         assert one.policy is not None  # a network alone drives nothing
         return resolve(replace(self.settings, tiers=(one.plan,)), one.policy.info, self.control_hz)
 

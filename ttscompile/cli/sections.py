@@ -64,5 +64,4 @@ def _is_given(ctx: click.Context, one: click.Parameter) -> bool:
 
 
 def _word(option: click.Parameter) -> str:
-    """How an option is written."""
     return max(option.opts, key=len)

@@ -119,7 +119,6 @@ def _serve_robot(
 
 
 def _serve_openpi(directory: Path, server: ServerOptions, how: dict[str, Any], plan: str | None = None) -> None:
-    """To clients of openpi, with a policy that is loaded so."""
     console, artifact = progress(), load_artifact(directory)
     with console.status("loading"):
         openpi = OpenPiServer(artifact, open_policy(artifact, plan=plan, **how), lock=server.lock)
@@ -130,7 +129,6 @@ def _serve_openpi(directory: Path, server: ServerOptions, how: dict[str, Any], p
 def _serve_fleet(
     directory: Path, server: ServerOptions, ray: str, settings: FleetSettings, plan: str | None = None
 ) -> None:
-    """From copies of the policy."""
     console, artifact = progress(), load_artifact(directory)
     Plans.of(artifact, plan)  # before copies are started, which takes a while
     output, identity = sys.stdout, artifact.manifest.identity

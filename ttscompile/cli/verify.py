@@ -52,7 +52,6 @@ def verify(
 
 
 def _print(found: ttscompile.Verification, output: Console) -> None:
-    """The ladder as a table, and what to do."""
     rows = [(r.name, r.status, figure(r.figure), figure(r.tolerance), r.unit) for r in found.rungs]
     made = table("rung", "", "error", "allowed", "of what", rows=rows)
     made.columns[1].justify = made.columns[4].justify = "left"

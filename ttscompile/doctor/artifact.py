@@ -67,7 +67,6 @@ def _needs(artifact: Artifact) -> list[Finding]:
 
 
 def _call(artifact: Artifact) -> list[Finding]:
-    """Calls on a random observation."""
     from ..runtimes.open import open_runtime
     from ..runtimes.policy import CompiledPolicy
     from ..runtimes.random_calls import random_call

@@ -42,7 +42,6 @@ def target_findings(
 
 
 def _checkpoint(target: Path | str) -> tuple[list[Finding], PolicySpec]:
-    """What is in it, and its specification."""
     from ..frontends import load_checkpoint_policy
     from ..frontends.examined import examine
     from ..hub import fetch_checkpoint

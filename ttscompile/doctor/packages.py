@@ -93,7 +93,6 @@ def _packages(wanted: list[Requirement]) -> list[Finding]:
 
 
 def _installed(wanted: Requirement) -> tuple[str, bool]:
-    """The version for people, and whether it is enough."""
     try:
         found = version(wanted.name)
     except PackageNotFoundError:

@@ -202,8 +202,6 @@ class _SelfAttention(nn.Module):
 
 
 class _FeedForward(nn.Module):
-    """Two linear layers, and the activation between them."""
-
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.fc1 = nn.Linear(config.hidden_size, config.intermediate_size)
@@ -215,8 +213,6 @@ class _FeedForward(nn.Module):
 
 
 class _Layer(nn.Module):
-    """Pre-norm self-attention and feed-forward."""
-
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.layer_norm1 = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)

@@ -96,7 +96,6 @@ def _network(settings: Settings) -> str:
 def _view(
     settings: Settings, key: str, shape: tuple[int, ...], normalizer: tuple[float, float], imagenet: bool
 ) -> View:
-    """How one camera's images reach the network."""
     channels, height, width = shape
     if channels != COLOURS:
         raise settings.error(

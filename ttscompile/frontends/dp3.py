@@ -67,7 +67,6 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
 
 
 def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointCloudEncoder:
-    """The observation encoder with its weights."""
     coloured = settings.flag("use_pc_color", False)
     settings.choice("pointnet_type", "pointnet")
     values = settings.values.get("pointcloud_encoder_cfg")

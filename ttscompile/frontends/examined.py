@@ -50,7 +50,6 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
 
 
 def _judged(key: str, one: Statistics) -> Finding:
-    """Whether statistics do what they are for."""
     first, second = one.first.flatten(), one.second.flatten()
     (of, width, place, size) = ("range", second - first, -1, 2)
     if one.mode == "MEAN_STD":

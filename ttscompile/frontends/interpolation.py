@@ -50,14 +50,12 @@ def _refuse(why: str) -> CheckpointError:
 
 
 def _number(value: Any) -> Any:
-    """The value itself if it is a number of reasonable size."""
     if not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
         raise _refuse(f"{value!r} is not a number below {_LARGEST:g}")
     return value
 
 
 def _evaluate(node: ast.AST) -> Any:
-    """The value of one node of an expression."""
     match node:
         case ast.Constant(value=bool() | int() | float() | str() | None):
             return node.value

@@ -112,7 +112,6 @@ def read_lerobot_config(
 
 
 def _features(settings: Settings, name: str) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Type and shape of each feature."""
     entries = settings.values.get(name)
     if not isinstance(entries, dict):
         raise settings.refusal(name, "type and shape by name")

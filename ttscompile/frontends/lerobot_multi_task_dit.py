@@ -94,7 +94,6 @@ def read_config(directory: Path, entries: Mapping[str, Any]) -> MultiTaskDiTConf
 
 
 def _network(settings: Settings, shared: LeRobotConfig) -> DiTConfig:
-    """Sizes and variant of the denoiser."""
     base = settings.values.get("rope_base", 10000.0)
     if type(base) not in (int, float) or not 1 < base < 2**63:
         raise settings.refusal("rope_base", "a number above 1")
@@ -181,7 +180,6 @@ def with_inputs(
 
 
 def _loops(config: MultiTaskDiTConfig, options: LoadOptions) -> Loops:
-    """The denoising loops of the policy's objective."""
     if not config.flow:
         return diffusion_loops(config, options)
     return loops_of(lambda each: _flow(config, each), options, "its own integration")

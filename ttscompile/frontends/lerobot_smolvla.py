@@ -147,7 +147,6 @@ def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
 
 
 def _layers(settings: Settings, there: int) -> int:
-    """Layers of the language model that are used, and of the expert."""
     wanted, expert = settings.values.get("num_vlm_layers", 16), settings.values.get("num_expert_layers", -1)
     if type(wanted) is not int or type(expert) is not int:
         raise settings.refusal("num_vlm_layers", "a whole number, as num_expert_layers is")
@@ -158,7 +157,6 @@ def _layers(settings: Settings, there: int) -> int:
 
 
 def _crosses(settings: Settings, layers: int) -> tuple[bool, ...]:
-    """Which layers of the expert see the prefix alone."""
     crossing = settings.choice("attention_mode", "cross_attn", "self_attn") == "cross_attn"
     every = settings.values.get("self_attn_every_n_layers", 2)
     if type(every) is not int:

@@ -37,8 +37,6 @@ class View:
 
 
 class _Camera(nn.Module):
-    """Images of one camera as its ResNet takes them."""
-
     scale: torch.Tensor
     offset: torch.Tensor
 

@@ -94,8 +94,6 @@ class _Text(nn.Module):
 
 
 class _ExpertLayer(nn.Module):
-    """One layer of the expert."""
-
     def __init__(self, config: SmolVLAConfig, crosses: bool) -> None:
         super().__init__()
         expert = config.expert

@@ -132,7 +132,6 @@ def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
 
 
 def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str], anew: bool = False) -> Fetched:
-    """Download these files, and nothing of another kind."""
     if len(chosen) > MOST_FILES:
         raise HubError(f"{text}: it lists {len(chosen)} files; expected {MOST_FILES} at most.")
     for each in chosen:
@@ -166,13 +165,11 @@ def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str],
 
 
 def _listing(hub: Any, repository: str, commit: str) -> list[str]:
-    """Files of a repository."""
     tree = hub.HfApi().list_repo_tree(repository, revision=commit, recursive=True)
     return [each.path for each in tree if isinstance(each, hub.hf_api.RepoFile)]
 
 
 def _kept(folder: Path) -> list[str]:
-    """Files of it that the cache has."""
     return [each.relative_to(folder).as_posix() for each in folder.rglob("*") if each.is_file()]
 
 

@@ -165,7 +165,6 @@ class Evaluator:
         return tuple(frame[slot] for slot in self._outputs)
 
     def _compile(self, node: Node) -> Getter:
-        """A closure that computes one node from the frame."""
         function, positional, names = resolve_op(node), len(node.args), [name for name, _ in node.kwargs]
         fixed, getter = self._argument(node, (*node.args, *(value for _, value in node.kwargs)))
 

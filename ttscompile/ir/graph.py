@@ -120,7 +120,6 @@ class Node:
         return replace(node, types=tuple(type_.resized(size) for type_ in self.types))
 
     def _mapped(self, function: Callable[[Argument], Argument]) -> Node:
-        """With others in the place of ``leaves``."""
         args = tuple(_map(a, function) for a in self.args)
         return replace(self, args=args, kwargs=tuple((k, _map(a, function)) for k, a in self.kwargs))
 

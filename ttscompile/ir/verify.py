@@ -91,7 +91,6 @@ def _verify_contexts(readers: Mapping[str, Iterable[str]], given: Container[str]
 
 
 def _verify_bindings(pieces: Pieces) -> None:
-    """Contexts and features are there when they are read."""
     step = () if pieces.step is None else pieces.step.outputs
     provided = {Binding.CONDITION: pieces.condition.outputs, Binding.TABLE: pieces.tables, Binding.STEP: step}
     given = {name for name, binding in pieces.bindings.items() if name in provided.get(binding, ())}

@@ -118,8 +118,6 @@ def _moved(piece: LoopPiece, prefix: str, stream: str, taken: set[str]) -> tuple
 
 
 class _Update:
-    """Writes the nodes of the sampler's update."""
-
     def __init__(self, taken: set[str], type_: TensorType) -> None:
         self.taken = taken
         self.type = type_
@@ -166,7 +164,6 @@ class _Update:
 
 
 def _fresh(name: str, taken: set[str]) -> str:
-    """A name that is not taken; takes it."""
     while name in taken:
         name += "_"
     taken.add(name)

@@ -47,7 +47,6 @@ class Contexts:
         self.by_step = {} if pieces.step is None else self._step_values(models[STEP])
 
     def _inline(self, name: str, values: Mapping[str, str]) -> list[str]:
-        """The outputs of a piece on values by the name of its input."""
         model = self._models[name]
         return self._main.inline(model, {v.name: values[v.name] for v in model.graph.input}, self._weights)
 
@@ -67,7 +66,6 @@ class Contexts:
         return rows[0] if len(rows) == 1 else self._main.op("Concat", *rows, axis=1)
 
     def _step_values(self, model: ModelProto) -> dict[str, str]:
-        """Step values, made for all steps in one batch of K * B."""
         step, main = self.pieces.step, self._main
         assert step is not None
         feeds = {}
@@ -137,7 +135,6 @@ class StreamContexts:
 
 
 def _sizes(w: GraphWriter, streams: str, type_: TensorType, axis: int) -> list[str]:
-    """The size of each axis, for as many streams as there are."""
     return [streams if i == axis else w.constant([n]) for i, n in enumerate(type_.at(1))]
 
 

@@ -62,7 +62,6 @@ def _join_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> Mode
 
 
 def _chain_blocks(blocks: Sequence[LoopPiece], own: Sequence[ModelProto]) -> ModelProto:
-    """The model of a step that computes all blocks."""
     stream = blocks[0].type
     contexts = {name: type_ for piece in blocks for name, type_ in piece.contexts.items()}
     nodes: list[NodeProto] = []

@@ -267,12 +267,10 @@ class DenoisingLoop:
         return w.choose(in_step, reads.body("in_step", added), plain.body("plain", same))[0]
 
     def _fresh_state(self, w: GraphWriter) -> _State:
-        """Names for what a body carries."""
         memory = (w.fresh(MEMORY),) if self._sampler.memories else ()
         return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history"), memory)
 
     def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
-        """Tail, sampler and the next step's stem."""
         by_step = {OFFSET: self._inputs.offset, UPDATE: self._inputs.update, **self._x0_columns}
         feeds = {STREAM: state.stream, SAMPLE: state.sample, HISTORY: state.history}
         feeds |= zip([MEMORY] * len(state.memory), state.memory, strict=True)

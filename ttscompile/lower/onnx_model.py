@@ -154,7 +154,6 @@ def _fresh_names(prefix: str, taken: set[str]) -> Iterator[str]:
 
 
 def _dtype(type_: TensorType) -> int:
-    """ONNX's number of a dtype."""
     names = {"float32": "FLOAT", "float64": "DOUBLE"}
     return int(TensorProto.DataType.Value(names.get(type_.dtype, type_.dtype.upper())))
 

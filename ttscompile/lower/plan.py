@@ -157,7 +157,6 @@ def _last_of_earlier_steps(w: GraphWriter, ones: str, groups: Sequence[int], ste
 
 
 def _ranks(groups: Sequence[int]) -> list[int]:
-    """Groups numbered from zero."""
     numbers = {group: rank for rank, group in enumerate(dict.fromkeys(groups))}
     return [numbers[group] for group in groups]
 
@@ -245,7 +244,6 @@ def write_executed_plans(
 
 
 def _of_pruner(w: GraphWriter, logits: str) -> GraphProto:
-    """The branch in which the largest logit of each cell says its source."""
     plan = w.op("Cast", w.op("ArgMax", logits, axis=3, keepdims=0), to=INT8)
     no_number = w.op("Cast", w.op("IsNaN", logits), to=FLOAT)
     some = w.op("ReduceMax", no_number, w.constant([1, 2, 3]), keepdims=0)
@@ -255,6 +253,5 @@ def _of_pruner(w: GraphWriter, logits: str) -> GraphProto:
 
 
 def _as_given(w: GraphWriter, plan: str, shape: str) -> GraphProto:
-    """The branch that executes the plan of the caller."""
     same, fine = w.op("Expand", plan, shape), w.constant(np.zeros((1, 1, 1)), np.float32)
     return w.graph("given_plan", [tensor(same, np.int8), tensor(w.op("Identity", fine), np.float32)])

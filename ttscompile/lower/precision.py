@@ -155,7 +155,6 @@ def _tokens(model: ModelProto) -> int:
 def _notes(
     precision: str, part: str, pieces: list[str], lowered: Mapping[str, ModelProto], constants: Mapping[str, Array]
 ) -> Iterator[str]:
-    """What became of the pieces of one part."""
     kinds = Counter(node.op_type for model in lowered.values() for node in model.graph.node)
     if lowered:
         where = f"{len(lowered)} of {len(pieces)} blocks" if part == BLOCKS else part

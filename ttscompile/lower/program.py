@@ -88,7 +88,6 @@ def structural_key(graph: Graph) -> str:
 
 
 def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
-    """Lower graphs, those of one structure with one export."""
     for name, graph in graphs.items():
         if len(set(graph.outputs)) != len(graph.outputs):
             raise LoweringError(f"{name}: the outputs {graph.outputs} hold a value twice; give each a name of its own.")

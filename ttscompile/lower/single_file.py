@@ -156,7 +156,6 @@ def lower_single_file(
 
 
 def _normalized(main: GraphWriter, key: str, spec: PolicySpec) -> str:
-    """An observation as the network wants it."""
     each = spec.observations[key]
     if each.normalizer is None:
         return key
@@ -285,7 +284,6 @@ def condition_numbers(program: Program) -> int:
 
 
 def _of_every_policy(program: Program) -> tuple[Values, Values]:
-    """What every policy has, beside its observations."""
     spec, count = program.spec, len(program.blocks)
     (horizon, channels), chunk, steps = spec.sample, spec.chunk, spec.sampler.steps
     row = program.blocks[0].type.at(1)

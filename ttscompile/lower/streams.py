@@ -97,7 +97,6 @@ def _uncorrected(w: GraphWriter, inputs: LoopInputs, far: str) -> LoopInputs:
 
 
 def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:
-    """What belongs to some streams."""
 
     def of(value: str, axis: int) -> str:
         return w.op("Gather", value, members, axis=axis)

@@ -78,5 +78,4 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
 
 
 def _near(p: Point, other: Point) -> bool:
-    """Whether the names of two points would cover each other."""
     return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.error / other.error)) < 0.2

@@ -82,7 +82,6 @@ def refuse_bound(clip: float | None, method: str) -> None:
 
 
 def _times(steps: int | Sequence[float], start: float, end: float) -> Times:
-    """The N + 1 times."""
     if isinstance(steps, Sequence) or np.ndim(steps):
         times = numbers(steps, "steps", SpecError, "float64")
     else:

@@ -126,7 +126,6 @@ def multistep_table(scheduler: Any, steps: int, name: str, step_arguments: Mappi
 
 
 def _measure(chains: _Chains) -> _Rows:
-    """All rows, from the answers to pulses."""
     steps, name = chains.steps, chains.name
     zero, numbers = np.zeros(steps), np.arange(steps)
     sample_to_x0, out_to_x0 = np.zeros((2, steps))
@@ -163,7 +162,6 @@ def _measure(chains: _Chains) -> _Rows:
 
 
 def _clip(chains: _Chains, out_to_x0: Array) -> float | None:
-    """The bound on what outputs mean, if there is one."""
     zero = np.zeros(chains.steps)
     near, far = (np.abs(chains.numbers(zero, reach * _FAR / out_to_x0)[0]) for reach in (1, 2))
     if not (near == far).any():

@@ -147,7 +147,6 @@ def _refuse_known(scheduler: Any) -> None:
 
 
 def _is_multistep(scheduler: Any) -> bool:
-    """Whether it is diffusers' DPMSolverMultistepScheduler or made from it."""
     return "DPMSolverMultistepScheduler" in {base.__name__ for base in type(scheduler).__mro__}
 
 

@@ -99,7 +99,6 @@ def load_trajectories(
 def _read(
     path: Path, observations: Mapping[str, ObservationSpec], action_steps: int, sources: Mapping[str, Sequence[str]]
 ) -> list[Episode]:
-    """Episodes of one file."""
     used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
     other, held, frames = _opened(path, sorted(used))
     if sources and not frames:
@@ -145,7 +144,6 @@ def _opened(path: Path, wanted: Sequence[str]) -> tuple[str | None, Frames, bool
 
 
 def _npz(path: Path) -> tuple[Frames, bool]:
-    """What an ``.npz`` holds, and whether its rows are frames rather than calls."""
     arrays = read_npz(path)
     frames = _meta(path, arrays.pop(META, None))
     if ENDS not in arrays:
@@ -205,7 +203,6 @@ def _other_format(path: Path) -> str | None:
 
 
 def _meta(path: Path, value: Array | None) -> bool:
-    """Whether the rows are frames rather than calls."""
     if value is None:
         return False
     meta = None

@@ -92,7 +92,6 @@ def observation_frames(
 
 
 def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
-    """One of the arrays that a key is made of."""
     name, colon, count = part.partition(":")
     if name not in frames.names:
         raise TrajectoryError(
@@ -116,7 +115,6 @@ def few(names: Sequence[str]) -> str:
 
 
 def _flat(path: Path, name: str, array: Array) -> Array:
-    """Frames as ``[F, numbers]``."""
     if not array.ndim or not array.size:
         raise TrajectoryError(f"{path}: {name!r} is {list(array.shape)}; expected frames [F, ...] that are not empty.")
     return array.reshape(len(array), -1)

@@ -94,6 +94,5 @@ def _require_plain(path: Path, array: Any) -> None:
 
 
 def _number(demo: str) -> tuple[int, str]:
-    """Order of ``demo_2`` and ``demo_10``."""
     found = re.search(r"\d+$", demo)
     return (int(found.group()) if found else 0, demo)

@@ -101,7 +101,6 @@ def _images_or_numbers(path: Path, name: str, kind: Any) -> bool:
 
 
 def _rows(values: Any) -> Array:
-    """Numbers as ``[n, ...]``, of lists of lists a level at a time."""
     import pyarrow
     from pyarrow import compute
 
@@ -118,7 +117,6 @@ def _rows(values: Any) -> Array:
 
 
 def _image(path: Path, name: str, value: Any) -> Array:
-    """A PNG or JPEG as ``[H, W, C]``."""
     from PIL import Image
 
     content = value.get("bytes") if value is not None else None

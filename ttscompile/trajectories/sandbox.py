@@ -93,7 +93,6 @@ def reader(request: Mapping[str, Any]) -> Iterator[IO[bytes]]:
 
 
 def _ended(path: str, status: int) -> TrajectoryError:
-    """The error of a reader that ended before its answer did."""
     how = f"with exit status {status}"
     if status < 0:
         name = signal.Signals(-status).name

@@ -102,7 +102,6 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
 
 
 def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> Any:
-    """``network.BlockFunction`` of the reference runtime."""
     import torch
 
     with torch.no_grad():

@@ -149,7 +149,6 @@ def _run(
     errors: Errors,
     unpaired: Unpaired | None,
 ) -> None:
-    """One episode with every plan, and twice dense; each begins with a reset."""
     noises, others = ([random_noise(spec, draw) for _ in rows] for _ in range(2))
 
     def actions(plan: str, with_noise: Sequence[Noise]) -> list[npt.NDArray[np.float64]]:

@@ -123,7 +123,6 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
 
 
 def _wrong_files(directory: Path) -> list[str]:
-    """What is wrong with the manifest or with each file that it lists."""
     try:
         manifest = read_manifest(directory)
     except ArtifactError as error:
@@ -140,7 +139,6 @@ def _wrong_files(directory: Path) -> list[str]:
 def _climb(
     artifact: Artifact, episodes: Sequence[Any], threads: int, progress: Progress
 ) -> tuple[list[Rung], ErrorMap | None]:
-    """All rungs above integrity."""
     artifact = replace(artifact, envelope=None)  # inputs of the record are random, and plans are to be as they are
     golden = load_golden(artifact)
     recorded, dense = load_golden_plans(artifact, golden.streams), artifact.plans[DENSE]

@@ -245,7 +245,6 @@ class _Inside:
         return found, inside
 
     def _at(self, timestep: np.generic) -> dict[str, torch.Tensor]:
-        """This timestep of every stream, and the observations."""
         timesteps = torch.from_numpy(np.full(self._streams, timestep))
         return {self._spec.timestep_argument: timesteps, **self._observations}
 

@@ -199,7 +199,6 @@ class Loops:
         return near(self._scores[_name(loop, count)], wanted) and self._deadline is None
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
-        """Trials of a loop, that has so many seconds."""
         limit, now = trials.clock.limit, trials.clock.elapsed()
         until = (now + ANSWERING * seconds) / limit if np.isfinite(limit) else 1.0
         own = replace(trials.of_loop(loop), until=until)
@@ -231,7 +230,6 @@ class Loops:
         return f"is {score.distance:.3g} from the original; {self._farthest:g} is allowed"
 
     def _none(self) -> str:
-        """Why there is nothing to propose."""
         if not self._scores:
             left = "; ".join(self._left_out) or "the time ended the search"
             return f"no plan could be tried: {left}. Allow more time."

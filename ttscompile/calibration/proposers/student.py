@@ -227,7 +227,6 @@ class Student:
 
     @torch.no_grad()
     def _write(self) -> None:
-        """Put the changes into the weights that the executor reads."""
         for name, value in self._weights.items():
             left, right = self._factors[f"{name}/left"], self._factors[f"{name}/right"]
             value.copy_(self._original[name] + (left @ right * _scale(right)).reshape(value.shape))

@@ -213,14 +213,12 @@ class Paper(NothingAfter):
         return round(float(self._task.budget * (self._most / self._task.budget) ** left))
 
     def _logits(self, values: Mapping[str, Array] | Mapping[str, Tensor], calls: Calls) -> Tensor:
-        """What the head says, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.as_tensor(value) for name, value in values.items()}
         if self._observes:
             return self._task.executor.model.logits(calls.contexts, tensors)
         return tensors[BASE].expand(calls.count, *tensors[BASE].shape)
 
     def _update(self, practice: Practice, numbers: IntArray, interval: int) -> None:
-        """One step of Adam on the calls of these numbers."""
         task, calls = self._task, self._task.executor.select(practice.calls, numbers)
         leaves = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in self._values.items()}
         logits = self._logits(leaves, calls)
