@@ -58,6 +58,7 @@ RIVALS_READ = {
         "calls",
         "execute",
         "spacing",
+        "strategy",
         "task",
     )
 }

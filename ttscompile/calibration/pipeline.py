@@ -32,7 +32,8 @@ from .result import CalibrationResult
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
-from .strategies import DEFAULT, Strategy, strategy_of
+from .strategies import DEFAULT, strategy_of
+from .strategy import Strategy
 from .targets import REPEATS
 from .trials import Trials, base_of
 

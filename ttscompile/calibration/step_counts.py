@@ -11,7 +11,7 @@ from .clock import Clock
 from .progress import Bar
 from .spacing import CROWDING, spacings
 from .state import StateFile
-from .strategies import Strategy
+from .strategy import Strategy
 from .task import Found, Task
 from .whole_steps import Errors, WholeSteps
 
