@@ -47,6 +47,8 @@ class PolicyInfo:
         noise: what a loop begins with: numbers of the ``normal`` distribution, or ``uniform`` ones of -1..1.
         follows: whether that plan begins with the chunk of the call before, so that each call has to be one chunk later
             than the one before (``CompiledPolicy.follow`` tells it of one that is not).
+        other_noise: how far two answers of the original to one observation are apart, mean over the executed actions in
+            their units, as the calibration found it; None without one, or where noise changes nothing.
     """
 
     K: int
@@ -69,3 +71,4 @@ class PolicyInfo:
     reuses_tokens: bool = False
     follows: bool = False
     noise: str = "normal"
+    other_noise: float | None = None

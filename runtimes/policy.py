@@ -108,6 +108,7 @@ class CompiledPolicy:
             reuses_tokens=self._runtime.reuses_tokens,
             follows=default.otherwise is not None,
             noise=manifest.spec.noise,
+            other_noise=(self._artifact.manifest.calibration or {}).get("other_noise") or None,
         )
 
     @property

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .runtimes.executor import AsyncExecutor as AsyncExecutor
     from .runtimes.executor import ExecutorSettings as ExecutorSettings
     from .runtimes.executor import GuardLimits as GuardLimits
+    from .runtimes.executor import Shadow as Shadow
     from .runtimes.info import PolicyInfo as PolicyInfo
     from .runtimes.load import load as load
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
@@ -57,7 +58,7 @@ _HOMES = {
         "errors": ("TtscompileError",),
         "report.push": ("push",),
         "runtimes.report": ("CallReport",),
-        "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits"),
+        "runtimes.executor": ("AsyncExecutor", "ExecutorSettings", "GuardLimits", "Shadow"),
         "runtimes.info": ("PolicyInfo",),
         "runtimes.load": ("load",),
         "runtimes.policy": ("CompiledPolicy",),

@@ -91,6 +91,7 @@ class Figures:
             their medians; None if there never was an action.
         bridged: share of the ticks that had an action in reserve, or the last one held, because a chunk was late.
         still: share of the ticks that had no action.
+        stalls: calls of the watchdog in an episode, mean.
     """
 
     evaluation: Evaluation
@@ -98,6 +99,7 @@ class Figures:
     age: float | None
     bridged: float
     still: float
+    stalls: float
 
     def to_json(self) -> dict[str, Any]:
         """The figures, and the score of every seed."""
@@ -121,6 +123,7 @@ def figures(setup: Setup, driven: Sequence[Driven], baseline: Rollout) -> Figure
         age=float(np.mean(ages)) if ages else None,
         bridged=sum(each.bridged for each in driven) / steps,
         still=sum(each.still for each in driven) / steps,
+        stalls=float(np.mean([each.stalls for each in driven])),
     )
 
 
@@ -132,7 +135,8 @@ def delays_table(found: dict[Setup, Figures], baseline: Evaluation) -> Table:
     )
     table.add_column("latency, ms", justify="right")
     table.add_column("setup")
-    for column in ("score", "success", "score, difference", "calls", "age, ticks", "bridged", "standing still"):
+    columns = "score", "success", "score, difference", "calls", "age, ticks", "bridged", "standing still", "watchdog"
+    for column in columns:
         table.add_column(column, justify="right")
     calls = np.mean([each.calls for each in episodes])
     table.add_row("", "the world waits", str(baseline.score), f"{baseline.success.mean:.3f}", "", f"{calls:.1f}")
@@ -148,6 +152,7 @@ def delays_table(found: dict[Setup, Figures], baseline: Evaluation) -> Table:
             "" if each.age is None else f"{each.age:.1f}",
             f"{each.bridged:.1%}",
             f"{each.still:.1%}",
+            "" if setup.stall_after is None else f"{each.stalls:.1f}",
         )
     return table
 
@@ -170,7 +175,9 @@ def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
 @click.command()
 @click.argument("variant", metavar="DIR[:PLAN]")
 @click.option("--latency-ms", "latencies", default="0,30,60,300,600", show_default=True, callback=several(float))
-@click.option("--seams", default="replace", show_default=True, callback=several(str), help="replace, blend, prefix.")
+@click.option(
+    "--seams", default="replace", show_default=True, callback=several(str), help="replace, blend, ensemble, prefix."
+)
 @click.option("--margins", default="1", show_default=True, callback=several(int), help="Ticks.")
 @click.option(
     "--horizons",
@@ -178,6 +185,14 @@ def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
     show_default=True,
     callback=several(int),
     help="Actions from one call to the next; 0: as many as the policy executes.",
+)
+@click.option(
+    "--stall-after",
+    "watchdogs",
+    default="0",
+    show_default=True,
+    callback=several(float),
+    help="Seconds without movement after which one call is dense and from nothing; 0: no watchdog.",
 )
 @click.option("--hz", default=10.0, show_default=True, type=click.FloatRange(min=0.1), help="Ticks a second.")
 @click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
@@ -193,6 +208,7 @@ def main(
     seams: list[str],
     margins: list[int],
     horizons: list[int],
+    watchdogs: list[float],
     hz: float,
     episodes: int,
     first_seed: int,
@@ -206,8 +222,8 @@ def main(
     opened, cache = open_variant(variant, runtime, 1), cache or Path("build", "pusht", "episodes")
     seeds = range(first_seed, first_seed + episodes)
     setups = [
-        Setup(latency, seam, margin, horizon or None, hz)
-        for seam, margin, horizon, latency in product(seams, margins, horizons, latencies)
+        Setup(latency, seam, margin, horizon or None, hz, watchdog or None)
+        for seam, margin, horizon, watchdog, latency in product(seams, margins, horizons, watchdogs, latencies)
     ]
     for setup in setups:
         setup.settings(opened.plan or opened.policy.info.default_plan)  # refused now, not after the baseline

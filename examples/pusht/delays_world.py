@@ -111,9 +111,10 @@ class DelayedPolicy:
         self.windows: list[Mapping[str, Array]] = []
 
     def reset(self, seed: int | None = None) -> None:
-        """A new episode."""
+        """A new episode; without a seed, as the executor's watchdog asks for it, its noise goes on."""
         self._variant.policy.reset()
-        self._seed, self.windows = seed or 0, []
+        if seed is not None:
+            self._seed, self.windows = seed, []
 
     def follow(self, executed: int) -> None:
         """See ``CompiledPolicy.follow``."""
@@ -139,6 +140,7 @@ class Setup:
         margin: ticks that a chunk shall be there before it is needed.
         horizon: actions from one call to the next; None for as many as the policy executes.
         hz: ticks a second, each one step of the environment.
+        stall_after: as in ``ExecutorSettings``.
     """
 
     latency_ms: float
@@ -146,12 +148,14 @@ class Setup:
     margin: int
     horizon: int | None
     hz: float
+    stall_after: float | None = None
 
     @property
     def label(self) -> str:
         """All but the latency."""
         horizon = "" if self.horizon is None else f", horizon {self.horizon}"
-        return f"{self.seam}, margin {self.margin}{horizon}"
+        watchdog = "" if self.stall_after is None else f", watchdog {self.stall_after:g} s"
+        return f"{self.seam}, margin {self.margin}{horizon}{watchdog}"
 
     def settings(self, plan: str) -> ExecutorSettings:
         """Of the executor.
@@ -164,6 +168,7 @@ class Setup:
             margin_ticks=self.margin,
             horizon=self.horizon,
             tiers=(plan,),
+            stall_after=self.stall_after,
             refuse_infeasible=False,
             trace_events=0,
         )
@@ -180,12 +185,14 @@ class Driven:
         bridged: ticks with an action in reserve or with the last one held, because a chunk was late.
         age: ticks from the observation that an action was computed from to when it was executed, median; None if there
             never was an action.
+        stalls: calls of the watchdog.
     """
 
     episode: Episode
     still: int
     bridged: int
     age: float | None
+    stalls: int = 0
 
 
 def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
@@ -200,7 +207,9 @@ def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
     clock, world = LockStepClock(), Recorder(PushT(), seed)
     latency = setup.latency_ms / 1e3
     policy = DelayedPolicy(variant, clock, latency)
-    executor = AsyncExecutor(policy, setup.hz, setup.settings(plan), clock=clock, latencies={plan: latency})
+    settings = setup.settings(plan)
+    latencies = dict.fromkeys((plan, settings.stall_plan), latency)
+    executor = AsyncExecutor(policy, setup.hz, settings, clock=clock, latencies=latencies)
     still = 0
     try:
         clock.join()
@@ -223,4 +232,5 @@ def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
     age = statistics.action_age_ms
     world.windows = policy.windows
     bridged = statistics.reserve + statistics.holds
-    return Driven(world.episode(), still, bridged, None if age is None else age.p50 * setup.hz / 1e3)
+    ticks = None if age is None else age.p50 * setup.hz / 1e3
+    return Driven(world.episode(), still, bridged, ticks, statistics.stalls)

@@ -9,6 +9,7 @@ Everything that decides is a state machine without clock or thread, driven by ``
 - ``stall``: whether the policy has stopped moving.
 - ``state``: all of these together.
 - ``statistics``, ``trace``: what happened.
+- ``shadow``: a compiled policy beside the original that acts.
 - ``server``, ``protocol``: the executor for other processes.
 """
 
@@ -19,6 +20,7 @@ from .feasibility import Feasibility
 from .guard import GuardLimits
 from .measure import Clock, MonotonicClock
 from .settings import ExecutorSettings
+from .shadow import Shadow, ShadowReport
 from .statistics import ExecutorStatistics
 
 __all__ = [
@@ -29,4 +31,6 @@ __all__ = [
     "Feasibility",
     "GuardLimits",
     "MonotonicClock",
+    "Shadow",
+    "ShadowReport",
 ]

@@ -144,13 +144,13 @@ class ExecutorSettings:
         for name in ("policy_hz", "max_age", "stall_after"):
             value = getattr(self, name)
             if value is not None:
-                _require_number(value, name)
-        _require_number(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
-        _require_number(self.stall_range, "stall_range")
+                require_number(value, name)
+        require_number(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
+        require_number(self.stall_range, "stall_range")
         if not isinstance(self.stall_plan, str):
             raise ExecutorError(f"stall_plan must be the name of a plan; found {self.stall_plan!r}.")
         most, name = _MOST_COEFFICIENT, "ensemble_coefficient"
-        _require_number(self.ensemble_coefficient, name, most, f"between {-most:g} and {most:g}", -most)
+        require_number(self.ensemble_coefficient, name, most, f"between {-most:g} and {most:g}", -most)
         if self.interpolation not in INTERPOLATIONS:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
@@ -160,9 +160,10 @@ class ExecutorSettings:
             raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
 
 
-def _require_number(
+def require_number(
     value: object, name: str, below: float = inf, wanted: str = "positive and finite", above: float = 0.0
 ) -> None:
+    """Raise ExecutorError unless a value is a number between two others."""
     if isinstance(value, bool) or not isinstance(value, Real) or not above < float(value) < below:
         raise ExecutorError(f"{name} must be a number, {wanted}; found {value!r}.")
 
@@ -211,7 +212,7 @@ class Resolved:
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy. Raises ExecutorError: they do not fit."""
-    _require_number(control_hz, "control_hz")
+    require_number(control_hz, "control_hz")
     policy_hz = settings.policy_hz or control_hz
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0

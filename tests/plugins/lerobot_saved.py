@@ -8,7 +8,8 @@ import torch
 STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
 DS, DA, PIXELS = 2, 2, 96
 """As Push-T has them."""
-CAMERAS = {"diffusion": "observation.image", "multi_task_dit": "observation.images.top"}
+TOP = "observation.images.top"
+CAMERAS = {"diffusion": "observation.image", "multi_task_dit": TOP, "act": TOP}
 """By case; that of Push-T, and that of ``still_robot``."""
 
 CLIP = {"hidden_size": 8, "intermediate_size": 12, "num_hidden_layers": 1, "num_attention_heads": 2}
@@ -48,6 +49,16 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "image_crop_shape": (16, 16),
         "tokenizer_max_length": 9,
     },
+    "act": {
+        "chunk_size": 8,
+        "pretrained_backbone_weights": None,
+        "dim_model": 16,
+        "n_heads": 2,
+        "dim_feedforward": 24,
+        "n_encoder_layers": 2,
+        "n_vae_encoder_layers": 1,
+        "latent_dim": 4,
+    },
 }
 """By case; its first word is the type."""
 
@@ -66,8 +77,10 @@ def save(case: str, folder: Path) -> Path:
     if kind == "multi_task_dit":
         settings |= dict.fromkeys(("vision_encoder_name", "text_encoder_name"), str(_clip(folder / "clip")))
     outputs = {"action": PolicyFeature(FeatureType.ACTION, (DA,))}
+    if "chunk_size" not in settings:
+        settings["horizon"] = 8
     config = make_policy_config(
-        kind, input_features=inputs, output_features=outputs, horizon=8, n_action_steps=4, device="cpu", **settings
+        kind, input_features=inputs, output_features=outputs, n_action_steps=4, device="cpu", **settings
     )
     torch.manual_seed(0)
     policy, directory = get_policy_class(kind)(config), folder / "policy"

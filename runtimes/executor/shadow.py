@@ -1,0 +1,297 @@
+"""Shadow mode: the original policy acts, and a compiled one answers the same observations beside it, for nobody.
+
+The *original* belongs to whoever calls the shadow; the *compiled policy* to the shadow's thread, which takes calls in
+their order. What was found is under one lock, held for microseconds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import copy
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.core.coercion import integer
+from ttscompile.errors import ExecutorError, ObservationError
+
+from .measure import Clock, MonotonicClock
+from .settings import require_number
+from .statistics import Samples, Summary, summary
+
+Numbers = npt.NDArray[np.float64]
+
+_TIMES = 4096
+"""That percentiles are made from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShadowReport:
+    """How far a compiled policy was from the original that acted; differences are in the units of the actions.
+
+    Attributes:
+        calls: of the original.
+        compared: of these, answered by the compiled policy, too.
+        dropped: of these, not given to it: too many waited, or it had missed a frame of the episode.
+        failed: of these, in which something of it raised an error.
+        late: of the compared ones, that took it longer than the deadline.
+        last_failure: the last error; empty if there was none.
+        mean: mean absolute difference by number of the action; empty where nothing was compared.
+        largest: the largest difference by number of the action.
+        worst: the largest mean difference of a call.
+        worst_call: its number, counted from 0; -1 where nothing was compared.
+        of_other_noise: the mean difference in units of what other noise changes, by the artifact's calibration: about 1
+            if the two do not have the same noise. None if that is not known, or noise changes nothing.
+        original_ms: what calls of the original took.
+        compiled_ms: what compared calls of the compiled policy took.
+    """
+
+    calls: int
+    compared: int
+    dropped: int
+    failed: int
+    late: int
+    last_failure: str
+    mean: tuple[float, ...]
+    largest: tuple[float, ...]
+    worst: float
+    worst_call: int
+    of_other_noise: float | None
+    original_ms: Summary | None
+    compiled_ms: Summary | None
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        failures = f"{self.failed} failed" + (f" ({self.last_failure})" if self.last_failure else "")
+        told = f"{self.compared} of {self.calls} calls compared, {self.dropped} dropped, {failures}, {self.late} late"
+        if self.original_ms is None or self.compiled_ms is None:
+            return told
+        share = "" if self.of_other_noise is None else f", {self.of_other_noise:.2f} of what other noise changes"
+        return (
+            f"{told}; {self.original_ms.p50:.4g} ms the original, {self.compiled_ms.p50:.4g} ms compiled; mean"
+            f" difference {np.mean(self.mean):.4g}{share}; by number of the action"
+            f" {', '.join(f'{one:.4g}' for one in self.mean)}; worst call {self.worst_call}: {self.worst:.4g}"
+        )
+
+
+@dataclass(frozen=True)
+class _Call:
+    """Something that the compiled policy is to do; without an answer nothing is compared."""
+
+    name: str
+    given: tuple[Any, ...]
+    words: Mapping[str, Any]
+    number: int = -1
+    answer: Numbers | None = None
+    within: float = 0.0
+
+
+class Shadow:
+    """A policy that answers as ``original`` does, while ``compiled`` answers the same observations for a report.
+
+    It takes the original's place in an ``AsyncExecutor``, or in a loop that calls LeRobot's methods::
+
+        shadow = ttscompile.Shadow(original, ttscompile.load("compiled/"))
+        with ttscompile.AsyncExecutor(shadow, control_hz=10) as executor:
+            ...
+        print(shadow.close())
+
+    The compiled policy is called after the original has answered, on a thread of its own: the caller waits for a copy
+    of the observation alone. Whatever happens there, the original's answer is given; errors are counted.
+
+    Args:
+        original: takes observations in the robot's units and gives actions in them, as the compiled policy does.
+        compiled: a ``CompiledPolicy``, which nobody else may use until ``close``.
+        deadline: seconds that a call of it may take; None for as long as the original took.
+        waiting: calls that may wait for it; more are dropped.
+        noise: given an observation before the original is called, gives the noise that the original will draw, for the
+            compiled policy; None for noise of its own.
+        clock: None for ``time.monotonic``.
+
+    Attributes:
+        worst_observation: of the worst call, for ``np.savez`` and ``ttscompile predict``; None before there is one.
+
+    Raises:
+        ExecutorError: an argument is no such number.
+    """
+
+    def __init__(
+        self,
+        original: Any,
+        compiled: Any,
+        *,
+        deadline: float | None = None,
+        waiting: int = 64,
+        noise: Callable[[Mapping[str, Any]], Any] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        if deadline is not None:
+            require_number(deadline, "deadline")
+        self._most, self._deadline = integer(waiting, "waiting", ExecutorError, 1), deadline
+        self._original, self._compiled, self._noise = original, compiled, noise
+        self._other_noise = getattr(getattr(compiled, "info", None), "other_noise", None)
+        self._clock = clock or MonotonicClock()
+        self._due: deque[_Call] = deque()
+        self._work = threading.Condition()
+        self._ending = self._missed = False
+        self._count: Counter[str] = Counter()
+        self._failure, self._worst = "", (0.0, -1)
+        self._sum = self._largest = np.zeros(0)
+        self._times = Samples(_TIMES), Samples(_TIMES)
+        self.worst_observation: Mapping[str, Any] | None = None
+        self._thread = threading.Thread(target=self._run, name="ttscompile-shadow", daemon=True)
+        self._thread.start()
+        atexit.register(self.close)  # a thread that comes back when the interpreter is gone may abort the process
+
+    @property
+    def info(self) -> Any:
+        """That of the original; where it has none, that of the compiled policy with one plan, ``original``."""
+        own = getattr(self._original, "info", None)
+        return own or replace(self._compiled.info, plans=("original",), default_plan="original", frames=0)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._original, name)  # ``last_report`` and ``prepare_frame``, if it has them
+
+    def reset(self, seed: int | None = None) -> None:
+        """A new episode of both."""
+        given = () if seed is None else (seed,)
+        self._original.reset(*given)
+        self._missed = False
+        self._give(_Call("reset", given, {}))
+
+    def follow(self, executed: int) -> None:
+        """Tells both how many steps of the last chunk are executed before the next call."""
+        getattr(self._original, "follow", lambda _: None)(executed)
+        self._give(_Call("follow", (executed,), {}))
+
+    def predict_action(self, obs_dict: Mapping[str, Any], plan: Any = None, **words: Any) -> Any:
+        """What the original answers; ``plan`` is one of the original's, if it has any."""
+        own = {"plan": plan} if plan is not None and hasattr(self._original, "info") else {}
+        return self._both("predict_action", obs_dict, words, own)
+
+    def predict_action_chunk(self, batch: Mapping[str, Any], **words: Any) -> Any:
+        """What the original answers."""
+        return self._both("predict_action_chunk", batch, words, {})
+
+    def select_action(self, batch: Mapping[str, Any], **words: Any) -> Any:
+        """What the original answers."""
+        return self._both("select_action", batch, words, {})
+
+    def report(self) -> ShadowReport:
+        """What was found so far."""
+        with self._work:
+            mean, noise = self._sum / max(self._count["compared"], 1), self._other_noise
+            return ShadowReport(
+                **{name: self._count[name] for name in ("calls", "compared", "dropped", "failed", "late")},
+                last_failure=self._failure,
+                mean=tuple(mean.tolist()),
+                largest=tuple(self._largest.tolist()),
+                worst=self._worst[0],
+                worst_call=self._worst[1],
+                of_other_noise=float(mean.mean()) / noise if noise and mean.size else None,
+                original_ms=summary(*self._times[0].copy()),
+                compiled_ms=summary(*self._times[1].copy()),
+            )
+
+    def close(self, timeout: float = 10.0) -> ShadowReport:
+        """Wait for the calls that are due, for so many seconds of real time, and end the thread."""
+        with self._work:
+            self._ending = True
+            self._work.notify()
+        self._thread.join(timeout)
+        atexit.unregister(self.close)
+        return self.report()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _both(self, name: str, obs: Mapping[str, Any], words: dict[str, Any], own: dict[str, Any]) -> Any:
+        given = copy.copy(words)
+        try:
+            given |= {} if self._noise is None else {"noise": self._noise(obs)}
+        except Exception as error:
+            self._fail(error)
+        begun = self._clock.now()
+        answer = getattr(self._original, name)(obs, **words, **own)
+        took = self._clock.now() - begun
+        with self._work:
+            number = self._count["calls"]
+            self._count["calls"] += 1
+            self._times[0].add(1e3 * took)
+            full = len(self._due) >= self._most
+            self._missed |= full
+            drop = full or (self._missed and name != "predict_action")  # the others keep frames from call to call
+            self._count["dropped"] += drop
+        try:
+            if not drop:
+                within = took if self._deadline is None else self._deadline
+                kept = {key: copy.deepcopy(value) for key, value in obs.items()}
+                self._give(_Call(name, (kept,), copy.deepcopy(given), number, _array(answer), within))
+        except Exception as error:
+            self._fail(error)
+        return answer
+
+    def _give(self, call: _Call) -> None:
+        with self._work:
+            self._due.append(call)
+            self._work.notify()
+
+    def _fail(self, error: Exception) -> None:
+        with self._work:
+            self._count["failed"] += 1
+            self._failure = f"{type(error).__name__}: {error!s:.300}"
+
+    # The thread's side
+
+    def _run(self) -> None:
+        while True:
+            with self._work:
+                self._work.wait_for(lambda: self._due or self._ending)
+                if not self._due:
+                    return
+                call = self._due[0]
+            try:
+                self._do(call)
+            except Exception as error:
+                self._fail(error)
+            with self._work:
+                self._due.popleft()
+
+    def _do(self, call: _Call) -> None:
+        begun = self._clock.now()
+        if call.answer is None:
+            getattr(self._compiled, call.name, lambda *_: None)(*call.given)
+            return
+        made = _array(getattr(self._compiled, call.name)(*call.given, **call.words))
+        took = self._clock.now() - begun
+        steps = min(made.shape[-2], call.answer.shape[-2])  # a chunk of LeRobot's is longer than what is executed of it
+        apart = np.abs(made[..., :steps, :] - call.answer[..., :steps, :]).reshape(-1, made.shape[-1])
+        if not np.isfinite(apart).all():
+            raise ObservationError("actions of the original, or of the compiled policy, are not finite.")
+        with self._work:
+            self._sum = apart.mean(0) + (self._sum if self._sum.size else 0.0)
+            self._largest = np.maximum(apart.max(0), self._largest if self._largest.size else 0.0)
+            self._count["compared"] += 1
+            self._count["late"] += took > call.within
+            self._times[1].add(1e3 * took)
+            if apart.mean() > self._worst[0] or self._worst[1] < 0:
+                self._worst, self.worst_observation = (float(apart.mean()), call.number), call.given[0]
+
+
+def _array(answer: Any) -> Numbers:
+    """The actions of an answer, ``[B, Da]`` or ``[B, Ta, Da]``, whoever's arrays they are."""
+    actions = answer["action"] if isinstance(answer, Mapping) else answer
+    return np.array(actions.detach().cpu() if hasattr(actions, "detach") else actions, np.float64)
