@@ -282,3 +282,51 @@ def test_the_policy_server_takes_it(
     server.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(specs)), context)
     batch = server.preprocessor(frame(0, server.policy, streams=1))
     assert server._get_action_chunk(batch).shape == (1, 3, DA)
+
+
+def test_in_shadow_mode_the_original_acts_and_the_log_says_how_far_the_compiled_one_is(
+    saved: tuple[str, Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """From the same generator both have the same noise, so the differences are those of rounding."""
+    _, original, compiled = saved
+    copy = Path(shutil.copytree(compiled, tmp_path / "copy"))
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**config, "original": str(original)}))
+    expected = driven(original)
+    with caplog.at_level(logging.WARNING):
+        found = driven(copy)
+    np.testing.assert_array_equal(found, expected)
+    policy, _, _ = opened(copy)
+    assert not policy.supports_rtc()
+    assert "shadow: " in caplog.text and " 0 dropped, 0 failed" in caplog.text
+    worst = float(caplog.text.split("worst call ")[1].split(": ")[1].split()[0])
+    assert worst < 1e-4 * np.abs(expected).max()
+
+
+def test_lerobots_of_other_series_are_refused_in_one_sentence(caplog: pytest.LogCaptureFixture) -> None:
+    from lerobot_policy_ttscompile.versions import TRIED, require_lerobot
+
+    with caplog.at_level(logging.WARNING):
+        require_lerobot()
+        require_lerobot(TRIED)
+    assert "was tried with" not in caplog.text
+    require_lerobot("0.6.2")
+    assert "was tried with lerobot 0.6.1, and this is 0.6.2" in caplog.text
+    for found in ("0.5.1", "0.7.0", "unknown"):
+        with pytest.raises(ImportError, match=f"tried with lerobot 0.6.1, and found {found}: install"):
+            require_lerobot(found)
+
+
+def test_without_the_asynchronous_server_the_rest_works_and_the_server_says_so(saved: tuple[str, Path, Path]) -> None:
+    """As in a LeRobot that has none any more."""
+    _, _, compiled = saved
+    without = "import sys; sys.modules['lerobot.async_inference'] = None\n"
+    opens = (
+        "from tests.plugins.test_lerobot_policy import opened; from pathlib import Path; opened(Path(sys.argv[1]))\n"
+    )
+    serves = "from lerobot_policy_ttscompile.policy_server import main; main()"
+    words = [sys.executable, "-W", "ignore", "-c", without + opens + serves, str(compiled)]
+    result = subprocess.run(words, capture_output=True, text=True, cwd=ROOT, timeout=600)
+    assert result.returncode == 2, result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.startswith(("error:", "Traceback"))]
+    assert len(lines) == 1 and "no asynchronous policy server" in lines[0] and "ttscompile serve" in lines[0]

@@ -4,7 +4,11 @@ LeRobot imports every installed package whose name begins with ``lerobot_policy_
 policy type ``ttscompile``.
 """
 
-from .configuration_ttscompile import TtscompileConfig
-from .modeling_ttscompile import TtscompilePolicy
+from .versions import require_lerobot
+
+require_lerobot()  # before anything is imported that another version may not have
+
+from .configuration_ttscompile import TtscompileConfig  # noqa: E402
+from .modeling_ttscompile import TtscompilePolicy  # noqa: E402
 
 __all__ = ["TtscompileConfig", "TtscompilePolicy"]

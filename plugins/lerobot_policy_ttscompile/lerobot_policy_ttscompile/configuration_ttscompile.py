@@ -18,6 +18,8 @@ class TtscompileConfig(PreTrainedConfig):
         threads: threads of arithmetic.
         plan: name of a plan of the artifact, ``dense`` among them, or ``NAME@fp32`` for one in another precision; None
             for the artifact's default.
+        original: the policy that was compiled, where that shall act and the compiled one be compared with it: its
+            directory, or a repository.
         precision: of older configurations, in which it was not part of the plan's name; the policy moves it there.
     """
 
@@ -25,6 +27,7 @@ class TtscompileConfig(PreTrainedConfig):
     runtime: str = "onnxruntime"
     threads: int = 1
     plan: str | None = None
+    original: str | None = None
     precision: str | None = None
 
     @property

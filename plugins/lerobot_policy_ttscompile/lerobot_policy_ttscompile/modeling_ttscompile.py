@@ -6,8 +6,10 @@ processors that ``ttscompile convert`` writes beside it.
 
 from __future__ import annotations
 
+import atexit
 import logging
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,6 +22,7 @@ import ttscompile
 from ttscompile.artifact.load import read_manifest
 
 from .configuration_ttscompile import TtscompileConfig
+from .original import Original
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +39,9 @@ class TtscompilePolicy(PreTrainedPolicy):
 
     Noise is drawn from torch's global generator, which LeRobot seeds, and in the order of LeRobot's samplers: with the
     generator in the same state the original acts alike on a CPU. (Making the original draws its weights, too.)
+
+    Where the configuration names the original, that acts, and the log says how far this one is from it: at every reset,
+    and when the program ends. Both have the same noise where the original computes on a CPU.
 
     Args:
         config: of the policy.
@@ -67,6 +73,10 @@ class TtscompilePolicy(PreTrainedPolicy):
                 f"{directory}: config.json says that the policy observes {sorted(config.input_features or {})}, and its"
                 f" artifact observes {sorted(observed)}: convert the checkpoint again"
             )
+        self._shadow: ttscompile.Shadow | None = None
+        if config.original is not None:
+            self._shadow = ttscompile.Shadow(Original(config.original), self._policy, noise=self._noise_ahead)
+            atexit.register(self._tell)
 
     @classmethod
     def from_pretrained(
@@ -102,7 +112,11 @@ class TtscompilePolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """A new episode."""
-        self._policy.reset()
+        if self._shadow is None:
+            self._policy.reset()
+            return
+        self._tell()
+        self._shadow.reset()
 
     def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None) -> Tensor:
         """The next action ``[B, Da]``, in the units of the robot.
@@ -112,6 +126,8 @@ class TtscompilePolicy(PreTrainedPolicy):
                 alone.
             noise: ``[B, T, D]`` that a chunk starts from, if this call computes one; None draws it.
         """
+        if self._shadow is not None:
+            return self._shadow.select_action(batch)
         drawn = None if self._policy.queued else self._noise(batch, noise)
         return self._policy.select_action(batch, drawn)
 
@@ -132,13 +148,15 @@ class TtscompilePolicy(PreTrainedPolicy):
                 Its first ``inference_delay`` actions are kept in the new chunk, and the rest of that is inpainted to
                 them (``predict_action(prefix=)``). Those after them have no influence: this is not LeRobot's guidance.
         """
+        if self._shadow is not None:
+            return self._shadow.predict_action_chunk(batch)
         prefix = _committed(inference_delay, prev_chunk_left_over)
         return self._policy.predict_action_chunk(batch, self._noise(batch, noise), prefix=prefix)
 
     def supports_rtc(self) -> bool:
         """Whether chunks can be joined to what is executed meanwhile; if not, the log says why."""
         info = self._policy.info
-        reason = info.prefix_refusal
+        reason = info.prefix_refusal if self._shadow is None else "the original acts, and this policy is its shadow"
         if reason is None and any(spec.frames not in (None, 1) for spec in info.observation.values()):
             reason = (
                 "it observes several frames, and real-time chunking gives it one a chunk: they would lie too far apart."
@@ -163,7 +181,17 @@ class TtscompilePolicy(PreTrainedPolicy):
         """
         self.forward({})
 
-    def _noise(self, batch: dict[str, Tensor], initial: Tensor | None) -> ttscompile.Noise:
+    def _tell(self) -> None:
+        """Log how far the compiled policy was from the original."""
+        if self._shadow is not None and (report := self._shadow.report()).calls:
+            logger.warning("shadow: %s", report)
+
+    def _noise_ahead(self, batch: Mapping[str, Any]) -> ttscompile.Noise:
+        """What the original will draw for a chunk, if the next call computes one; nothing is drawn of it here."""
+        with torch.random.fork_rng(devices=[]):
+            return self._noise(batch, None)
+
+    def _noise(self, batch: Mapping[str, Any], initial: Tensor | None) -> ttscompile.Noise:
         """What LeRobot's samplers draw for a chunk: the sample that it starts from, and then step by step."""
         info = self._policy.info
         streams = len(batch[next(iter(info.observation))])
