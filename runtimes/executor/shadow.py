@@ -11,8 +11,9 @@ import copy
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,8 +44,7 @@ class ShadowReport:
         last_failure: the last error; empty if there was none.
         mean: mean absolute difference by number of the action; empty where nothing was compared.
         largest: the largest difference by number of the action.
-        worst: the largest mean difference of a call.
-        worst_call: its number, counted from 0; -1 where nothing was compared.
+        worst: the largest mean difference of a call, and the call's number, counted from 0; -1 without one.
         of_other_noise: the mean difference in units of what other noise changes, by the artifact's calibration: about 1
             if the two do not have the same noise. None if that is not known, or noise changes nothing.
         original_ms: what calls of the original took.
@@ -59,39 +59,10 @@ class ShadowReport:
     last_failure: str
     mean: tuple[float, ...]
     largest: tuple[float, ...]
-    worst: float
-    worst_call: int
+    worst: tuple[float, int]
     of_other_noise: float | None
     original_ms: Summary | None
     compiled_ms: Summary | None
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain JSON values."""
-        return asdict(self)
-
-    def __str__(self) -> str:
-        failures = f"{self.failed} failed" + (f" ({self.last_failure})" if self.last_failure else "")
-        told = f"{self.compared} of {self.calls} calls compared, {self.dropped} dropped, {failures}, {self.late} late"
-        if self.original_ms is None or self.compiled_ms is None:
-            return told
-        share = "" if self.of_other_noise is None else f", {self.of_other_noise:.2f} of what other noise changes"
-        return (
-            f"{told}; {self.original_ms.p50:.4g} ms the original, {self.compiled_ms.p50:.4g} ms compiled; mean"
-            f" difference {np.mean(self.mean):.4g}{share}; by number of the action"
-            f" {', '.join(f'{one:.4g}' for one in self.mean)}; worst call {self.worst_call}: {self.worst:.4g}"
-        )
-
-
-@dataclass(frozen=True)
-class _Call:
-    """Something that the compiled policy is to do; without an answer nothing is compared."""
-
-    name: str
-    given: tuple[Any, ...]
-    words: Mapping[str, Any]
-    number: int = -1
-    answer: Numbers | None = None
-    within: float = 0.0
 
 
 class Shadow:
@@ -139,12 +110,12 @@ class Shadow:
         self._original, self._compiled, self._noise = original, compiled, noise
         self._other_noise = getattr(getattr(compiled, "info", None), "other_noise", None)
         self._clock = clock or MonotonicClock()
-        self._due: deque[_Call] = deque()
+        self._due: deque[Callable[[], object]] = deque()
         self._work = threading.Condition()
         self._ending = self._missed = False
         self._count: Counter[str] = Counter()
         self._failure, self._worst = "", (0.0, -1)
-        self._sum = self._largest = np.zeros(0)
+        self._differences = np.zeros((2, 0))  # sum of the means, and the largest
         self._times = Samples(_TIMES), Samples(_TIMES)
         self.worst_observation: Mapping[str, Any] | None = None
         self._thread = threading.Thread(target=self._run, name="ttscompile-shadow", daemon=True)
@@ -167,12 +138,12 @@ class Shadow:
         given = () if seed is None else (seed,)
         self._original.reset(*given)
         self._missed = False
-        self._give(_Call("reset", given, {}))
+        self._give(partial(self._compiled.reset, *given))
 
     def follow(self, executed: int) -> None:
         """Tells both how many steps of the last chunk are executed before the next call."""
-        getattr(self._original, "follow", lambda _: None)(executed)
-        self._give(_Call("follow", (executed,), {}))
+        for policy, tell in ((self._original, lambda note: note()), (self._compiled, self._give)):
+            tell(partial(getattr(policy, "follow", lambda _: None), executed))
 
     def predict_action(self, obs_dict: Mapping[str, Any], plan: Any = None, **words: Any) -> Any:
         """What the original answers; ``plan`` is one of the original's, if it has any."""
@@ -190,14 +161,13 @@ class Shadow:
     def report(self) -> ShadowReport:
         """What was found so far."""
         with self._work:
-            mean, noise = self._sum / max(self._count["compared"], 1), self._other_noise
+            mean, noise = self._differences[0] / max(self._count["compared"], 1), self._other_noise
             return ShadowReport(
                 **{name: self._count[name] for name in ("calls", "compared", "dropped", "failed", "late")},
                 last_failure=self._failure,
                 mean=tuple(mean.tolist()),
-                largest=tuple(self._largest.tolist()),
-                worst=self._worst[0],
-                worst_call=self._worst[1],
+                largest=tuple(self._differences[1].tolist()),
+                worst=self._worst,
                 of_other_noise=float(mean.mean()) / noise if noise and mean.size else None,
                 original_ms=summary(*self._times[0].copy()),
                 compiled_ms=summary(*self._times[1].copy()),
@@ -212,14 +182,8 @@ class Shadow:
         atexit.unregister(self.close)
         return self.report()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _both(self, name: str, obs: Mapping[str, Any], words: dict[str, Any], own: dict[str, Any]) -> Any:
-        given = copy.copy(words)
+        given = dict(words)
         try:
             given |= {} if self._noise is None else {"noise": self._noise(obs)}
         except Exception as error:
@@ -237,16 +201,17 @@ class Shadow:
             self._count["dropped"] += drop
         try:
             if not drop:
-                within = took if self._deadline is None else self._deadline
                 kept = {key: copy.deepcopy(value) for key, value in obs.items()}
-                self._give(_Call(name, (kept,), copy.deepcopy(given), number, _array(answer), within))
+                call = partial(getattr(self._compiled, name), kept, **copy.deepcopy(given))
+                within = took if self._deadline is None else self._deadline
+                self._give(partial(self._compare, call, kept, number, _array(answer), within))
         except Exception as error:
             self._fail(error)
         return answer
 
-    def _give(self, call: _Call) -> None:
+    def _give(self, work: Callable[[], object]) -> None:
         with self._work:
-            self._due.append(call)
+            self._due.append(work)
             self._work.notify()
 
     def _fail(self, error: Exception) -> None:
@@ -262,33 +227,31 @@ class Shadow:
                 self._work.wait_for(lambda: self._due or self._ending)
                 if not self._due:
                     return
-                call = self._due[0]
+                work = self._due[0]
             try:
-                self._do(call)
+                work()
             except Exception as error:
                 self._fail(error)
             with self._work:
                 self._due.popleft()
 
-    def _do(self, call: _Call) -> None:
+    def _compare(self, call: Callable[[], Any], obs: Any, number: int, answer: Numbers, within: float) -> None:
+        """Have the compiled policy answer, and take note of it."""
         begun = self._clock.now()
-        if call.answer is None:
-            getattr(self._compiled, call.name, lambda *_: None)(*call.given)
-            return
-        made = _array(getattr(self._compiled, call.name)(*call.given, **call.words))
+        made = _array(call())
         took = self._clock.now() - begun
-        steps = min(made.shape[-2], call.answer.shape[-2])  # a chunk of LeRobot's is longer than what is executed of it
-        apart = np.abs(made[..., :steps, :] - call.answer[..., :steps, :]).reshape(-1, made.shape[-1])
+        steps = min(made.shape[-2], answer.shape[-2])  # a chunk of LeRobot's is longer than what is executed of it
+        apart = np.abs(made[..., :steps, :] - answer[..., :steps, :]).reshape(-1, made.shape[-1])
         if not np.isfinite(apart).all():
             raise ObservationError("actions of the original, or of the compiled policy, are not finite.")
         with self._work:
-            self._sum = apart.mean(0) + (self._sum if self._sum.size else 0.0)
-            self._largest = np.maximum(apart.max(0), self._largest if self._largest.size else 0.0)
+            total, largest = self._differences if self._count["compared"] else np.zeros((2, made.shape[-1]))
+            self._differences = np.stack([total + apart.mean(0), np.maximum(largest, apart.max(0))])
             self._count["compared"] += 1
-            self._count["late"] += took > call.within
+            self._count["late"] += took > within
             self._times[1].add(1e3 * took)
             if apart.mean() > self._worst[0] or self._worst[1] < 0:
-                self._worst, self.worst_observation = (float(apart.mean()), call.number), call.given[0]
+                self._worst, self.worst_observation = (float(apart.mean()), number), obs
 
 
 def _array(answer: Any) -> Numbers:

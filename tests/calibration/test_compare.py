@@ -217,3 +217,41 @@ def test_bench_judges_the_plans_that_are_named(planned: Path, other_sampler: Pat
     assert refused.exit_code == 2 and "'quick'" in refused.stderr
     again = CliRunner().invoke(main, [*words, "--with", str(twins), str(twins)])
     assert again.exit_code == 2 and "two artifacts are called 'three'" in again.stderr
+
+
+def test_where_a_plan_is_far_by_number_of_the_action_and_by_call(frontier: Comparison, recording: Path) -> None:
+    dense, half = (points(frontier)["this artifact", name] for name in ("dense", "half"))
+    assert len(half.by_number) == len(half.errors) == 2
+    assert np.mean(half.errors) == pytest.approx(half.error, rel=1e-4) and max(dense.errors) < 1e-6
+    assert half.by_number != pytest.approx((half.distance,) * 2) and max(dense.by_number) < 1e-3
+    assert points(frontier)["five", "dense"].errors == ()  # which has other noise
+    distances = [one.distance for one in half.furthest]
+    assert len(distances) == 3 and distances == sorted(distances, reverse=True) and distances[0] > half.distance
+    assert {one.episode for one in half.furthest} <= set(frontier.episodes)
+    original, found = half.furthest[0].actions
+    assert original.shape == found.shape and np.abs(original - found).max() > 1e-3
+    told = json.loads(json.dumps(frontier.to_json()))["points"][1]
+    assert told["furthest"][0] == {name: getattr(half.furthest[0], name) for name in ("episode", "call", "distance")}
+    assert told["by_number"] == list(half.by_number)
+
+
+def test_the_furthest_calls_have_what_the_cameras_saw_and_are_drawn(once: Once, tmp_path: Path) -> None:
+    """Two artifacts of one checkpoint on one recording: ``bench A --with B -t FILE --plot``."""
+
+    def make(folder: Path) -> None:
+        ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact")
+
+    folder = shutil.copytree(once.folder("tokens in fp32", make) / "artifact", tmp_path / "own")
+    other, recorded = shutil.copytree(folder, tmp_path / "other"), tmp_path / "calls.npz"
+    views = {key: np.random.default_rng(0).random((8, 2, 3, cameras.SIDE, cameras.SIDE)) for key in cameras.CAMERAS}
+    np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
+    far = compare(folder, [recorded], [other], calls=4).points[1].furthest[0]
+    assert set(far.pictures) == set(cameras.CAMERAS)
+    held_out = views[cameras.CAMERAS[0]][4 * far.episode + far.call, -1]
+    np.testing.assert_allclose(far.pictures[cameras.CAMERAS[0]], held_out, atol=1e-6)
+    words = ["bench", str(folder), "--with", str(other), "-t", str(recorded), "--calls", "1"]
+    result = CliRunner().invoke(main, [*words, "--plot", str(tmp_path / "both.png")], catch_exceptions=False)
+    assert result.exit_code == 0 and "furthest calls" in result.stdout
+    assert f"episode {far.episode}, call" in result.stdout and "both-calls.png" in result.stderr
+    with Image.open(tmp_path / "both-calls.png") as picture:
+        assert picture.width > 2 * picture.height

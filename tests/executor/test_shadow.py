@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -95,7 +95,7 @@ def toys() -> Iterator[tuple[Toy, Toy]]:
 
 def test_the_report_has_differences_by_dimension_the_worst_call_and_times(toys: tuple[Toy, Toy]) -> None:
     original, compiled = toys
-    with Shadow(original, compiled, clock=original.clock) as shadow:
+    with closing(Shadow(original, compiled, clock=original.clock)) as shadow:
         for number in range(4):
             compiled.off = np.array([0.25, -1.0]) * (3 if number == 2 else 1)
             compiled.latency = 0.75 if number == 3 else 0.25
@@ -105,35 +105,26 @@ def test_the_report_has_differences_by_dimension_the_worst_call_and_times(toys: 
     found = shadow.report()
     assert (found.calls, found.compared, found.dropped, found.failed) == (4, 4, 0, 0)
     assert found.mean == pytest.approx((0.375, 1.5)) and found.largest == (0.75, 3.0)
-    assert (found.worst_call, found.worst) == (2, pytest.approx(1.875))
+    assert found.worst == (pytest.approx(1.875), 2)
     assert shadow.worst_observation is not None and shadow.worst_observation["obs"].tolist() == [[2.0]]
     assert found.late == 1, "the last one took longer than the original"
     assert found.original_ms is not None and found.original_ms.p50 == pytest.approx(500)
     assert found.compiled_ms is not None and (found.compiled_ms.min, found.compiled_ms.max) == (250, 750)
-    told = str(found)
-    for words in (
-        "4 of 4 calls compared",
-        "1 late",
-        "500 ms the original, 250 ms compiled",
-        "0.375, 1.5",
-        "call 2: 1.8",
-    ):
-        assert words in told
-    assert json.loads(json.dumps(found.to_json()))["worst_call"] == 2 and found.of_other_noise is None
+    assert found.of_other_noise is None
 
 
 def test_in_units_of_other_noise_where_the_artifact_knows_them(toys: tuple[Toy, Toy]) -> None:
     original, compiled = toys
     compiled.info = SimpleNamespace(other_noise=1.25)  # type: ignore[attr-defined]
-    with Shadow(original, compiled) as shadow:
+    with closing(Shadow(original, compiled)) as shadow:
         shadow.predict_action_chunk(seen(1))
     found = shadow.report()
-    assert found.of_other_noise == pytest.approx(0.5) and "0.50 of what other noise changes" in str(found)
+    assert found.of_other_noise == pytest.approx(0.5)
 
 
 def test_a_deadline_says_what_is_late(toys: tuple[Toy, Toy]) -> None:
     original, compiled = toys
-    with Shadow(original, compiled, clock=original.clock, deadline=0.2) as shadow:
+    with closing(Shadow(original, compiled, clock=original.clock, deadline=0.2)) as shadow:
         shadow.predict_action(seen(1))
     assert shadow.report().late == 1
     for wrong in (0, "1"):
@@ -146,7 +137,7 @@ def test_a_deadline_says_what_is_late(toys: tuple[Toy, Toy]) -> None:
 def test_what_fails_is_counted_and_nobody_is_told_in_the_loop(toys: tuple[Toy, Toy]) -> None:
     original, compiled = toys
     compiled.faults = {1: ZeroDivisionError("scripted")}
-    with Shadow(original, compiled) as shadow:
+    with closing(Shadow(original, compiled)) as shadow:
         for number in range(3):
             assert shadow.select_action(seen(number)).tolist() == [[number, 2 * number]]
         drained(shadow)
@@ -160,7 +151,7 @@ def test_what_fails_is_counted_and_nobody_is_told_in_the_loop(toys: tuple[Toy, T
 def test_an_error_of_the_original_is_the_callers_and_is_not_compared(toys: tuple[Toy, Toy]) -> None:
     original, compiled = toys
     original.faults = {0: ZeroDivisionError("scripted")}
-    with Shadow(original, compiled) as shadow:
+    with closing(Shadow(original, compiled)) as shadow:
         with pytest.raises(ZeroDivisionError):
             shadow.predict_action(seen(0))
         shadow.predict_action(seen(1))
@@ -172,7 +163,7 @@ def test_a_compiled_policy_that_hangs_delays_nobody_and_frames_it_missed_end_its
     original, compiled = toys
     gate = threading.Event()
     compiled.faults = {0: gate}
-    with Shadow(original, compiled, waiting=2) as shadow:
+    with closing(Shadow(original, compiled, waiting=2)) as shadow:
         answers = [float(shadow.select_action(seen(number))[0, 0]) for number in range(5)]
         assert answers == [0, 1, 2, 3, 4] and shadow.report().compared == 0
         gate.set()
@@ -190,7 +181,7 @@ def test_the_observation_is_copied_and_what_belongs_to_the_plans_stays_with_the_
     original.info = compiled.info = SimpleNamespace()  # type: ignore[attr-defined]
     gate = threading.Event()
     compiled.faults = {0: gate}
-    with Shadow(original, compiled, noise=lambda obs: float(obs["obs"][0, 0])) as shadow:
+    with closing(Shadow(original, compiled, noise=lambda obs: float(obs["obs"][0, 0]))) as shadow:
         obs = seen(0)
         for number in (1.0, 2.0):
             obs["obs"][:] = number
@@ -219,8 +210,8 @@ def test_an_executor_executes_the_originals_actions(fault: str) -> None:
             world.begin()
             return [action.tolist() for _ in range(40) if (action := world.tick()) is not None]
 
-    compiled = SimpleNamespace(predict_action=predict_action, info=None)
-    with Shadow(ScriptedPolicy(FakeClock()), compiled) as shadow:
+    compiled = SimpleNamespace(predict_action=predict_action, reset=lambda *_: None)
+    with closing(Shadow(ScriptedPolicy(FakeClock()), compiled)) as shadow:
         found = executed(shadow)
         gate.set()
     assert found == executed(ScriptedPolicy(FakeClock())) and len(found) == 40
@@ -232,7 +223,7 @@ def test_an_executor_executes_the_originals_actions(fault: str) -> None:
 def test_two_compiled_policies_with_the_same_noise_agree(toy_compiled: Path) -> None:
     """LeRobot's loop: frame by frame, from a queue of actions."""
     policies = [ttscompile.load(toy_compiled) for _ in range(2)]
-    with Shadow(*policies) as shadow:
+    with closing(Shadow(*policies)) as shadow:
         shadow.reset(seed=3)
         for number in range(6):
             shadow.select_action({"obs": np.full((1, 2), number / 7, np.float32)})

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,13 +19,17 @@ from ..artifact.load import Artifact, load_artifact
 from ..core.coercion import integer
 from ..core.plan import DENSE, Plan
 from ..errors import CalibrationError
-from ..measure.points import Comparison, MeasuredPoint
+from ..measure.energy import pairs, rooted
+from ..measure.points import Comparison, FarCall, MeasuredPoint
 from ..runtimes.open import require_able
 from .calls import Split, load_episodes
-from .judge import judge, other_noise, timed
+from .judge import Score, judge, other_noise, timed
 from .progress import Progress
 from .state import StateFile
 from .trials import Trials
+
+FURTHEST = 3
+"""Calls of each plan that are shown, those furthest from the original."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +138,35 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
             quartiles_ms=took.quartiles,
             sparsity=score.sparsity,
             flops=(1 - score.flops_saved) * one.trials.artifact.manifest.flops.dense,
+            **_apart(one.trials, score),
         )
         for one, score, took in zip(entrants, scores, times, strict=True)
     )
+
+
+def _apart(trials: Trials, score: Score) -> dict[str, Any]:
+    """``by_number``, ``errors`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
+    spec, sample = trials.artifact.manifest.spec, trials.held_out
+    x, y = score.answers, sample.answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
+    assert x is not None  # ``judge`` made the score
+    each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(spec.chunk.action_dim)]
+    flat = (one.reshape(*one.shape[:2], -1).astype(np.float64) for one in (x, y))
+    h, far = pairs(*flat)
+    scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+    errors = np.abs(x - y).mean((0, 1, 2)) / scale
+    furthest = []
+    for n in np.argsort(h)[: -FURTHEST - 1 : -1].tolist():
+        episode, row = int(sample.episodes[n]), int(sample.calls[n, 1])
+        seen = trials.episodes[episode].observations
+        cameras = {key: seen[key][row] for key, one in spec.observations.items() if one.image}
+        newest = {key: frame.reshape(-1, *frame.shape[-3:])[-1] for key, frame in cameras.items()}
+        actions = spec.chunk.unnormalized(np.stack([y[n, 0], x[n, 0]]).astype(np.float32))
+        furthest.append(FarCall(episode, row, rooted(float(h[n]), float(far.mean())), newest, actions))
+    return {
+        "by_number": tuple(rooted(float(gap.mean()), float(unit.mean())) for gap, unit in each),
+        "errors": () if score.error is None else tuple(errors.tolist()),
+        "furthest": tuple(furthest),
+    }
 
 
 def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None:

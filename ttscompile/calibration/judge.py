@@ -15,7 +15,7 @@ noise changes nothing the unit is another one (``measure.energy.pairs``).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -64,6 +64,7 @@ class Score:
         tokens: share of the tokens of new frames that were computed; 1 where no tokens are reused.
         gaps: mean h of each episode, and the mean over all episodes of |y_i - y_j|, that the others are of: what
             ``further`` compares.
+        answers: what it executes, normalised, ``[N, R, Ta, Da]``.
     """
 
     distance: float
@@ -76,11 +77,12 @@ class Score:
     plans: int
     tokens: float = 1.0
     gaps: tuple[tuple[float, ...], float] = ((), 0.0)
+    answers: Numbers | None = field(default=None, compare=False, repr=False)
 
     def record(self) -> dict[str, Any]:
         """As JSON, for the record of a calibration; the same on every machine."""
         known = {name: one for name, one in asdict(self).items() if one is not None}
-        return {name: one for name, one in known.items() if name != "gaps"}
+        return {name: one for name, one in known.items() if name not in ("gaps", "answers")}
 
 
 def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
@@ -303,6 +305,7 @@ def _scored(
         plans=len(np.unique(cells, axis=0)),
         tokens=sum(one.tokens for one in frames) / of if of else 1.0,
         gaps=(tuple(gaps.tolist()), float(apart.mean())),
+        answers=x.reshape(*x.shape[:2], -1, spec.chunk.action_dim),
     )
 
 

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.cli.output import counted_parts, manifest_of, only_results_on_stdout, progress, say, table
+from ttscompile.core.plan import DENSE
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
+from ttscompile.plots.chunk import plot_calls
 from ttscompile.plots.frontier import plot_frontier
 
 if TYPE_CHECKING:
@@ -48,10 +50,14 @@ def compare(
 
 
 def draw_comparison(found: Comparison, directory: Path, picture: Path) -> str:
-    """Draw it, and say so."""
+    """Draw it, and beside it the calls that are furthest from the original; says so."""
     title = f"{directory.resolve().name}: {found.calls} held-out calls, {_threads(found)}\n{one_line(fingerprint())}"
     plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], picture, title)
-    return f"wrote {picture}"
+    far = [p for p in found.points if p.furthest and p.name != DENSE] or [p for p in found.points[1:] if p.furthest]
+    if not far:
+        return f"wrote {picture}"
+    plot_calls(far, calls := picture.with_stem(f"{picture.stem}-calls"))
+    return f"wrote {picture} and {calls}"
 
 
 def _threads(found: Comparison) -> str:
@@ -78,6 +84,12 @@ def print_comparison(found: Comparison, output: Console) -> None:
             "yes" if p in efficient else "",
         )
     output.print(made)
+    apart = table("", "plan", "distance by number of the action", "error", "furthest calls")
+    for p in found.points:
+        calls = (f"episode {one.episode}, call {one.call}: {one.distance:.2f}" for one in p.furthest)
+        numbers = (", ".join(f"{one:.3g}" for one in each) for each in (p.by_number, p.errors))
+        apart.add_row(p.series, p.name, *numbers, "; ".join(calls))
+    output.print(apart)
     say(
         output,
         "Distance: between the actions and the original's for the same observation, in units of what other noise"

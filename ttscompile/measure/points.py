@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, TypeVar
+
+from ..core.spec import FloatArray
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,24 @@ class Point:
     latency_ms: float
 
 
+@dataclass(frozen=True, eq=False)
+class FarCall:
+    """A held-out call that a plan answers far from the original.
+
+    Attributes:
+        call: number of the call in its episode.
+        distance: of this call alone.
+        pictures: the newest frame of each camera, by key ``[C, H, W]``.
+        actions: executed by the original and by the plan, with the first draw of noise, ``[2, Ta, Da]`` in their units.
+    """
+
+    episode: int
+    call: int
+    distance: float
+    pictures: Mapping[str, FloatArray]
+    actions: FloatArray
+
+
 @dataclass(frozen=True)
 class MeasuredPoint:
     """One plan on the held-out calls of a comparison.
@@ -38,6 +58,9 @@ class MeasuredPoint:
         quartiles_ms: first and third quartile of the latency.
         sparsity: share of the cells that are reused, mean over the calls.
         flops: of a call, mean.
+        by_number: the distance of each number of the action alone.
+        errors: the error of each number of the action, in its units; empty where there is none.
+        furthest: the calls with the largest distance, the largest first.
     """
 
     series: str
@@ -50,6 +73,9 @@ class MeasuredPoint:
     quartiles_ms: tuple[float, float]
     sparsity: float
     flops: float
+    by_number: tuple[float, ...] = ()
+    errors: tuple[float, ...] = ()
+    furthest: tuple[FarCall, ...] = ()
 
     @property
     def point(self) -> Point:
@@ -110,8 +136,14 @@ class Comparison:
         """As plain JSON values."""
         best = self.efficient()
         points = [
-            {**asdict(p), "quartiles_ms": list(p.quartiles_ms), "interval": list(p.interval), "efficient": p in best}
+            {
+                **{name: list(one) if isinstance(one, tuple) else one for name, one in vars(p).items()},
+                "furthest": [
+                    {"episode": one.episode, "call": one.call, "distance": one.distance} for one in p.furthest
+                ],
+                "efficient": p in best,
+            }
             for p in self.points
         ]
-        record = {**asdict(self), "points": points, "episodes": list(self.episodes), "warnings": list(self.warnings)}
+        record = {**vars(self), "points": points, "episodes": list(self.episodes), "warnings": list(self.warnings)}
         return {**record, "skipped": dict(self.skipped)}

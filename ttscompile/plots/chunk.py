@@ -1,11 +1,19 @@
-"""A chunk of actions as curves, one for each number of the action."""
+"""Chunks of actions as curves, one for each number of the action."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from ..core.spec import FloatArray
+from ..measure.points import MeasuredPoint
 from .figure import new_figure, write_picture
+from .frontier import COLOURS
+
+MOST = 8
+"""Plans that are drawn."""
 
 
 def plot_chunk(actions: FloatArray, executed: range, path: str | Path, title: str) -> None:
@@ -18,4 +26,26 @@ def plot_chunk(actions: FloatArray, executed: range, path: str | Path, title: st
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), ncols=1 + actions.shape[1] // 16)
     axes.set(xlabel="step of the chunk", ylabel="action, in its units")
     axes.set_title(title, fontsize=10, loc="left")
+    write_picture(figure, path)
+
+
+def plot_calls(points: Sequence[MeasuredPoint], path: Path) -> None:
+    """Draw the furthest calls of each plan in a row, lines the original and dots the plan; see ``write_picture``."""
+    shown = points[:MOST]
+    calls, sees = max(len(p.furthest) for p in shown), any(p.furthest[0].pictures for p in shown)
+    figure = new_figure(2.8 * calls * (1 + sees), 2.4 * len(shown), "the calls")
+    for row, p in enumerate(shown):
+        for column, call in enumerate(p.furthest):
+            place = (row * calls + column) * (1 + sees) + 1
+            if sees:
+                camera = figure.add_subplot(len(shown), calls * 2, place)
+                camera.imshow(np.concatenate([np.moveaxis(one, 0, -1) for one in call.pictures.values()]).clip(0, 1))
+                camera.set_axis_off()
+            axes = figure.add_subplot(len(shown), calls * (1 + sees), place + sees)
+            for number, (theirs, own) in enumerate(zip(*np.swapaxes(call.actions, 1, 2), strict=True)):
+                axes.plot(theirs, color=COLOURS[number % len(COLOURS)], linewidth=1)
+                axes.plot(own, color=COLOURS[number % len(COLOURS)], marker=".", linestyle="none")
+            told = f"{p.series}: {p.name}\nepisode {call.episode}, call {call.call}: distance {call.distance:.2f}"
+            axes.set_title(told, fontsize=7, loc="left")
+            axes.tick_params(labelsize=6)
     write_picture(figure, path)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 import ttscompile
 from ttscompile.artifact.load import read_manifest
+from ttscompile.runtimes.executor import ShadowReport
 
 from .configuration_ttscompile import TtscompileConfig
 from .original import Original
@@ -184,7 +185,7 @@ class TtscompilePolicy(PreTrainedPolicy):
     def _tell(self) -> None:
         """Log how far the compiled policy was from the original."""
         if self._shadow is not None and (report := self._shadow.report()).calls:
-            logger.warning("shadow: %s", report)
+            logger.warning("shadow: %s", _told(report))
 
     def _noise_ahead(self, batch: Mapping[str, Any]) -> ttscompile.Noise:
         """What the original will draw for a chunk, if the next call computes one; nothing is drawn of it here."""
@@ -203,6 +204,21 @@ class TtscompilePolicy(PreTrainedPolicy):
             return ttscompile.Noise(first[:, :predicted].numpy())
         steps = torch.stack([torch.randn(shape) for _ in range(info.noise_steps - 1)] + [torch.zeros(shape)])
         return ttscompile.Noise(first[:, :predicted].numpy(), steps[:, :, :predicted].numpy())
+
+
+def _told(report: ShadowReport) -> str:
+    """A report for people."""
+    failures = f"{report.failed} failed" + (f" ({report.last_failure})" if report.last_failure else "")
+    told = f"{report.compared} of {report.calls} calls compared, {report.dropped} dropped, {failures}"
+    if report.original_ms is None or report.compiled_ms is None:
+        return told
+    share = "" if report.of_other_noise is None else f", {report.of_other_noise:.2f} of what other noise changes"
+    each = ", ".join(f"{one:.4g} ({most:.4g})" for one, most in zip(report.mean, report.largest, strict=True))
+    return (
+        f"{told}, {report.late} late; {report.original_ms.p50:.4g} ms the original, {report.compiled_ms.p50:.4g} ms"
+        f" compiled; mean difference {sum(report.mean) / len(report.mean):.4g}{share}; by number of the action, and at"
+        f" most, {each}; worst call {report.worst[1]}: {report.worst[0]:.4g}"
+    )
 
 
 def _committed(delay: int | None, left_over: Tensor | None) -> Tensor | None:
