@@ -47,8 +47,7 @@ class PolicyInfo:
         noise: what a loop begins with: numbers of the ``normal`` distribution, or ``uniform`` ones of -1..1.
         follows: whether that plan begins with the chunk of the call before, so that each call has to be one chunk later
             than the one before (``CompiledPolicy.follow`` tells it of one that is not).
-        other_noise: how far two answers of the original to one observation are apart, mean over the executed actions in
-            their units, as the calibration found it; None without one, or where noise changes nothing.
+        other_noise: mean difference of two answers of the original to one observation, if the calibration found one.
     """
 
     K: int

@@ -12,23 +12,20 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ttscompile.core.coercion import integer
-from ttscompile.errors import ExecutorError, ObservationError
+from ttscompile.errors import ObservationError
+from ttscompile.measure.energy import Numbers
 
 from .measure import Clock, MonotonicClock
 from .settings import require_number
 from .statistics import Samples, Summary, summary
 
-Numbers = npt.NDArray[np.float64]
-
-_TIMES = 4096
-"""That percentiles are made from."""
+WAITING, TIMES = 64, 4096
+"""Calls that may wait for the compiled policy: more are dropped. And times that percentiles are made from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +40,8 @@ class ShadowReport:
         late: of the compared ones, that took it longer than the deadline.
         last_failure: the last error; empty if there was none.
         mean: mean absolute difference by number of the action; empty where nothing was compared.
-        largest: the largest difference by number of the action.
         worst: the largest mean difference of a call, and the call's number, counted from 0; -1 without one.
-        of_other_noise: the mean difference in units of what other noise changes, by the artifact's calibration: about 1
-            if the two do not have the same noise. None if that is not known, or noise changes nothing.
+        of_other_noise: the mean of these in units of ``PolicyInfo.other_noise``: about 1 where noise is not the same.
         original_ms: what calls of the original took.
         compiled_ms: what compared calls of the compiled policy took.
     """
@@ -58,7 +53,6 @@ class ShadowReport:
     late: int
     last_failure: str
     mean: tuple[float, ...]
-    largest: tuple[float, ...]
     worst: tuple[float, int]
     of_other_noise: float | None
     original_ms: Summary | None
@@ -68,7 +62,8 @@ class ShadowReport:
 class Shadow:
     """A policy that answers as ``original`` does, while ``compiled`` answers the same observations for a report.
 
-    It takes the original's place in an ``AsyncExecutor``, or in a loop that calls LeRobot's methods::
+    Its ``predict_action``, ``predict_action_chunk`` and ``select_action`` take what the original's take, in an
+    ``AsyncExecutor`` or in a loop of LeRobot::
 
         shadow = ttscompile.Shadow(original, ttscompile.load("compiled/"))
         with ttscompile.AsyncExecutor(shadow, control_hz=10) as executor:
@@ -76,13 +71,13 @@ class Shadow:
         print(shadow.close())
 
     The compiled policy is called after the original has answered, on a thread of its own: the caller waits for a copy
-    of the observation alone. Whatever happens there, the original's answer is given; errors are counted.
+    of the observation alone. Whatever happens there, the original's answer is given; errors are counted. After one,
+    methods that keep frames from call to call are compared again from the next episode on.
 
     Args:
         original: takes observations in the robot's units and gives actions in them, as the compiled policy does.
         compiled: a ``CompiledPolicy``, which nobody else may use until ``close``.
         deadline: seconds that a call of it may take; None for as long as the original took.
-        waiting: calls that may wait for it; more are dropped.
         noise: given an observation before the original is called, gives the noise that the original will draw, for the
             compiled policy; None for noise of its own.
         clock: None for ``time.monotonic``.
@@ -91,7 +86,7 @@ class Shadow:
         worst_observation: of the worst call, for ``np.savez`` and ``ttscompile predict``; None before there is one.
 
     Raises:
-        ExecutorError: an argument is no such number.
+        ExecutorError: the deadline is no such number.
     """
 
     def __init__(
@@ -100,14 +95,12 @@ class Shadow:
         compiled: Any,
         *,
         deadline: float | None = None,
-        waiting: int = 64,
         noise: Callable[[Mapping[str, Any]], Any] | None = None,
         clock: Clock | None = None,
     ) -> None:
         if deadline is not None:
             require_number(deadline, "deadline")
-        self._most, self._deadline = integer(waiting, "waiting", ExecutorError, 1), deadline
-        self._original, self._compiled, self._noise = original, compiled, noise
+        self._original, self._compiled, self._noise, self._deadline = original, compiled, noise, deadline
         self._other_noise = getattr(getattr(compiled, "info", None), "other_noise", None)
         self._clock = clock or MonotonicClock()
         self._due: deque[Callable[[], object]] = deque()
@@ -115,8 +108,8 @@ class Shadow:
         self._ending = self._missed = False
         self._count: Counter[str] = Counter()
         self._failure, self._worst = "", (0.0, -1)
-        self._differences = np.zeros((2, 0))  # sum of the means, and the largest
-        self._times = Samples(_TIMES), Samples(_TIMES)
+        self._sum = np.zeros(0)  # of the mean differences, by number of the action
+        self._times = Samples(TIMES), Samples(TIMES)
         self.worst_observation: Mapping[str, Any] | None = None
         self._thread = threading.Thread(target=self._run, name="ttscompile-shadow", daemon=True)
         self._thread.start()
@@ -145,28 +138,14 @@ class Shadow:
         for policy, tell in ((self._original, lambda note: note()), (self._compiled, self._give)):
             tell(partial(getattr(policy, "follow", lambda _: None), executed))
 
-    def predict_action(self, obs_dict: Mapping[str, Any], plan: Any = None, **words: Any) -> Any:
-        """What the original answers; ``plan`` is one of the original's, if it has any."""
-        own = {"plan": plan} if plan is not None and hasattr(self._original, "info") else {}
-        return self._both("predict_action", obs_dict, words, own)
-
-    def predict_action_chunk(self, batch: Mapping[str, Any], **words: Any) -> Any:
-        """What the original answers."""
-        return self._both("predict_action_chunk", batch, words, {})
-
-    def select_action(self, batch: Mapping[str, Any], **words: Any) -> Any:
-        """What the original answers."""
-        return self._both("select_action", batch, words, {})
-
     def report(self) -> ShadowReport:
         """What was found so far."""
         with self._work:
-            mean, noise = self._differences[0] / max(self._count["compared"], 1), self._other_noise
+            mean, noise = self._sum / max(self._count["compared"], 1), self._other_noise
             return ShadowReport(
                 **{name: self._count[name] for name in ("calls", "compared", "dropped", "failed", "late")},
                 last_failure=self._failure,
                 mean=tuple(mean.tolist()),
-                largest=tuple(self._differences[1].tolist()),
                 worst=self._worst,
                 of_other_noise=float(mean.mean()) / noise if noise and mean.size else None,
                 original_ms=summary(*self._times[0].copy()),
@@ -182,7 +161,9 @@ class Shadow:
         atexit.unregister(self.close)
         return self.report()
 
-    def _both(self, name: str, obs: Mapping[str, Any], words: dict[str, Any], own: dict[str, Any]) -> Any:
+    def _both(self, name: str, obs: Mapping[str, Any], /, plan: Any = None, **words: Any) -> Any:
+        """What the original answers; ``plan`` is one of the original's, if it has any."""
+        own = {} if plan is None or not hasattr(self._original, "info") else {"plan": plan}
         given = dict(words)
         try:
             given |= {} if self._noise is None else {"noise": self._noise(obs)}
@@ -195,7 +176,7 @@ class Shadow:
             number = self._count["calls"]
             self._count["calls"] += 1
             self._times[0].add(1e3 * took)
-            full = len(self._due) >= self._most
+            full = len(self._due) >= WAITING
             self._missed |= full
             drop = full or (self._missed and name != "predict_action")  # the others keep frames from call to call
             self._count["dropped"] += drop
@@ -203,11 +184,14 @@ class Shadow:
             if not drop:
                 kept = {key: copy.deepcopy(value) for key, value in obs.items()}
                 call = partial(getattr(self._compiled, name), kept, **copy.deepcopy(given))
-                within = took if self._deadline is None else self._deadline
-                self._give(partial(self._compare, call, kept, number, _array(answer), within))
+                self._give(partial(self._compare, call, kept, number, _array(answer), self._deadline or took))
         except Exception as error:
             self._fail(error)
         return answer
+
+    predict_action = partialmethod(_both, "predict_action")
+    predict_action_chunk = partialmethod(_both, "predict_action_chunk")
+    select_action = partialmethod(_both, "select_action")
 
     def _give(self, work: Callable[[], object]) -> None:
         with self._work:
@@ -219,8 +203,6 @@ class Shadow:
             self._count["failed"] += 1
             self._failure = f"{type(error).__name__}: {error!s:.300}"
 
-    # The thread's side
-
     def _run(self) -> None:
         while True:
             with self._work:
@@ -231,12 +213,12 @@ class Shadow:
             try:
                 work()
             except Exception as error:
+                self._missed = True
                 self._fail(error)
             with self._work:
                 self._due.popleft()
 
     def _compare(self, call: Callable[[], Any], obs: Any, number: int, answer: Numbers, within: float) -> None:
-        """Have the compiled policy answer, and take note of it."""
         begun = self._clock.now()
         made = _array(call())
         took = self._clock.now() - begun
@@ -245,8 +227,7 @@ class Shadow:
         if not np.isfinite(apart).all():
             raise ObservationError("actions of the original, or of the compiled policy, are not finite.")
         with self._work:
-            total, largest = self._differences if self._count["compared"] else np.zeros((2, made.shape[-1]))
-            self._differences = np.stack([total + apart.mean(0), np.maximum(largest, apart.max(0))])
+            self._sum = apart.mean(0) + (self._sum if self._count["compared"] else 0.0)
             self._count["compared"] += 1
             self._count["late"] += took > within
             self._times[1].add(1e3 * took)

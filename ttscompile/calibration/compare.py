@@ -28,9 +28,6 @@ from .progress import Progress
 from .state import StateFile
 from .trials import Trials
 
-FURTHEST = 3
-"""Calls of each plan that are shown, those furthest from the original."""
-
 
 @dataclass(frozen=True, eq=False)
 class Entrant:
@@ -150,12 +147,10 @@ def _apart(trials: Trials, score: Score) -> dict[str, Any]:
     x, y = score.answers, sample.answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
     assert x is not None  # ``judge`` made the score
     each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(spec.chunk.action_dim)]
-    flat = (one.reshape(*one.shape[:2], -1).astype(np.float64) for one in (x, y))
-    h, far = pairs(*flat)
-    scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
-    errors = np.abs(x - y).mean((0, 1, 2)) / scale
+    h, far = pairs(*(one.reshape(*one.shape[:2], -1).astype(np.float64) for one in (x, y)))
+    errors = np.abs(x - y).mean((0, 1, 2)) / (1.0 if (own := spec.chunk.normalizer) is None else np.abs(own.scale))
     furthest = []
-    for n in np.argsort(h)[: -FURTHEST - 1 : -1].tolist():
+    for n in np.argsort(h)[:-4:-1].tolist():  # three are shown
         episode, row = int(sample.episodes[n]), int(sample.calls[n, 1])
         seen = trials.episodes[episode].observations
         cameras = {key: seen[key][row] for key, one in spec.observations.items() if one.image}

@@ -107,13 +107,7 @@ SECTIONS = (
     help="Make the plan the default that 'ttscompile build' would choose by these times, without calibrating again."
     " With --control-hz it is the nearest plan that keeps up. The exit status is 1 if none does.",
 )
-@click.option(
-    "--plot",
-    "picture",
-    type=PICTURE,
-    help="Draw error against latency into this file (.png, .svg or .pdf), and the calls furthest from the original,"
-    " with what the cameras saw, into FILE-calls.png beside it.",
-)
+@click.option("--plot", "picture", type=PICTURE, help="Draw distance against latency; the furthest calls go beside it.")
 @click.pass_context
 def bench(
     context: click.Context,

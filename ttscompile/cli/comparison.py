@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.cli.output import counted_parts, manifest_of, only_results_on_stdout, progress, say, table
-from ttscompile.core.plan import DENSE
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
@@ -53,10 +52,7 @@ def draw_comparison(found: Comparison, directory: Path, picture: Path) -> str:
     """Draw it, and beside it the calls that are furthest from the original; says so."""
     title = f"{directory.resolve().name}: {found.calls} held-out calls, {_threads(found)}\n{one_line(fingerprint())}"
     plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], picture, title)
-    far = [p for p in found.points if p.furthest and p.name != DENSE] or [p for p in found.points[1:] if p.furthest]
-    if not far:
-        return f"wrote {picture}"
-    plot_calls(far, calls := picture.with_stem(f"{picture.stem}-calls"))
+    plot_calls(found.points[1:] or found.points, calls := picture.with_stem(f"{picture.stem}-calls"))
     return f"wrote {picture} and {calls}"
 
 

@@ -39,6 +39,11 @@ def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOp
             "adapt_to_pi_aloha or use_relative_actions is set: joints are turned into others, or actions are relative"
             " to the state, around the policy, which is not compiled; expected false"
         )
+    if config.settings.values.get("rtc_training_max_delay", 0) != 0:
+        raise config.settings.error(
+            "rtc_training_max_delay is set: the policy was trained to go on from a clean prefix, by a timestep for each"
+            " action, which is not compiled; with 0 it is compiled as a policy that knows no prefix"
+        )
     without = set(options.without_cameras or ())
     unknown = sorted(without - set(config.cameras))
     kept = [key for key in config.cameras if not key.startswith(_EMPTY) and key not in without]

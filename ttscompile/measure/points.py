@@ -137,13 +137,10 @@ class Comparison:
         best = self.efficient()
         points = [
             {
-                **{name: list(one) if isinstance(one, tuple) else one for name, one in vars(p).items()},
-                "furthest": [
-                    {"episode": one.episode, "call": one.call, "distance": one.distance} for one in p.furthest
-                ],
+                **vars(p),
+                "furthest": [{"episode": c.episode, "call": c.call, "distance": c.distance} for c in p.furthest],
                 "efficient": p in best,
             }
             for p in self.points
         ]
-        record = {**vars(self), "points": points, "episodes": list(self.episodes), "warnings": list(self.warnings)}
-        return {**record, "skipped": dict(self.skipped)}
+        return {**vars(self), "points": points, "skipped": dict(self.skipped)}

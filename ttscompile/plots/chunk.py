@@ -12,9 +12,6 @@ from ..measure.points import MeasuredPoint
 from .figure import new_figure, write_picture
 from .frontier import COLOURS
 
-MOST = 8
-"""Plans that are drawn."""
-
 
 def plot_chunk(actions: FloatArray, executed: range, path: str | Path, title: str) -> None:
     """Draw the actions ``[T, Da]``, with the executed steps shaded, and write the picture; see ``write_picture``."""
@@ -30,22 +27,23 @@ def plot_chunk(actions: FloatArray, executed: range, path: str | Path, title: st
 
 
 def plot_calls(points: Sequence[MeasuredPoint], path: Path) -> None:
-    """Draw the furthest calls of each plan in a row, lines the original and dots the plan; see ``write_picture``."""
-    shown = points[:MOST]
-    calls, sees = max(len(p.furthest) for p in shown), any(p.furthest[0].pictures for p in shown)
-    figure = new_figure(2.8 * calls * (1 + sees), 2.4 * len(shown), "the calls")
+    """Draw the furthest calls, a row for each of the first eight plans; lines are the original, dots the plan."""
+    shown = points[:8]
+    width = 1 + max(len(call.pictures) for p in shown for call in p.furthest)  # of a call
+    across = width * max(len(p.furthest) for p in shown)
+    figure = new_figure(2.2 * across, 2.4 * len(shown), "the calls")
     for row, p in enumerate(shown):
         for column, call in enumerate(p.furthest):
-            place = (row * calls + column) * (1 + sees) + 1
-            if sees:
-                camera = figure.add_subplot(len(shown), calls * 2, place)
-                camera.imshow(np.concatenate([np.moveaxis(one, 0, -1) for one in call.pictures.values()]).clip(0, 1))
+            place = row * across + column * width + 1
+            for number, picture in enumerate(call.pictures.values()):
+                camera = figure.add_subplot(len(shown), across, place + number)
+                camera.imshow(np.moveaxis(picture, 0, -1).clip(0, 1), cmap="gray")
                 camera.set_axis_off()
-            axes = figure.add_subplot(len(shown), calls * (1 + sees), place + sees)
+            axes = figure.add_subplot(len(shown), across, place + width - 1)
             for number, (theirs, own) in enumerate(zip(*np.swapaxes(call.actions, 1, 2), strict=True)):
                 axes.plot(theirs, color=COLOURS[number % len(COLOURS)], linewidth=1)
                 axes.plot(own, color=COLOURS[number % len(COLOURS)], marker=".", linestyle="none")
-            told = f"{p.series}: {p.name}\nepisode {call.episode}, call {call.call}: distance {call.distance:.2f}"
+            told = f"{p.series}: {p.name}\nepisode {call.episode}, call {call.call}:\ndistance {call.distance:.2f}"
             axes.set_title(told, fontsize=7, loc="left")
             axes.tick_params(labelsize=6)
     write_picture(figure, path)

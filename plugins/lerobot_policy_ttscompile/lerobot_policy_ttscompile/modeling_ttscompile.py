@@ -213,11 +213,11 @@ def _told(report: ShadowReport) -> str:
     if report.original_ms is None or report.compiled_ms is None:
         return told
     share = "" if report.of_other_noise is None else f", {report.of_other_noise:.2f} of what other noise changes"
-    each = ", ".join(f"{one:.4g} ({most:.4g})" for one, most in zip(report.mean, report.largest, strict=True))
+    each = ", ".join(f"{one:.4g}" for one in report.mean)
     return (
         f"{told}, {report.late} late; {report.original_ms.p50:.4g} ms the original, {report.compiled_ms.p50:.4g} ms"
-        f" compiled; mean difference {sum(report.mean) / len(report.mean):.4g}{share}; by number of the action, and at"
-        f" most, {each}; worst call {report.worst[1]}: {report.worst[0]:.4g}"
+        f" compiled; mean difference {sum(report.mean) / len(report.mean):.4g}{share}; by number of the action"
+        f" {each}; worst call {report.worst[1]}: {report.worst[0]:.4g}"
     )
 
 
