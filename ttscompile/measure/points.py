@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from ..core.spec import FloatArray
+import numpy as np
+import numpy.typing as npt
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class FarCall:
     episode: int
     call: int
     distance: float
-    pictures: Mapping[str, FloatArray]
-    actions: FloatArray
+    pictures: Mapping[str, npt.NDArray[np.float32]]
+    actions: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
