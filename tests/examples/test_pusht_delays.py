@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -133,6 +134,24 @@ def test_a_policy_that_fails_is_an_error_at_once() -> None:
     failing: Any = Telling(2)
     with pytest.raises(WorkerDeadError, match="ZeroDivisionError: scripted"):
         drive(Variant("telling", failing, None, SHAPE), setup(2), seed=0)
+
+
+def test_a_policy_that_stands_still_is_counted_and_goes_on_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the watchdog the policy is reset within an episode, which begins no new one."""
+    still = np.full((1, 16, 2), 100, np.float32)
+    moving = Telling.predict_action
+
+    def predict_action(self: Telling, *given: Any, **words: Any) -> dict[str, Any]:
+        return {"action_pred": still} if moving(self, *given, **words) else {}
+
+    monkeypatch.setattr(Telling, "predict_action", predict_action)
+    driven, policy = played(replace(setup(1), stall_after=0.2), STEPS)[1:]
+    # The first action is that of tick 3. At ticks 13 and 28 nothing has moved for 10: calls at 17 and 33 begin from nothing.
+    assert driven.stalls == 2 and driven.episode.calls >= 5
+    last = np.random.default_rng([3, driven.episode.calls - 1]).standard_normal(dtype=np.float32)
+    assert policy.noises[-1] == last and len(policy.noises) < driven.episode.calls
+    assert replace(setup(1), stall_after=0.2).label == "replace, margin 0, watchdog 0.2 s"
+    assert played(setup(1), STEPS)[1].stalls == 0
 
 
 def episode(seed: int, best: float, calls: int) -> Episode:
