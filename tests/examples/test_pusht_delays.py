@@ -146,7 +146,7 @@ def test_a_policy_that_stands_still_is_counted_and_goes_on_with_its_noise(monkey
 
     monkeypatch.setattr(Telling, "predict_action", predict_action)
     driven, policy = played(replace(setup(1), stall_after=0.2), STEPS)[1:]
-    # The first action is that of tick 3. At ticks 13 and 28 nothing has moved for 10: calls at 17 and 33 begin from nothing.
+    # The first action is that of tick 3; at ticks 13 and 28 nothing has moved for 10: calls 17 and 33 begin anew.
     assert driven.stalls == 2 and driven.episode.calls >= 5
     last = np.random.default_rng([3, driven.episode.calls - 1]).standard_normal(dtype=np.float32)
     assert policy.noises[-1] == last and len(policy.noises) < driven.episode.calls
