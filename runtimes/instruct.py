@@ -6,14 +6,9 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from ttscompile.core.spec import PolicySpec
-from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.core.tokenizer import TASK, Tokenizer, padded
 from ttscompile.errors import ObservationError
-
-TASK = "task"
-"""The key of the text, as LeRobot has it."""
 
 
 class Instruct:
@@ -47,11 +42,7 @@ class Instruct:
         texts = [task] * streams if isinstance(task, str) else task
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
             raise ObservationError(f"the task is {task!r:.80}; expected a text, or one for each stream.")
-        tokens = np.zeros((len(texts), self._length), np.int64)
-        mask = np.zeros((len(texts), self._length), np.bool_)
-        for i, text in enumerate(texts):
-            made = self._tokens(text)[: self._length]  # what is longer is cut, as lerobot does
-            tokens[i, : len(made)], mask[i, : len(made)] = made, True
+        tokens, mask = padded([self._tokens(text) for text in texts], self._length)
         return {**rest, self._told.tokens: tokens, self._told.mask: mask}
 
     def _tokens(self, text: str) -> list[int]:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ttscompile.artifact.load import Artifact
+from ttscompile.core.tokenizer import TASK
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import Array
-from ttscompile.runtimes.instruct import TASK
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.lock import Lock

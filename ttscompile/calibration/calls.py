@@ -65,7 +65,8 @@ def load_episodes(
         CalibrationError: there is only one.
         TrajectoryError: the recordings do not fit the policy.
     """
-    episodes = load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, observation)
+    steps = spec.chunk.stop - spec.chunk.start
+    episodes = load_trajectories(trajectories, spec.observations, steps, observation, spec.instruction)
     if len(episodes) < 2:
         raise CalibrationError(
             "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"

@@ -102,7 +102,8 @@ def calibrate(
             finished by then, as far as what was done before lets it be known; what has to be done at least is done.
             Also decides how many calls are used. A busy machine takes up to twice as long by the wall clock.
         validation_fraction: of the episodes.
-        observation: by key, the arrays of a recording that it is made of, where they are called otherwise.
+        observation: by key, the arrays of a recording that it is made of, where they are called otherwise; of ``task``
+            the path of the tokenizer that makes recorded instructions tokens.
         correct: fit a correction of the sampler to the schedule of a strategy that fits none itself, and keep it if it
             is better on calls that it was not fitted on.
         rank: of the low-rank update to each weight matrix, where weights are learned.

@@ -95,7 +95,8 @@ def inspect(
 
 def _first_episode(artifact: Artifact, trajectories: tuple[Path, ...], sources: Sources) -> Episode:
     spec = artifact.manifest.spec
-    return load_trajectories(trajectories, spec.observations, spec.chunk.stop - spec.chunk.start, sources)[0]
+    steps = spec.chunk.stop - spec.chunk.start
+    return load_trajectories(trajectories, spec.observations, steps, sources, spec.instruction)[0]
 
 
 def _drawn_by_default(artifact: Artifact, episode: Episode | None) -> str:

@@ -13,7 +13,7 @@ from ttscompile.core.paths import require_path
 from ttscompile.errors import TrajectoryError
 
 Sources = dict[str, tuple[str, ...]]
-"""By key of the observation, the arrays of a recording that it is made of; see ``ttscompile.trajectories``."""
+"""By key of the observation, the arrays of a recording that it is made of; of ``task``, the tokenizer's folder."""
 
 
 class FilesCommand(click.Command):
@@ -75,6 +75,7 @@ def trajectories_options(required: bool = True, what: str = "Learn from these re
             callback=_sources,
             metavar="KEY=NAME,NAME:N",
             help="Make a key of the observation of these arrays, joined in this order, where a recording of frames has"
-            " other names. NAME:N takes the first N numbers of an array.",
+            " other names. NAME:N takes the first N numbers of an array. task=DIR makes tokens of recorded"
+            " instructions, with the tokenizer.json of this folder.",
         ),
     )

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from .coercion import Errors
+
+TASK = "task"
+"""The key of an instruction's text, as LeRobot has it."""
 
 FILE = "tokenizer.json"
 _MOST_BYTES = 64 * 2**20
@@ -60,6 +67,14 @@ class Tokenizer:
             return list(self._tokenizer.encode(text).ids)
         except Exception as refused:
             raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
+
+
+def padded(tokens: Sequence[Sequence[int]], length: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Tokens of n texts as ``[n, length]``, with zeros after them, and which count; cut at the end, as lerobot does."""
+    rows, mask = np.zeros((len(tokens), length), np.int64), np.zeros((len(tokens), length), np.bool_)
+    for i, made in enumerate(each[:length] for each in tokens):
+        rows[i, : len(made)], mask[i, : len(made)] = made, True
+    return rows, mask
 
 
 def find_tokenizer(folder: Path) -> Path | None:

@@ -8,6 +8,7 @@ replay buffer of Diffusion Policy, an HDF5 file of robomimic and a LeRobot data 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import warnings
 import zipfile
@@ -22,12 +23,14 @@ import numpy.typing as npt
 
 from ..core.coercion import integer
 from ..core.paths import require_path
-from ..core.spec import ObservationSpec
+from ..core.spec import Instruction, ObservationSpec
+from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values, fitted
 from ..core.zip_files import open_zip
 from ..errors import TrajectoryError
 from .frames import Frames, few, observation_frames, one_error, require_proportion
+from .instructions import instruction_rows
 from .sandbox import sandboxed_frames
 
 Array = npt.NDArray[Any]
@@ -60,13 +63,16 @@ def load_trajectories(
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
     sources: Mapping[str, Sequence[str]] | None = None,
+    told: Instruction | None = None,
 ) -> list[Episode]:
     """Read episodes from files.
 
     Args:
         action_steps: how many actions of a chunk are executed: the frames between two calls.
         sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
-            are called otherwise; ``NAME:N`` are the first N numbers of one.
+            are called otherwise; ``NAME:N`` are the first N numbers of one. With ``task``, the path of a tokenizer, the
+            recorded instructions are made the policy's tokens.
+        told: how the policy is told its task in words.
 
     Returns:
         The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning; so
@@ -84,7 +90,8 @@ def load_trajectories(
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
-    for episode in [each for path in paths for each in _read(Path(path), observations, action_steps, sources or {})]:
+    read = (_read(Path(path), observations, action_steps, sources or {}, told) for path in paths)
+    for episode in itertools.chain.from_iterable(read):
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
@@ -97,9 +104,16 @@ def load_trajectories(
 
 
 def _read(
-    path: Path, observations: Mapping[str, ObservationSpec], action_steps: int, sources: Mapping[str, Sequence[str]]
+    path: Path,
+    observations: Mapping[str, ObservationSpec],
+    action_steps: int,
+    given: Mapping[str, Sequence[str]],
+    told: Instruction | None,
 ) -> list[Episode]:
-    used = {part.partition(":")[0] for key in observations for part in sources.get(key, (key,))}
+    sources = {key: parts for key, parts in given.items() if key != TASK}
+    text = {told.tokens, told.mask} if TASK in given and told is not None else set()
+    seen = {key: spec for key, spec in observations.items() if key not in text}
+    used = {part.partition(":")[0] for key in seen for part in sources.get(key, (key,))} | ({TASK} & set(given))
     other, held, frames = _opened(path, sorted(used))
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
@@ -107,7 +121,9 @@ def _read(
     if unknown := sorted(set(sources) - set(observations)):
         raise TrajectoryError(f"the policy observes {sorted(observations)}; found arrays for {unknown}.")
     ends = _ends(path, held.ends)
-    arrays = observation_frames(path, held, observations, sources)
+    arrays = observation_frames(path, held, seen, sources)
+    if TASK in given:
+        arrays |= instruction_rows(path, held, told, observations, os.fspath(given[TASK][0]))
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}

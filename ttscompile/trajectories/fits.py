@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..core.finding import Finding, Level
 from ..core.spec import PolicySpec
+from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .episodes import load_trajectories, recorded_names
@@ -29,7 +30,7 @@ _BLIND_SECONDS = 3.0
 def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping[str, Sequence[str]]) -> list[Finding]:
     """Look at recordings, which are given as to ``load_trajectories``, as the policy would observe them."""
     found, renamed = list[Finding](), dict(sources)
-    if said := [key for key in spec.observations if key.startswith(_LANGUAGE) and key not in sources]:
+    if said := [key for key in spec.observations if key.startswith(_LANGUAGE) and not {key, TASK} & set(sources)]:
         observed = {key: one for key, one in spec.observations.items() if key not in said}
         spec = replace(spec, observations=observed, instruction=None)
         told = f"{', '.join(said)}: not looked at; recordings seldom have them, and convert --task compiles a text in"
@@ -39,7 +40,8 @@ def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping
         try:
             for path in paths:
                 found += [*_names(path, spec, renamed), *_rate(path, spec)]
-            episodes = load_trajectories(paths, spec.observations, spec.chunk.stop - spec.chunk.start, renamed)
+            steps = spec.chunk.stop - spec.chunk.start
+            episodes = load_trajectories(paths, spec.observations, steps, renamed, spec.instruction)
         except TrajectoryError as error:
             return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
     found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in warned]
@@ -51,7 +53,8 @@ def _names(path: Path, spec: PolicySpec, renamed: dict[str, Sequence[str]]) -> l
     """Keys that a recording lacks; a name that may stand for one is added to ``renamed``, and said."""
     names, frames = recorded_names(path)
     used = {part.partition(":")[0] for key in spec.observations for part in renamed.get(key, (key,))}
-    missing = [key for key in spec.observations if key not in renamed and key not in names]
+    text = {spec.instruction.tokens, spec.instruction.mask} if TASK in renamed and spec.instruction else set[str]()
+    missing = [key for key in spec.observations if key not in renamed and key not in names and key not in text]
     free = [name for name in names if name not in used]
     if not missing:
         return [Finding(PART, path.name, "what the policy observes" + f"; not read: {few(free)}" * bool(free))]

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.spec import ObservationSpec
+from ..core.tokenizer import TASK
 from ..errors import TrajectoryError
 
 Array = npt.NDArray[Any]
@@ -94,9 +95,11 @@ def observation_frames(
 def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
     name, colon, count = part.partition(":")
     if name not in frames.names:
+        words = "language" in key and TASK in frames.names
+        remedy = " Of its instructions --observation task=DIR makes tokens, with DIR/tokenizer.json." if words else ""
         raise TrajectoryError(
-            f"{path}: has no array {name!r} for the observation {key!r}; it has {few(frames.names)}. Say what the"
-            f" observation is made of, in order: --observation {key}=NAME,NAME:N (NAME:N are its first N numbers), or"
+            f"{path}: has no array {name!r} for the observation {key!r}; it has {few(frames.names)}.{remedy} Say what"
+            f" the observation is made of, in order: --observation {key}=NAME,NAME:N (NAME:N are its first N), or"
             f' observation={{"{key}": ["NAME", "NAME:N"]}}.'
         )
     array = frames.read(name)

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .frames import Array, Recording, missing_package, one_error, require_files, require_proportion
 from .lerobot_video import video_frames
 
-EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
+EPISODE, FRAME, TIME, TASKS = "episode_index", "frame_index", "timestamp", "task_index"
 MAX_INFO = 64 * 2**20
 """Bytes of ``meta/info.json``."""
 ROWS, IMAGES = 4096, 8
@@ -50,7 +51,11 @@ def lerobot_recording(path: Path) -> Recording:
     order = np.lexsort((numbers, episodes))
     ends = np.append(np.flatnonzero(np.diff(episodes[order])) + 1, len(order))
 
+    told = TASKS in names and TASK not in names and any((path / "meta").glob("tasks.*"))
+
     def read(name: str) -> tuple[int, Iterator[Array]]:
+        if name == TASK and told:
+            return len(order), _texts(path, _index(path, tables, TASKS, size))
         if name in videos:
             times = np.concatenate([np.zeros(0, np.float32), *_column(path, tables, TIME, size)])
             return len(order), video_frames(path, name, info, episodes, times, columns)
@@ -60,7 +65,7 @@ def lerobot_recording(path: Path) -> Recording:
         return np.concatenate(list(_column(path, [parquet.ParquetFile(file) for file in files], name, size)))
 
     sorted_already = bool((order == np.arange(len(order))).all())
-    return Recording([*names, *videos], read, ends, None if sorted_already else order)
+    return Recording([*names, *videos, *([TASK] if told else [])], read, ends, None if sorted_already else order)
 
 
 def _index(path: Path, tables: list[Any], name: str, size: int) -> Array:
@@ -69,6 +74,26 @@ def _index(path: Path, tables: list[Any], name: str, size: int) -> Array:
     if whole.ndim != 1 or whole.dtype.kind not in "iu":
         raise TrajectoryError(f"{path}: column {name!r} is {whole.dtype}{list(whole.shape)}; expected integers [F].")
     return whole
+
+
+def _texts(path: Path, numbers: Array) -> Iterator[Array]:
+    """The instruction of each row, as the bytes of its text with zeros after them, ``[n, L]``."""
+    lines = path / "meta" / "tasks.jsonl"
+    with one_error(f"{path}: meta/{lines.stem} cannot be read", ", which says what each task_index is in words"):
+        if lines.exists():  # version 2
+            rows = [parse_json(line, MAX_INFO) for line in lines.read_bytes().splitlines() if line]
+            texts = {int(row[TASKS]): str(row[TASK]) for row in rows}
+        else:
+            import pyarrow.parquet as parquet
+
+            table = parquet.read_table(lines.with_suffix(".parquet"), use_threads=False)
+            (name,) = (each for each in table.column_names if each != TASKS)
+            texts = dict(zip(table[TASKS].to_pylist(), map(str, table[name].to_pylist()), strict=True))
+        different, places = np.unique(numbers, return_inverse=True)
+        coded = np.array([texts[number].encode() for number in different.tolist()])
+    letters = coded[:, None].view(np.uint8)
+    for begin in range(0, len(numbers), ROWS):
+        yield letters[places[begin : begin + ROWS]]
 
 
 def _column(path: Path, tables: list[Any], name: str, size: int) -> Iterator[Array]:

@@ -82,8 +82,9 @@ def verify(
         return Verification(str(path), None, None, (rung,), time.monotonic() - begun)
     manifest, episodes = artifact.manifest, []
     if trajectories:
-        chunk, observations = manifest.spec.chunk, manifest.spec.observations
-        episodes = choose(load_trajectories(trajectories, observations, chunk.stop - chunk.start, sources), calls)
+        spec = manifest.spec
+        steps = spec.chunk.stop - spec.chunk.start
+        episodes = choose(load_trajectories(trajectories, spec.observations, steps, sources, spec.instruction), calls)
     rungs, errors = _climb(artifact, episodes, threads, progress)
     seconds = time.monotonic() - begun
     return Verification(str(path), manifest.identity, manifest.model_identity, (rung, *rungs), seconds, errors)

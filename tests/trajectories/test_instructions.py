@@ -1,0 +1,140 @@
+"""Instructions of recordings, as the tokens that a policy observes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
+import pytest
+
+from ttscompile.core.spec import Instruction, ObservationSpec
+from ttscompile.errors import TrajectoryError
+from ttscompile.trajectories import load_trajectories
+from ttscompile.trajectories.fits import examine_recordings
+
+from . import test_fits
+from .data_sets import ENDS, arrays, read_here
+
+TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
+TOLD = Instruction(TOKENS, MASK, new_line=True)
+WORDS = {"?": 0, "push": 1, "left": 2, "right": 3, "\n": 4}
+LANGUAGE = {
+    TOKENS: ObservationSpec((3,), dtype="int64", bounds=(0, 4)),
+    MASK: ObservationSpec((3,), dtype="bool"),
+}
+OBSERVED = {"state": ObservationSpec((1, 5)), **LANGUAGE}
+TEXTS = ["push left", "push right right right"]
+
+
+@pytest.fixture(autouse=True)
+def _read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ttscompile.trajectories.sandbox.reader", read_here)
+
+
+@pytest.fixture
+def tokenizer(tmp_path: Path) -> Path:
+    folder = tmp_path / "language"
+    folder.mkdir()
+    model = {"type": "WordLevel", "vocab": WORDS, "unk_token": "?"}
+    split = {"type": "Split", "pattern": {"String": " "}, "behavior": "Removed", "invert": False}
+    lines = {"type": "Split", "pattern": {"String": "\n"}, "behavior": "Isolated", "invert": False}
+    both = {"type": "Sequence", "pretokenizers": [split, lines]}
+    written = {"version": "1.0", "added_tokens": [], "pre_tokenizer": both, "model": model}
+    (folder / "tokenizer.json").write_text(json.dumps(written))
+    return folder
+
+
+def data_set(path: Path, version: int) -> Path:
+    """Two episodes; the first is task 7, the second task 3."""
+    root = path / "it"
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps({"features": {}}))
+    if version == 2:
+        lines = [json.dumps({"task_index": number, "task": text}) for number, text in zip((7, 3), TEXTS, strict=True)]
+        (root / "meta" / "tasks.jsonl").write_text("\n".join(lines))
+    else:
+        named = {"task_index": [7, 3], "__index_level_0__": TEXTS}
+        parquet.write_table(pa.table(named), root / "meta" / "tasks.parquet")
+    (root / "data").mkdir()
+    first = ENDS[0]
+    table = {
+        "state": arrays()["state"].tolist(),
+        "episode_index": [int(i >= first) for i in range(ENDS[-1])],
+        "frame_index": [i - first * (i >= first) for i in range(ENDS[-1])],
+        "task_index": [3 if i >= first else 7 for i in range(ENDS[-1])],
+    }
+    parquet.write_table(pa.table(table), root / "data" / "file.parquet")
+    return root
+
+
+def require_told(path: Path, tokenizer: Path) -> None:
+    """Both episodes have the tokens of their texts, at every call."""
+    first, second = load_trajectories([path], OBSERVED, 3, {"task": (str(tokenizer),)}, TOLD)
+    assert first.calls == second.calls == 2
+    np.testing.assert_array_equal(first.observations[TOKENS], [[1, 2, 4]] * 2)
+    np.testing.assert_array_equal(first.observations[MASK], [[True] * 3] * 2)
+    np.testing.assert_array_equal(second.observations[TOKENS], [[1, 3, 3]] * 2)  # what is longer is cut
+    np.testing.assert_array_equal(second.observations["state"][0], arrays()["state"][ENDS[0] :][:1])
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_instructions_of_a_lerobot_data_set_become_tokens(version: int, tmp_path: Path, tokenizer: Path) -> None:
+    require_told(data_set(tmp_path, version), tokenizer)
+
+
+def test_texts_of_an_npz_become_tokens(tmp_path: Path, tokenizer: Path) -> None:
+    texts = [TEXTS[int(i >= ENDS[0])] for i in range(ENDS[-1])]
+    meta = np.array('{"frames": true}')
+    path = tmp_path / "it.npz"
+    np.savez(path, state=arrays()["state"], task=np.array(texts), episode_ends=np.array(ENDS), meta=meta)
+    require_told(path, tokenizer)
+
+
+def test_short_texts_are_padded(tmp_path: Path, tokenizer: Path) -> None:
+    longer = {**OBSERVED, TOKENS: ObservationSpec((5,), dtype="int64"), MASK: ObservationSpec((5,), dtype="bool")}
+    told = Instruction(TOKENS, MASK, new_line=False)
+    first, _ = load_trajectories([data_set(tmp_path, 3)], longer, 3, {"task": (str(tokenizer),)}, told)
+    np.testing.assert_array_equal(first.observations[TOKENS][0], [1, 2, 0, 0, 0])
+    np.testing.assert_array_equal(first.observations[MASK][0], [True, True, False, False, False])
+
+
+def test_a_data_set_with_instructions_says_how_they_become_tokens(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match="no array 'observation.language.*--observation task=DIR makes tokens"):
+        load_trajectories([data_set(tmp_path, 3)], OBSERVED, 3, None, TOLD)
+
+
+def test_a_tokenizer_for_a_policy_without_text_is_refused(tmp_path: Path, tokenizer: Path) -> None:
+    with pytest.raises(TrajectoryError, match="this policy takes no text"):
+        load_trajectories([data_set(tmp_path, 3)], {"state": OBSERVED["state"]}, 3, {"task": (str(tokenizer),)})
+
+
+def test_a_data_set_without_instructions_is_refused(tmp_path: Path, tokenizer: Path) -> None:
+    root = data_set(tmp_path, 3)
+    (root / "meta" / "tasks.parquet").unlink()
+    with pytest.raises(TrajectoryError, match="has no array 'task'; it has state, task_index"):
+        load_trajectories([root], OBSERVED, 3, {"task": (str(tokenizer),)}, TOLD)
+
+
+def test_a_task_that_is_not_named_is_refused(tmp_path: Path, tokenizer: Path) -> None:
+    root = data_set(tmp_path, 2)
+    (root / "meta" / "tasks.jsonl").write_text(json.dumps({"task_index": 7, "task": "push"}))
+    with pytest.raises(TrajectoryError, match="meta/tasks cannot be read .KeyError: 3., which says what each"):
+        load_trajectories([root], OBSERVED, 3, {"task": (str(tokenizer),)}, TOLD)
+
+
+def test_a_tokenizer_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match="no such file; expected the tokenizer.json"):
+        load_trajectories([data_set(tmp_path, 3)], OBSERVED, 3, {"task": (str(tmp_path / "no"),)}, TOLD)
+
+
+def test_the_doctor_looks_at_tokens_that_it_can_make(tmp_path: Path, tokenizer: Path) -> None:
+    spec = test_fits.policy()
+    held = {test_fits.STATE: test_fits.states(), test_fits.FRONT: test_fits.pictures(0.2)}
+    held |= {test_fits.WRIST: test_fits.pictures(0.7), "task": np.array(["push left"] * 40)}
+    np.savez(tmp_path / "calls.npz", meta=np.array('{"frames": true}'), episode_ends=np.array([20, 40]), **held)
+    told = type(spec)(spec.sample, {**spec.observations, **LANGUAGE}, spec.sampler, spec.chunk, instruction=TOLD)
+    said = {one.what: one for one in examine_recordings([tmp_path / "calls.npz"], told, {"task": (str(tokenizer),)})}
+    assert "instruction" not in said and said["calls"].found == "10 in 2 episodes"
