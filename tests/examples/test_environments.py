@@ -27,7 +27,7 @@ from ttscompile.samplers.flow import flow_matching_table
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # read when MuJoCo is imported; there is no display
 
-PACKAGES = {"fetch": "gymnasium_robotics", "metaworld": "metaworld"}
+PACKAGES = {"fetch": "gymnasium_robotics", "fetch-blocks": "gymnasium_robotics", "metaworld": "metaworld"}
 """What an environment needs beyond the extra ``dev``."""
 
 SEEDS = range(3)
@@ -84,7 +84,7 @@ def test_frames_keep_their_shapes_and_are_of_the_caller(environment: Environment
     environment.step(environment.rest() + np.float32(0.3))
     for key, array in environment.observe().items():
         assert (array.shape, array.dtype) == (first[key].shape, first[key].dtype)
-        assert array.dtype in (np.float32, np.int64, np.uint8)
+        assert array.dtype in (np.float32, np.int64, np.uint8, np.bool_)
         assert np.isfinite(array).all()
         np.testing.assert_array_equal(first[key], before[key], err_msg="a frame changed after it was given")
     environment.reset(1)
