@@ -49,7 +49,7 @@ def save(folder: Path) -> Path:
     flags = dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized"), False)
     split = {"type": "Split", "pattern": {"Regex": "."}, "behavior": "Isolated", "invert": False}
     words = {"type": "WordLevel", "vocab": {**letters, **_MARKS}, "unk_token": "?"}
-    tokenizer = {"version": "1.0", "added_tokens": [{**mark, **flags} for mark in marks]}
+    tokenizer: dict[str, Any] = {"version": "1.0", "added_tokens": [{**mark, **flags} for mark in marks]}
     tokenizer |= {"pre_tokenizer": split, "model": words}  # a letter is a token: this is nobody's text
     tokenizer |= dict.fromkeys(("truncation", "padding", "normalizer", "post_processor", "decoder"))
     write_json(model / "tokenizer.json", tokenizer)

@@ -36,7 +36,7 @@ def proportional(array: FloatArray, height: int, width: int, centre: bool) -> Fl
 
 def in_bytes(array: FloatArray) -> FloatArray:
     """Numbers in 0..1 rounded down to steps of 1/255; those that are such steps stay."""
-    return np.trunc(np.clip(array * np.float32(255), 0, 255)) / np.float32(255)
+    return np.asarray(np.trunc(np.clip(array * np.float32(255), 0, 255)) / 255, np.float32)
 
 
 def stretched(array: FloatArray, height: int, width: int) -> FloatArray:
@@ -44,11 +44,11 @@ def stretched(array: FloatArray, height: int, width: int) -> FloatArray:
 
     It is computed as PyTorch does, rounding included, so that no pixel is another step than in the original.
     """
-    pixels = np.trunc(np.clip(array * np.float32(255), 0, 255))
+    pixels = np.rint(in_bytes(array) * np.float32(255))
     if array.shape[-2:] != (height, width):
         pixels = _cubic(_cubic(pixels, width, -1), height, -2)
         pixels = np.rint(np.clip(pixels, 0, 255))
-    return np.asarray(pixels / np.float32(255))
+    return np.asarray(pixels / np.float32(255), np.float32)
 
 
 def _bilinear(array: FloatArray, count: int, axis: int) -> FloatArray:

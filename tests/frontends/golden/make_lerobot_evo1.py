@@ -118,7 +118,7 @@ def language(kind: str) -> None:
     config = InternVLConfig(
         vision_config=VISION | vision,
         text_config=TEXT | text | {"vocab_size": len(tokenizer)},
-        image_token_id=tokenizer.convert_tokens_to_ids("<IMG_CONTEXT>"),
+        image_token_id=made.get_vocab()["<IMG_CONTEXT>"],
         image_seq_length=4,
     )
     InternVLModel(config).save_pretrained(evo1s.LANGUAGE)
