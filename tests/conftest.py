@@ -41,6 +41,12 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     if not has_integer_dot_product():
         config.addinivalue_line("filterwarnings", "ignore:precision 'int8' is fast on a processor:RuntimeWarning")
+    if importlib.util.find_spec("hypothesis") is not None:
+        from hypothesis import HealthCheck, settings
+
+        # What else the machine does may slow an example down.
+        settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+        settings.load_profile("any machine")
     if importlib.util.find_spec("torch") is not None:
         import torch
 
