@@ -129,7 +129,7 @@ def convert_clip(folder: Path) -> None:
     stages.end()
 
 
-def run_smolvla(folder: Path) -> None:
+def run_smolvla(folder: Path, rounds: int) -> None:
     """See ``large_calls``; two of ten steps are computed."""
     import large_calls
     import large_smolvla
@@ -137,11 +137,13 @@ def run_smolvla(folder: Path) -> None:
     from ttscompile.frontends import load_checkpoint_policy
 
     module, spec = load_checkpoint_policy(folder / "smolvla")
-    large_calls.compare(folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2)
-    large_calls.reusing(folder, spec, 2)
+    large_calls.compare(
+        folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
+    )
+    large_calls.reusing(folder, spec, 2, rounds + 2)
 
 
-def run_evo1(folder: Path) -> None:
+def run_evo1(folder: Path, rounds: int) -> None:
     """See ``large_calls``; two of 32 steps are computed."""
     import large_calls
     import large_evo1
@@ -151,8 +153,10 @@ def run_evo1(folder: Path) -> None:
     from ttscompile.frontends.families import LoadOptions
 
     module, spec = load_checkpoint_policy(folder / "evo1", options=LoadOptions(task=large_evo1.TASK))
-    large_calls.compare(folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, 3)
-    large_calls.reusing(folder, spec, 2, 3)
+    large_calls.compare(
+        folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
+    )
+    large_calls.reusing(folder, spec, 2, rounds + 2)
 
 
 def _vision(module: nn.Module) -> nn.Module:
@@ -160,14 +164,14 @@ def _vision(module: nn.Module) -> nn.Module:
     return next(one for name, one in module.named_modules() if name.endswith(("vision_model", "vision_tower")))
 
 
-def run_clip(folder: Path) -> None:
+def run_clip(folder: Path, rounds: int) -> None:
     """See ``large_calls``; five of a hundred steps are computed."""
     import large_calls
     import large_clip
 
     module, spec = large_clip.policy()
-    large_calls.compare(folder, "encoder, loop", large_clip.eager(module, spec), spec, 5)
-    large_calls.reusing(folder, spec, 5)
+    large_calls.compare(folder, "encoder, loop", large_clip.eager(module, spec), spec, 5, rounds)
+    large_calls.reusing(folder, spec, 5, rounds + 2)
 
 
 def run(folder: Path) -> None:
@@ -215,15 +219,17 @@ def main() -> None:
     parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
     parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
+    parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.smolvla and options.only is not None:
-        (convert_smolvla if options.only == "convert" else run_smolvla)(options.output)
-    elif options.evo1 and options.only is not None:
-        (convert_evo1 if options.only == "convert" else run_evo1)(options.output)
-    elif options.clip and options.only is not None:
-        (convert_clip if options.only == "convert" else run_clip)(options.output)
+    policies = {"smolvla": (convert_smolvla, run_smolvla), "evo1": (convert_evo1, run_evo1)}
+    policies |= {"clip": (convert_clip, run_clip)}
+    asked = next((own for name, own in policies.items() if getattr(options, name)), None)
+    if asked is not None and options.only == "convert":
+        asked[0](options.output)
+    elif asked is not None and options.only == "run":
+        asked[1](options.output, options.rounds)
     elif options.only == "convert":
         from large_networks import transformer, unet
 
@@ -238,7 +244,7 @@ def main() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             for part in ("convert", "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
-                own += ["--smolvla"] * options.smolvla + ["--evo1"] * options.evo1 + ["--clip"] * options.clip
+                own += [f"--{name}" for name in policies if getattr(options, name)] + [f"--rounds={options.rounds}"]
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

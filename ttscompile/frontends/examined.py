@@ -103,7 +103,8 @@ def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[s
         told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
         remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
         doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
-    return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, found, spec, encoders)]
+    name = str(found.tokenizer.get("tokenizer_name", entries.get("vlm_model_name", "none")))[:200]
+    return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, name, found, spec, encoders)]
 
 
 def _cameras(directory: Path, features: Features, step: Mapping[str, Any]) -> list[Finding]:
@@ -130,10 +131,10 @@ def _cameras(directory: Path, features: Features, step: Mapping[str, Any]) -> li
 
 
 def _tokenizer(
-    directory: Path, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
+    directory: Path, name: str, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
 ) -> list[Finding]:
     """Of a policy that reads an instruction: whether the tokenizer is of its language model."""
-    one, name = spec.observations.get(TOKENS), str(found.tokenizer.get("tokenizer_name", "none"))[:200]
+    one = spec.observations.get(TOKENS)
     if one is None or one.bounds is None:
         return []
     near = encoder_folders(encoders, directory)
