@@ -17,7 +17,7 @@ from ttscompile.artifact.manifest import SCHEMA_VERSION, Manifest, PlanRecord
 from ttscompile.artifact.strict_json import Value, dump, parse
 from ttscompile.artifact.typed_json import from_json, read_as, to_json
 from ttscompile.core.spec import Affine, Instruction, ObservationSpec, PolicySpec, SamplerTable
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactError, SpecError
 from ttscompile.ir.graph import Batch, TensorType
 
 finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -86,6 +86,8 @@ def test_what_a_record_leaves_out_has_its_default() -> None:
     uniform = replace(spec, noise="uniform", instruction=replace(instruction, before=("a line",), skipped=3))
     found = through_json(uniform)
     assert (found.noise, found.instruction) == ("uniform", uniform.instruction)
+    with pytest.raises(SpecError, match="noise is 'pink'; expected normal or uniform"):
+        replace(spec, noise="pink")  # type: ignore[arg-type]
     with pytest.raises(ArtifactError, match="noise"):
         from_json(PolicySpec, parse(dump({**to_json(spec), "noise": "pink"}), "spec"))
 

@@ -255,6 +255,8 @@ class PolicySpec:
         object.__setattr__(self, "left_out", integer(self.left_out, "left_out", SpecError))
         if len(sizes) != 2:
             raise SpecError(f"the sample's shape must be (T, D); found {self.sample}.")
+        if self.noise not in ("normal", "uniform"):
+            raise SpecError(f"noise is {self.noise!r:.80}; expected normal or uniform.")
         if not self.observations:
             raise SpecError("a policy needs at least one observation: a condition input of the denoiser.")
         taken = {self.sample_argument, self.timestep_argument}
