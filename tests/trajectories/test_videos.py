@@ -14,7 +14,7 @@ import pytest
 
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
-from ttscompile.trajectories import load_trajectories, sandbox
+from ttscompile.trajectories import frames, load_trajectories, sandbox
 
 from .data_sets import ENDS, as_lerobot_with_videos, read_here, shade, write_video
 
@@ -42,6 +42,31 @@ def test_frames_are_those_of_their_rows(tmp_path: Path, version: int, codec: str
         np.testing.assert_allclose(found[:, 1], wanted, atol=SHADES)
         before = np.array([shade(first + max(0, 2 * call - 1)) for call in range(episode.calls)], np.float32) / 255
         np.testing.assert_allclose(found[:, 0, :, 7, 9], before, atol=SHADES)
+
+
+@pytest.mark.parametrize("block", [None, 64])
+def test_a_policy_of_one_frame_sees_those_of_its_calls(
+    tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch, block: int | None
+) -> None:
+    """Whether the pictures are kept in memory or, where they are many, on disk."""
+    if block is not None:
+        monkeypatch.setattr(sandbox, "BLOCK_BYTES", block)
+    specs = {"top": ObservationSpec((1, 3, 16, 32)), "state": ObservationSpec((5,))}
+    root = as_lerobot_with_videos(tmp_path)
+    one, two = (load_trajectories([root], given, 2) for given in (specs, SPECS))
+    assert [episode.calls for episode in one] == [3, 2]
+    for each, other in zip(one, two, strict=True):
+        assert type(each.observations["top"]) is np.ndarray, "nothing else is told of the file on disk"
+        np.testing.assert_array_equal(each.observations["top"][:, 0], other.observations["top"][:, 1])
+        np.testing.assert_array_equal(each.observations["state"], other.observations["state"][:, 1])
+
+
+def test_only_the_frames_of_calls_become_floats(tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[int]()
+    whole = frames._as_image
+    monkeypatch.setattr(frames, "_as_image", lambda array, spec: seen.append(len(array)) or whole(array, spec))
+    load_trajectories([as_lerobot_with_videos(tmp_path)], {"top": ObservationSpec((1, 3, 16, 32))}, 4)
+    assert seen == [3], "of nine frames, calls begin with these"
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="this system has no scheduling policies")

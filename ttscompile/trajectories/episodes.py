@@ -8,7 +8,6 @@ replay buffer of Diffusion Policy, an HDF5 file of robomimic and a LeRobot data 
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
 import warnings
 import zipfile
@@ -29,7 +28,7 @@ from ..core.untrusted_json import parse_json
 from ..core.values import check_values, fitted
 from ..core.zip_files import open_zip
 from ..errors import TrajectoryError
-from .frames import Frames, few, observation_frames, one_error, require_proportion
+from .frames import Frames, few, frames_of_calls, observation_frames, one_error, require_proportion
 from .instructions import instruction_rows
 from .sandbox import sandboxed_frames
 
@@ -90,8 +89,8 @@ def load_trajectories(
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
-    read = (_read(Path(path), observations, action_steps, sources or {}, told) for path in paths)
-    for episode in itertools.chain.from_iterable(read):
+    sources = sources or {}
+    for episode in [each for path in paths for each in _read(Path(path), observations, action_steps, sources, told)]:
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
@@ -121,6 +120,9 @@ def _read(
     if unknown := sorted(set(sources) - set(observations)):
         raise TrajectoryError(f"the policy observes {sorted(observations)}; found arrays for {unknown}.")
     ends = _ends(path, held.ends)
+    if other == "lerobot" and all((spec.frames or 1) == 1 for spec in observations.values()):
+        held, action_steps = frames_of_calls(held, action_steps), 1
+        ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
     if TASK in given:
         arrays |= instruction_rows(path, held, told, observations, os.fspath(given[TASK][0]))

@@ -59,6 +59,14 @@ class Recording:
     order: Array | None = None
 
 
+def frames_of_calls(frames: Frames, stride: int) -> Frames:
+    """Those in which calls begin, which are all that a policy of one frame sees: no other is made floats."""
+    starts = np.append(0, frames.ends[:-1])
+    rows = [np.arange(start, end, stride) for start, end in zip(starts, frames.ends, strict=True)]
+    chosen, ends = np.concatenate(rows), np.cumsum([len(each) for each in rows])
+    return Frames(frames.names, lambda name: frames.read(name)[chosen], ends)
+
+
 def observation_frames(
     path: Path, frames: Frames, observations: Mapping[str, ObservationSpec], sources: Mapping[str, Sequence[str]]
 ) -> dict[str, Array]:

@@ -19,10 +19,8 @@ def instruction_rows(
     """Tokens and mask of every row, from its text.
 
     Args:
-        path: of the recording, for messages.
         held: what it holds: ``task``, texts ``[F]`` or their bytes ``[F, L]``.
         told: how the policy is told its task.
-        observations: of the policy.
         tokenizer: path of ``tokenizer.json``, or of its folder.
 
     Returns:

@@ -91,9 +91,8 @@ def _texts(path: Path, numbers: Array) -> Iterator[Array]:
             texts = dict(zip(table[TASKS].to_pylist(), map(str, table[name].to_pylist()), strict=True))
         different, places = np.unique(numbers, return_inverse=True)
         coded = np.array([texts[number].encode() for number in different.tolist()])
-    letters = coded[:, None].view(np.uint8)
     for begin in range(0, len(numbers), ROWS):
-        yield letters[places[begin : begin + ROWS]]
+        yield coded[places[begin : begin + ROWS], None].view(np.uint8)
 
 
 def _column(path: Path, tables: list[Any], name: str, size: int) -> Iterator[Array]:

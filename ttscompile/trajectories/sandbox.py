@@ -18,12 +18,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
+from tempfile import TemporaryFile
 from typing import IO, Any, BinaryIO
 
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import AS_NPZ, Array, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
+from .frames import AS_NPZ, BLOCK_BYTES, Array, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
 from .hdf5_file import hdf5_recording
 from .lerobot_dataset import lerobot_recording
 from .zarr_buffer import zarr_recording
@@ -102,7 +103,10 @@ def _ended(path: str, status: int) -> TrajectoryError:
 
 
 def _array(stream: IO[bytes], line: Mapping[str, Any]) -> Array:
-    array = np.empty(line["shape"], line["dtype"])
+    shape, dtype = tuple(line["shape"]), np.dtype(line["dtype"])
+    large = dtype.itemsize * int(np.prod(shape, dtype=object)) > BLOCK_BYTES
+    with TemporaryFile() as file:  # which stays as long as the array: pictures of hundreds of episodes are on disk
+        array = np.memmap(file, dtype, "w+", shape=shape) if large else np.empty(shape, dtype)
     done = 0
     while done < len(array):
         head = _line(stream)
