@@ -5,37 +5,40 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+
+from .recipes import script
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # read when MuJoCo is imported; there is no display
 MISSING = importlib.util.find_spec("gymnasium_robotics") is None
 pytestmark = pytest.mark.skipif(
     MISSING, reason="NO TESTS OF FETCH-BLOCKS: gymnasium_robotics is not installed; pip install 'ttscompile[examples]'"
 )
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def recipe() -> Iterator[Any]:
-    """The demonstrations of ``examples/policies/vla``, which are run from the root of the repository."""
-    sys.path.insert(0, str(ROOT))
+def recipe() -> Iterator[ModuleType]:
+    """The demonstrations of ``examples/policies/vla``."""
+    folder = Path(__file__).parents[2] / "examples" / "policies" / "vla"
+    sys.path.insert(0, str(folder))
     try:
-        yield importlib.import_module("examples.policies.vla.demonstrations")
+        yield script(folder, "demonstrations")
     finally:
-        sys.path.remove(str(ROOT))
+        sys.path.remove(str(folder))
 
 
 @pytest.fixture(scope="module")
-def world(recipe: Any) -> Iterator[Any]:
+def world(recipe: ModuleType) -> Iterator[Any]:
     made = recipe.FetchBlocks()
     yield made
     made.close()
 
 
-def test_every_task_can_be_done_in_the_same_scene(recipe: Any, world: Any) -> None:
+def test_every_task_can_be_done_in_the_same_scene(recipe: ModuleType, world: Any) -> None:
     for task in recipe.TASKS:
         world.reset(5, task, 5)
         while not world.done:
@@ -43,7 +46,7 @@ def test_every_task_can_be_done_in_the_same_scene(recipe: Any, world: Any) -> No
         assert world.success, task
 
 
-def test_whoever_does_something_else_fails(recipe: Any, world: Any) -> None:
+def test_whoever_does_something_else_fails(recipe: ModuleType, world: Any) -> None:
     """An expert that heard another colour, or another direction."""
     for task, done in (("lift red", "lift blue"), ("push left green", "push right green"), ("lift red", "touch red")):
         world.reset(5, task, 5)
@@ -52,7 +55,7 @@ def test_whoever_does_something_else_fails(recipe: Any, world: Any) -> None:
         assert not world.success, (task, done)
 
 
-def test_the_first_pictures_do_not_say_what_is_asked(recipe: Any, world: Any) -> None:
+def test_the_first_pictures_do_not_say_what_is_asked(recipe: ModuleType, world: Any) -> None:
     frames = []
     for task in recipe.TASKS:
         world.reset(7, task, 7)
@@ -79,7 +82,7 @@ def test_a_block_that_lies_still_moves_in_the_picture_of_the_gripper_alone(world
 
 
 def test_phrasings_that_are_unseen_have_words_that_are_not() -> None:
-    from examples.evaluation.environments import fetch_blocks
+    from environments import fetch_blocks
 
     seen = {word for texts in fetch_blocks.SEEN.values() for text in texts for word in text.split()}
     for kind, texts in fetch_blocks.UNSEEN.items():
@@ -88,7 +91,7 @@ def test_phrasings_that_are_unseen_have_words_that_are_not() -> None:
             assert set(text.split()) <= seen, text
 
 
-def test_a_demonstration_has_a_row_for_each_step(recipe: Any, world: Any) -> None:
+def test_a_demonstration_has_a_row_for_each_step(recipe: ModuleType, world: Any) -> None:
     recorded = recipe.episode(world, recipe.SEEDS, "touch red", 0.1)
     steps = len(recorded["action"])
     shapes = {name: array.shape[1:] for name, array in recorded.items()}

@@ -1,19 +1,21 @@
 """Demonstrations of the twelve tasks of ``fetch_blocks``, as arrays in folders of 150 episodes.
 
-MUJOCO_GL=osmesa python -m examples.policies.vla.demonstrations OUT --first 0 --count 40
+MUJOCO_GL=osmesa python examples/policies/vla/demonstrations.py OUT --first 0 --count 40
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from examples.evaluation.environments.fetch_blocks import COLOURS, TASKS, FetchBlocks
+sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
 
-from .experts import act
+from environments.fetch_blocks import COLOURS, TASKS, FetchBlocks
+from experts import act
 
 SCENES, TASKS_OF_A_SCENE = 50, 3
 """Of one folder. All episodes of a scene begin with the same pictures."""

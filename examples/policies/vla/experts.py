@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-
-from examples.evaluation.environments.fetch_blocks import COLOURS, HALF, REACH, TABLE, FetchBlocks
+from environments.fetch_blocks import COLOURS, HALF, REACH, TABLE, FetchBlocks
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -6,12 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from environments.fetch_blocks import BEFORE, LENGTH, SIZE, WORDS
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import PreTrainedTokenizerFast, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
-
-from examples.evaluation.environments.fetch_blocks import BEFORE, LENGTH, SIZE, WORDS
 
 NAME = "language-model"
 """Folder of the language model's configuration and tokenizer, beside the policy's own."""

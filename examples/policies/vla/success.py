@@ -1,6 +1,6 @@
 """How often the original policy, run by lerobot, does what it is asked; by task.
 
-    MUJOCO_GL=osmesa python -m examples.policies.vla.success OUT --episodes 10 --log success.log
+    MUJOCO_GL=osmesa python examples/policies/vla/success.py OUT --episodes 10 --log success.log
 
 ``OUT`` is the folder that ``train.py`` writes. Seeds are the harness's: of demonstrations are none.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +21,9 @@ import torch
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 
-from examples.evaluation.environments.fetch_blocks import SEEN, TASKS, UNSEEN, FetchBlocks, instruction
+sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
+
+from environments.fetch_blocks import SEEN, TASKS, UNSEEN, FetchBlocks, instruction
 
 FIRST = 100_000
 

@@ -1,18 +1,21 @@
 """The demonstrations as a LeRobot data set with videos, by lerobot's own writer.
 
-python -m examples.policies.vla.to_lerobot DEMOS OUT --episodes 24
+python examples/policies/vla/to_lerobot.py DEMOS OUT --episodes 24
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from examples.evaluation.environments.fetch_blocks import SIZE, TASKS, FetchBlocks, instruction
+sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
+
+from environments.fetch_blocks import SIZE, TASKS, FetchBlocks, instruction
 
 
 def main() -> None:

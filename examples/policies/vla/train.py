@@ -1,6 +1,6 @@
 """Train lerobot's ``smolvla`` from nothing on the demonstrations, on one or several processors; resumes where it was.
 
-    OMP_NUM_THREADS=1 python -m examples.policies.vla.train DEMOS OUT --updates 30000 --processes 2
+    OMP_NUM_THREADS=1 python examples/policies/vla/train.py DEMOS OUT --updates 30000 --processes 2
 
 The network, its processors and its files are lerobot's. The loss is that of ``SmolVLAPolicy.forward``, computed as
 inference does it, the prefix first: so one prefix, which is most of the work, serves several noises and times. Beside
@@ -14,6 +14,7 @@ import json
 import math
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,16 +32,17 @@ from torch import distributed as dist
 from torch import multiprocessing as mp
 from torch.nn import functional
 
-from examples.evaluation.environments.fetch_blocks import COLOURS, TASKS, instruction
+sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
 
-from .model import NAME, configuration, save_language_model
+from environments.fetch_blocks import COLOURS, TASKS, instruction
+from model import NAME, configuration, save_language_model
 
 WIDTH, LAYERS, PATCH = 96, 4, 12
 CHUNK = 16
 REPEATS = 4
 """Noises and times for one prefix."""
 WARM_UP, SMOOTHING, AUXILIARY, REPORTED = 300, 0.999, 0.5, 50
-UNIT = 0.1
+UNIT, MIDDLE = 0.1, (1.31, 0.75, 0.42)
 """Metres, of what the network says about blocks."""
 
 
@@ -104,22 +106,42 @@ class Demonstrations:
 
 
 class Places(nn.Module):
-    """Says where the blocks are from what the last layer reads of the state's token. Of training alone."""
+    """Says where the blocks are: of training alone.
+
+    From what the last layer of the language model reads of the state's token, which has heard the instruction; and, so
+    that the eyes learn first, from the mean of the tokens of each picture.
+    """
 
     def __init__(self, policy: SmolVLAPolicy) -> None:
         super().__init__()
         self.head = nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, WIDTH), nn.GELU(), nn.Linear(WIDTH, 12))
-        last: Any = policy.model.vlm_with_expert.vlm.model.text_model.layers[-1]
-        last.input_layernorm.register_forward_pre_hook(self._keep)
+        self.eyes = nn.ModuleList(nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 9)) for _ in ("front", "wrist"))
+        model: Any = policy.model.vlm_with_expert.vlm.model
+        model.text_model.layers[-1].input_layernorm.register_forward_pre_hook(self._keep)
+        model.connector.register_forward_hook(self._keep_picture)
         self._read: Tensor | None = None
+        self._pictures: list[Tensor] = []
 
     def _keep(self, _: nn.Module, given: tuple[Tensor]) -> None:
         self._read = given[0][:, -1]
 
-    def forward(self) -> Tensor:
-        """``[B, 4, 3]``, of the prefix that was computed last."""
+    def _keep_picture(self, _: nn.Module, __: tuple[Tensor], tokens: Tensor) -> None:
+        self._pictures = [*self._pictures[-1:], tokens.mean(1)]
+
+    def forward(self, offsets: Tensor, grip: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors of the state's token and of the pictures, of the prefix that was computed last.
+
+        Args:
+            offsets: ``[B, 4, 3]``, in ``UNIT``: from the grip to the block that was asked for, and to all three.
+            grip: ``[B, 3]``, metres. The fixed camera says where blocks are, that on the gripper where from the grip.
+        """
         assert self._read is not None
-        return self.head(self._read).unflatten(-1, (4, 3))  # type: ignore[no-any-return]
+        told = functional.smooth_l1_loss(self.head(self._read), offsets.flatten(1))
+        from_grip = offsets[:, 1:]
+        fixed = from_grip + (grip - torch.tensor(MIDDLE))[:, None] / UNIT
+        pairs = zip(self.eyes, self._pictures, (fixed, from_grip), strict=True)
+        seen = sum(functional.smooth_l1_loss(eye(picture), wanted.flatten(1)) for eye, picture, wanted in pairs)
+        return told, torch.as_tensor(seen)
 
 
 def flow_loss(policy: SmolVLAPolicy, batch: dict[str, Tensor], padding: Tensor, repeats: int) -> Tensor:
@@ -196,16 +218,15 @@ class Training:
             self.places.load_state_dict(state["places"])
             self.optimizer.load_state_dict(state["optimizer"])
 
-    def update(
-        self, given: dict[str, Any], padding: Tensor, offsets: Tensor, settings: Settings
-    ) -> tuple[float, float]:
-        """Learn from a batch; both losses."""
+    def update(self, given: dict[str, Any], padding: Tensor, offsets: Tensor, settings: Settings) -> list[float]:
+        """Learn from a batch; all losses."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate(settings, self.done)
+        grip = given["observation.state"][:, :3].clone()
         loss = flow_loss(self.policy, self.processors[0](given), padding, REPEATS)
-        besides = functional.smooth_l1_loss(self.places(), offsets)
+        told, seen = self.places(offsets, grip)
         self.optimizer.zero_grad(set_to_none=True)
-        (loss + AUXILIARY * besides).backward()
+        (loss + AUXILIARY * (told + seen)).backward()
         averaged(self.parameters, settings.processes)
         nn.utils.clip_grad_norm_(self.parameters, 1.0)
         self.optimizer.step()
@@ -215,7 +236,7 @@ class Training:
                 mean = self.smoothed[name]
                 mean.lerp_(value, 1 - share) if value.is_floating_point() else mean.copy_(value)
         self.done += 1
-        return loss.item(), besides.item()
+        return [loss.item(), told.item(), seen.item()]
 
     def save(self) -> None:
         """Write the state, and the smoothed policy as lerobot's directory ``policy``; each is replaced as a whole."""
@@ -269,7 +290,7 @@ def work(rank: int, settings: Settings) -> None:
     if settings.processes > 1:
         dist.barrier()
     training = Training(settings)
-    since, losses = time.perf_counter(), list[tuple[float, float]]()
+    since, losses = time.perf_counter(), list[list[float]]()
     for update, batch in batches(settings, demonstrations, training.done, rank):
         torch.manual_seed(settings.seed + 1000 * update + rank)
         losses.append(training.update(*batch, settings))
@@ -283,10 +304,10 @@ def work(rank: int, settings: Settings) -> None:
         dist.destroy_process_group()
 
 
-def report(done: int, losses: list[tuple[float, float]], seconds: float, updates: int, scenes: int) -> None:
+def report(done: int, losses: list[list[float]], seconds: float, updates: int, scenes: int) -> None:
     """Add a line to ``log.jsonl``."""
-    loss, besides = np.mean(losses, axis=0).tolist()
-    line = {"update": done, "loss": loss, "places": besides, "seconds": seconds}
+    loss, told, seen = np.mean(losses, axis=0).tolist()
+    line = {"update": done, "loss": loss, "places": told, "pictures": seen, "seconds": seconds}
     line |= {"hours_left": (updates - done) * seconds / 3600, "scenes": scenes}
     with Path("log.jsonl").open("a") as log:
         log.write(json.dumps({name: round(value, 4) for name, value in line.items()}) + "\n")
