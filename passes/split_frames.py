@@ -156,7 +156,6 @@ def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, Ten
 
 
 def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], taken: Collection[str]) -> _Tower | None:
-    """All that follows from these rows alone; None if that is nothing."""
     types, users, banned = graph.types(), graph.users(), set(taken)
     rows = _rows(types, entries[0])
     while True:
@@ -198,7 +197,6 @@ def _crossing(name: str) -> str:
 
 
 def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
-    """The graph of one row for each that ``rows * B`` stand for."""
 
     def size(batch: Batch) -> Batch:
         return Batch(batch.multiple // rows)
@@ -211,7 +209,6 @@ def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
 
 
 def _alike(towers: list[_Tower]) -> list[list[_Tower]]:
-    """Towers that do the same with the same weights, together."""
     groups: dict[tuple[int, str], list[_Tower]] = {}
     for tower in towers:
         groups.setdefault((tower.rows, _form(tower.graph)), []).append(tower)

@@ -90,7 +90,6 @@ def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, Observati
 
 
 def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
-    """Raise unless an array has the shape and the dtype of its specification."""
     if array.shape[1:] == spec.shape and len(array) > 0 and array.dtype == spec.dtype:
         return
     expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]"

@@ -80,7 +80,6 @@ def load(
 
 
 def _damaged(folder: Path) -> bool:
-    """Whether a file is not what the manifest says."""
     try:
         for name, record in read_manifest(folder).files.items():
             check_file(folder / name, record)

@@ -291,7 +291,6 @@ class CompiledPolicy:
     def _predict(
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
-        """One call; the actions ``[B, T, Da]``, which are finite."""
         self._report, wanted = None, self._plan(plan)
         spec = self._runtime.view(wanted).manifest.spec
         obs = check_observation(obs, spec.observations)

@@ -137,7 +137,6 @@ class TokenTower:
             )
 
     def _differences(self, one: Array, other: Array) -> Array:
-        """The mean absolute difference of each patch of ``[C, H, W]``, row by row."""
         high, wide = self._record.patch
         _, rows, columns, *_ = self._patches(one).shape
         off = one[:, : rows * high, : columns * wide] - other[:, : rows * high, : columns * wide]

@@ -140,7 +140,6 @@ class Guard:
 
 
 def _numbers(limit: float | Sequence[float], name: str) -> FloatArray:
-    """A limit as an array of the shape that it was given in."""
     return numbers(limit, f"the guard's {name}", ExecutorError)
 
 

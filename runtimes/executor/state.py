@@ -321,7 +321,6 @@ class ExecutorState:
 
     @property
     def _latency(self) -> float:
-        """Seconds that the next call is reckoned to take."""
         return self._latencies[self.plan].reckoned(self._coverable)
 
     @property

@@ -113,7 +113,6 @@ class OpenPiServer(FleetServer):
         return Answered(self._policy.predict_action(obs, plan=plan)["action"][0], True)
 
     def _observation(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As ``predict_action`` takes it, which refuses what does not fit."""
         obs = dict[str, Any]()
         for key, value in given.items():
             if (spec := self._specs.get(key)) is not None and not isinstance(value, str):

@@ -134,7 +134,6 @@ class FleetServer(Listener):
         return {"action": (await self._ask(plan, obs)).tolist()}
 
     def _facts(self) -> dict[str, Any]:
-        """What every client is told of the artifact and of the limits."""
         chunk = self._manifest.spec.chunk
         return {
             "observation": {key: {"shape": list(one.shape), "dtype": one.dtype} for key, one in self._specs.items()},

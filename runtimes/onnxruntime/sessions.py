@@ -369,7 +369,6 @@ def renew_piece(
 
 
 def _failed(error: Exception) -> ArtifactError:
-    """The error of a graph that onnxruntime loads and cannot run."""
     return ArtifactError(
         f"onnxruntime cannot run a graph of the artifact: {str(error).strip()[:500]} The graph does not fit the"
         " manifest, or there is too little memory. Convert the checkpoint again."

@@ -264,7 +264,6 @@ class _Writer:
         return self._seen[root, *place]
 
     def _text(self, node: Node, argument: Argument, reads: list[str]) -> str:
-        """An argument in the source; names that it reads go to ``reads``."""
         if isinstance(argument, Ref):
             reads.append(self._named(argument.name))
             return reads[-1]

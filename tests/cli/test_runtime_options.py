@@ -22,25 +22,19 @@ def test_bench_times_torch_beside_the_same_plan_in_onnxruntime(toy_compiled: Pat
     assert result.exit_code == 0, result.stderr
     told = json.loads(result.stdout)
     assert (told["runtime"], told["device"]) == (["torch", "onnxruntime"], "cpu")
-    assert told["precision_error"] is None
     contestants = [(each["label"], each["plan"]) for each in told["contestants"]]
     assert contestants == [("dense, torch on cpu", "dense"), ("dense, onnxruntime", "dense")]
 
 
-def test_bench_times_a_plan_in_fewer_bits_on_torch_and_says_how_far_off_they_are(toy_compiled: Path) -> None:
+def test_bench_times_a_plan_in_fewer_bits_on_torch(toy_compiled: Path) -> None:
     options = ("--runtime", "torch", "--device", "cpu", "--plan", "dense@bf16")
     result = run("bench", toy_compiled, *options, "--calls", 2, "--json")
     assert result.exit_code == 0, result.stderr
     told = json.loads(result.stdout)
     assert (told["runtime"], told["device"]) == (["torch"], "cpu")
-    error = told["precision_error"]
-    assert error["precision"] == "bf16"
-    assert 0 < error["mean"] <= error["p90"] <= error["largest"] < 1
-    assert error["mean"] < 0.1
     contestants = [(each["label"], each["plan"]) for each in told["contestants"]]
     assert contestants == [("dense, torch on cpu", "dense"), ("dense@bf16, torch on cpu", "dense@bf16")]
     shown = run("bench", toy_compiled, *options, "--calls", 1, "--control-hz", 10)
-    assert "dense calls in bf16 are" in " ".join(shown.stdout.split())
     assert "dense@bf16, torch on cpu: " in " ".join(shown.stdout.split())
 
 

@@ -181,7 +181,6 @@ def load_golden(artifact: Artifact) -> Golden:
 
 
 def _start(loop: str) -> str:
-    """Before the names of arrays that are of a loop; nothing for the original."""
     return "" if loop == ORIGINAL else f"loop/{loop}/"
 
 

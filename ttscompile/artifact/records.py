@@ -241,7 +241,6 @@ def calibration_record(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _interfaces(program: Program) -> dict[str, PieceRecord]:
-    """What the model of each piece reads and gives; without its file."""
     pieces, sampler = program.pieces, program.spec.sampler
 
     def record(

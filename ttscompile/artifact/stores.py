@@ -141,7 +141,6 @@ def _put(directory: Path, name: str, content: bytes, files: dict[str, FileRecord
 
 
 def _bound_again(artifact: Artifact, piece: str, file: str, places: Mapping[str, Place]) -> bytes:
-    """The model of a piece, whose constants at these places get new values."""
     import onnx
 
     return bind(onnx.load(artifact.path / file, load_external_data=False), places, piece, again=True)

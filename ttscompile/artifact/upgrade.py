@@ -75,7 +75,6 @@ def _upgraded(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _free(name: str, plans: Mapping[str, Any]) -> str:
-    """The name, or one like it that no plan has."""
     return next(each for each in (name, *(f"{name}-{i}" for i in range(len(plans)))) if each not in plans)
 
 

@@ -132,7 +132,6 @@ class StateFile:
 
 
 def _checksum(arrays: Mapping[str, Array]) -> bytes:
-    """The sha256 of names, types and contents, whatever their order."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

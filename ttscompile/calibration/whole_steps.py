@@ -177,7 +177,6 @@ def _measured_elsewhere(
 
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:
-    """The plan that all calls have, or those that are made for them."""
     return plan(calls) if callable(plan) else plan
 
 
@@ -241,7 +240,6 @@ class ScheduleRuns:
             places.append(self._loop.after(places[-1], self._idle, pool))
 
     def _forget(self) -> None:
-        """Leave out what there is no room for."""
         held = {
             steps: sum({id(one): one.nbytes for place in places for one in place.held}.values())
             for steps, places in self._kept.items()

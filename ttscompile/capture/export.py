@@ -109,7 +109,6 @@ def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
 def _traced(
     module: nn.Module, spec: PolicySpec, streams: int, symbolic: bool
 ) -> tuple[torch.export.ExportedProgram, dict[str, torch.Tensor]]:
-    """What torch.export makes of the module, and the example inputs."""
     examples = _examples(spec, streams)
     given = _as_arguments(examples, spec)
     fastpath = torch.backends.mha.get_fastpath_enabled()
@@ -184,7 +183,6 @@ def _export(module: nn.Module, examples: Mapping[str, torch.Tensor], symbolic: b
 
 
 def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[str, torch.Tensor]:
-    """By the names of the module's arguments."""
     return {spec.arguments.get(name, name): value for name, value in inputs.items()}
 
 
@@ -334,7 +332,6 @@ class _Converter:
 
 
 def _source(fx_node: torch.fx.Node) -> str:
-    """Where the module's code makes this node."""
     return _innermost(fx_node.meta.get("stack_trace") or "")
 
 

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.bench_report import BenchReport, PrecisionError
+from ttscompile.cli.bench_report import BenchReport
 from ttscompile.cli.choosing import choosable, choose_again
 from ttscompile.cli.comparison import compare, draw_comparison
 from ttscompile.cli.contestants import Way, contestants, originals
@@ -32,17 +31,13 @@ from ttscompile.cli.recordings import Sources, require_recordings, trajectories_
 from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
 from ttscompile.core.plan import DENSE
-from ttscompile.core.spec import FP32
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.report.timing import Contestant, Measurement, measure
 from ttscompile.runtimes.executor import ExecutorSettings
-from ttscompile.runtimes.open import CPU, kind_of
-from ttscompile.runtimes.random_calls import random_calls
+from ttscompile.runtimes.open import CPU
 
 THIS = "this artifact"
 MOST_CALLS = 10_000
-COMPARED = 8
-"""Dense calls on random observations, in another precision and in fp32."""
 
 SECTIONS = (
     Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
@@ -153,13 +148,12 @@ def bench(
         measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
         status.update("judging")
         judged = None if loop is None else loop.judge(entered, measured)
-        error = _precision_error(artifact, plans, ways[0])
     asked = {"observation": sources, "plans": plans, "calls": calls, "seed": _seed(artifact), **vars(ways[0])}
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
     limit = None if judged is None else judged.may_take_ms
     chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
-    report = BenchReport(measured, default, calls, by_threads, error, judged, compared, chosen)
+    report = BenchReport(measured, default, calls, by_threads, judged, compared, chosen)
     identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
         of = {"identity": artifact.manifest.identity, "machine": fingerprint()}
@@ -184,25 +178,6 @@ def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
             raise click.UsageError(f"two artifacts are called {name!r}: they could not be told apart. Rename one.")
         found[name] = load_artifact(other)
     return found
-
-
-def _precision_error(artifact: Artifact, plans: Sequence[str], way: Way) -> PrecisionError | None:
-    """What fewer bits that a runtime makes itself do to dense actions: how far they are from those in fp32."""
-    asked = [plan.partition("@")[2] for plan in plans]
-    if not (found := [one for one in asked if one in kind_of(way.runtime).made]):
-        return None
-    actions = []
-    for each in (found[0], FP32):
-        policy = way.open(artifact, f"{DENSE}@{each}")
-        made = []
-        for obs, noise in random_calls(artifact.manifest.spec, COMPARED, seed=0):
-            policy.reset()
-            made.append(policy.predict_action(obs, noise=noise)["action"])
-        actions.append(np.concatenate(made))
-    apart = np.abs(actions[0] - actions[1])
-    means = apart.mean((1, 2))
-    numbers = float(means.mean()), float(np.quantile(means, 0.9)), float(apart.max())
-    return PrecisionError(found[0], COMPARED, *numbers)
 
 
 def _ways(runtimes: Sequence[str], device: str | None, threads: Sequence[int]) -> list[Way]:

@@ -93,7 +93,6 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
 
 
 def _goes_on(artifact: Artifact, plan: Plan) -> bool:
-    """Whether what a call of it computes depends on the calls before."""
     return plan.otherwise is not None or plan.tokens is not None or reads_earlier_calls(view_of(artifact, plan), plan)
 
 

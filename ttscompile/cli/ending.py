@@ -117,7 +117,6 @@ def _signal_behind(error: BaseException) -> BaseException | None:
 
 
 def _judged(error: BaseException, words: Sequence[str]) -> tuple[str, Status]:
-    """Message and status of an error."""
     if isinstance(error, KeyboardInterrupt):
         return f"interrupted{_resumes(words)}", Status.INTERRUPTED
     if isinstance(error, _EndedError):

@@ -46,7 +46,6 @@ def observed(
 
 
 def _camera(name: str, specs: Mapping[str, ObservationSpec]) -> str:
-    """The camera of this name, or the one whose key ends with it."""
     cameras = [key for key, one in specs.items() if one.image]
     found = [key for key in cameras if key == name] or [key for key in cameras if key.endswith(f".{name}")]
     if len(found) != 1:

@@ -104,7 +104,6 @@ def numbers(value: Any, what: str, error: Errors, dtype: str = "float32") -> Arr
 
 
 def _rows(value: Any, what: str, error: Errors, dtype: str) -> Any:
-    """A list with the arrays in it made plain."""
     if isinstance(value, list | tuple):
         return [_rows(one, what, error, dtype) for one in value]
     return plain(value, what, error, dtype) if isinstance(value, np.ndarray) or is_tensor(value) else value

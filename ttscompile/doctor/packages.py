@@ -115,7 +115,6 @@ def _extra(name: str, wanted: list[Requirement]) -> Finding:
 
 
 def _providers() -> list[Finding]:
-    """Whether onnxruntime can be imported, and where it can compute."""
     part = "onnxruntime"
     try:
         module = importlib.import_module("onnxruntime")

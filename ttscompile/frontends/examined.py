@@ -73,7 +73,6 @@ def _judged(key: str, one: Statistics) -> Finding:
 
 
 def _columns(which: torch.Tensor) -> str:
-    """For people: the first of the columns that are true, and of how many."""
     found = which.nonzero().flatten().tolist()
     return f"column {', '.join(map(str, found[:8]))}{', ..' * (len(found) > 8)} of {len(which)}"
 

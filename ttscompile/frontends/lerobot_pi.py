@@ -114,7 +114,6 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
 
 
 def _language(weights: Mapping[str, Tensor], start: str) -> LanguageConfig:
-    """A Gemma; all heads of queries share one of keys."""
     queries, width = _shape(weights, f"{start}layers.0.self_attn.q_proj.weight", 2)
     channels = _shape(weights, f"{start}layers.0.self_attn.k_proj.weight", 2)[0]
     if channels % 2 or queries % channels:

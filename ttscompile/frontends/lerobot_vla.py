@@ -104,7 +104,6 @@ def vla_spec(
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
-    """From time 1, noise, to time 0, actions."""
     name = "num_steps" if "num_steps" in settings.values else "num_inference_steps"
     return flow_matching(integration_steps(settings, options, name, 10), options, start=1.0, end=0.0)
 

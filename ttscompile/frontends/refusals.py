@@ -217,7 +217,6 @@ def _refused(path: Path, what: str, how: str, remedy: str) -> CheckpointError:
 
 
 def _match(row: Refusal, names: Iterable[str]) -> str | None:
-    """The first name that the row's sign is in."""
     return next((name for name in names if re.search(row.sign, name)), None)
 
 

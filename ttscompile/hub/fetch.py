@@ -115,7 +115,6 @@ def _whole(name: HubName, kept: list[str]) -> bool:
 
 
 def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
-    """Of the files of a repository those that a checkpoint in it is made of."""
     inside = f"{name.inside}/" if name.inside else ""
     below = [each.removeprefix(inside) for each in files if each.startswith(inside)]
     if any(policy <= set(below) for policy in _POLICIES):

@@ -173,7 +173,6 @@ def _require_affine(graph: Graph) -> None:
 
 
 def _split_at_norm(tail: Graph, stream: str) -> tuple[Node, Graph]:
-    """The LayerNorm that the stream enters first, and the tail after it."""
     users = tail.users()[stream]
     if len(users) != 1 or users[0].op != _NORM or users[0].args[0] != Ref(stream):
         raise _Declined(f"the tail does not begin with a LayerNorm of its input, but with {users[0]}")

@@ -319,7 +319,6 @@ class DenoisingLoop:
         return w.choose(is_anchor, anchor.body("anchor", longer), other.body("other", same))[0]
 
     def _following(self, w: GraphWriter, k: str) -> str:
-        """The next step; of the last one itself, whose stream nobody reads."""
         return w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
 
     def _feeds(self, w: GraphWriter, piece: LoopPiece, stream: str, k: str) -> dict[str, str]:
@@ -329,7 +328,6 @@ class DenoisingLoop:
 
 
 def _flags(w: GraphWriter, vector: str, which: range) -> list[str]:
-    """Elements of a vector, as conditions."""
     part = w.op("Slice", vector, w.constant([which.start]), w.constant([which.stop]))
     return w.ops("Split", [part], len(which), axis=0, num_outputs=len(which))
 

@@ -129,7 +129,6 @@ def value_info(name: str, type_: TensorType) -> ValueInfoProto:
 
 
 def _shared(tensor: TensorProto, kept: dict[bytes, TensorProto], names: Iterator[str]) -> str:
-    """Name of the small constant with this value; one for all that are equal."""
     data = onnx.numpy_helper.to_array(tensor).tobytes()
     key = f"{tensor.data_type} {list(tensor.dims)} ".encode() + data
     if key not in kept:
@@ -245,7 +244,6 @@ def _heads(node: NodeProto, shapes: Mapping[str, Sequence[int]]) -> tuple[int, i
 
 
 def _shapes(graph: GraphProto) -> Mapping[str, tuple[int, ...]]:
-    """Shapes of inner values; zero for a size that depends on the batch."""
     return {
         value.name: tuple(d.dim_value for d in value.type.tensor_type.shape.dim)
         for value in [*graph.value_info, *graph.input, *graph.output]

@@ -287,7 +287,6 @@ def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str,
 
 
 def _rows(shape: Sequence[int]) -> int:
-    """Rows of a product whose first factor has this shape."""
     return math.prod(shape[:-1]) if shape else 0
 
 

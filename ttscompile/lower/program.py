@@ -105,7 +105,6 @@ def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
 
 
 def _in_order_of_use(graph: Graph) -> Graph:
-    """The graph with its constants in the order in which nodes read them."""
     used = dict.fromkeys(name for node in graph.nodes for name in node.refs() if name in graph.constants)
     order = [*used, *(name for name in graph.constants if name not in used)]
     return replace(graph, constants={name: graph.constants[name] for name in order})

@@ -65,7 +65,6 @@ class _Probe:
 
 
 def _draw(seed: int) -> torch.Tensor:
-    """The normal numbers that a scheduler draws from a generator of this seed."""
     return torch.randn(_SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
@@ -108,7 +107,6 @@ def _probe_step(probe: _Probe, timestep: torch.Tensor) -> _Row:
 def _verify(
     probe: _Probe, timestep: torch.Tensor, row: _Row, x: torch.Tensor, out: torch.Tensor, seed: int
 ) -> torch.Tensor:
-    """Hold a row against the scheduler on one input; gives ``next``."""
     x0, following = probe(timestep, x, out, seed)
     (sample_to_x0, out_to_x0, *to_next), clip = row
     unclipped = sample_to_x0 * x + out_to_x0 * out

@@ -209,7 +209,6 @@ def read_npz(path: Path) -> dict[str, Array]:
 
 
 def _other_format(path: Path) -> str | None:
-    """What a file is that is no ``.npz``."""
     name = path.name.lower()
     if not path.exists():
         return None

@@ -83,7 +83,6 @@ def _pairs(missing: Sequence[str], free: Sequence[str]) -> dict[str, str]:
 
 
 def _rate(path: Path, spec: PolicySpec) -> list[Finding]:
-    """How long a chunk is, where a data set says its rate."""
     info, executed = path / "meta" / "info.json", spec.chunk.stop - spec.chunk.start
     if not info.is_file():
         return []

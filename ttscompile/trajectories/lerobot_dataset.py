@@ -111,7 +111,6 @@ def _column(path: Path, tables: list[Any], name: str, size: int) -> Iterator[Arr
 
 
 def _images_or_numbers(path: Path, name: str, kind: Any) -> bool:
-    """Whether a column holds images; numbers may be in lists."""
     from pyarrow import types
 
     if types.is_struct(kind):

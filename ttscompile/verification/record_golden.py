@@ -174,7 +174,6 @@ def record_plans(artifact: Artifact) -> dict[str, GoldenPlan]:
 def _episode(
     view: View, model: ReferenceModel, plan: Plan, golden: Golden, obs: Mapping[str, npt.NDArray[Any]]
 ) -> GoldenPlan:
-    """Two calls with one plan; see ``GoldenPlan``."""
     cache, calls, chunk = model.empty_cache(golden.streams), [], golden.sample
     for order in (1, -1):
         contexts = model.prologue({key: torch.from_numpy(value[::order].copy()) for key, value in obs.items()})

@@ -281,6 +281,5 @@ def too_far(name: str, score: Score, bound: float) -> str:
 
 
 def _call(runtime: Runtime, obs: Observation, noise: Noise, plan: Plan) -> None:
-    """A call that computes all of its frames."""
     runtime.reset()
     runtime.predict(obs, noise, plan)

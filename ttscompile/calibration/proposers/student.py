@@ -233,5 +233,4 @@ class Student:
 
 
 def _scale(right: Tensor) -> float:
-    """What a change is multiplied by, given its right factor."""
     return SCALE / math.sqrt(right.shape[1])

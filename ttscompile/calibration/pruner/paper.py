@@ -246,7 +246,6 @@ class Paper(NothingAfter):
             self._values[name] = (self._values[name] - rate * step).astype(np.float32)
 
     def _compare(self) -> None:
-        """Keep the head if it is better than the best one so far."""
         task, calls, values = self._task, self._compared, self._priced()
         plans = legal(pruner_plan(self._logits(values, calls).numpy()), calls.window)
         error = float(task.actions.errors(task.executor.run(plans, calls), calls.targets, units=False).mean())
