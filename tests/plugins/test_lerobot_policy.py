@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -285,21 +286,25 @@ def test_the_policy_server_takes_it(
 
 
 def test_in_shadow_mode_the_original_acts_and_the_log_says_how_far_the_compiled_one_is(
-    saved: tuple[str, Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    saved: tuple[str, Path, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the same generator both have the same noise, so the differences are those of rounding."""
     _, original, compiled = saved
+    at_exit: list[Any] = []
+    registry = SimpleNamespace(register=lambda *given: at_exit.append(partial(*given)))
+    monkeypatch.setattr("lerobot_policy_ttscompile.modeling_ttscompile.atexit", registry)
     copy = Path(shutil.copytree(compiled, tmp_path / "copy"))
     config = json.loads((copy / "config.json").read_text())
     (copy / "config.json").write_text(json.dumps({**config, "original": str(original)}))
     expected = driven(original)
     with caplog.at_level(logging.WARNING):
         found = driven(copy)
+        at_exit[0]()
     np.testing.assert_array_equal(found, expected)
     policy, _, _ = opened(copy)
     assert not policy.supports_rtc()
-    assert "shadow: " in caplog.text and " 0 dropped, 0 failed" in caplog.text
-    worst = float(caplog.text.split("worst call ")[1].split(": ")[1].split()[0])
+    assert "shadow: 20 of 20 calls compared, 0 dropped, 0 failed, " in caplog.text
+    worst = float(caplog.text.split("worst call ")[-1].split(": ")[1].split()[0])
     assert worst < 1e-4 * np.abs(expected).max()
 
 

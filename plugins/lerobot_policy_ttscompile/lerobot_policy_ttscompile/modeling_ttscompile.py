@@ -77,7 +77,7 @@ class TtscompilePolicy(PreTrainedPolicy):
         self._shadow: ttscompile.Shadow | None = None
         if config.original is not None:
             self._shadow = ttscompile.Shadow(Original(config.original), self._policy, noise=self._noise_ahead)
-            atexit.register(self._tell)
+            atexit.register(self._tell, True)
 
     @classmethod
     def from_pretrained(
@@ -182,10 +182,12 @@ class TtscompilePolicy(PreTrainedPolicy):
         """
         self.forward({})
 
-    def _tell(self) -> None:
-        """Log how far the compiled policy was from the original."""
-        if self._shadow is not None and (report := self._shadow.report()).calls:
-            logger.warning("shadow: %s", _told(report))
+    def _tell(self, last: bool = False) -> None:
+        """Log how far the compiled policy was from the original; the last time when it has answered all calls."""
+        if self._shadow is not None:
+            report = self._shadow.close() if last else self._shadow.report()
+            if report.calls:
+                logger.warning("shadow: %s", _told(report))
 
     def _noise_ahead(self, batch: Mapping[str, Any]) -> ttscompile.Noise:
         """What the original will draw for a chunk, if the next call computes one; nothing is drawn of it here."""
