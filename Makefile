@@ -77,7 +77,7 @@ test-lerobot:
 	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
 		'lerobot[async,diffusion,multi-task-dit,pusht]==0.6.1' -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
 		hypothesis pytest pytest-benchmark
-	$(LEROBOT)/bin/python -m pytest tests/plugins tests/test_capture.py tests/frontends/test_lerobot.py tests/trajectories
+	$(LEROBOT)/bin/python -m pytest tests/plugins tests/capture/test_export.py tests/frontends/test_lerobot.py tests/trajectories
 
 # The published client of openpi, which has numpy below 2 and so an environment of its own, against ttscompile serve --openpi.
 OPENPI := build/openpi-venv
@@ -85,7 +85,7 @@ test-openpi: $(READY)
 	test -x $(OPENPI)/bin/python || $(PYTHON) -m venv $(OPENPI)
 	$(OPENPI)/bin/python -m pip install --quiet --disable-pip-version-check openpi-client==0.1.2 \
 		typing_extensions  # which it imports and does not ask for
-	$(BIN)/pytest tests/fleet/test_openpi_client.py
+	$(BIN)/pytest tests/runtimes/fleet/test_openpi_client.py
 
 # Python 3.11 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
 test-matrix: $(READY)

@@ -271,6 +271,17 @@ def test_every_pass_has_its_test_and_tests_import_helpers_not_each_other() -> No
     assert found == {}
 
 
+BESIDE_ROOMS = {"examples", "families", "hostile", "machines", "plugins"}
+"""Folders of tests that are of no room: of what is beside the package, or goes through all of it."""
+
+
+def test_folders_of_tests_are_rooms() -> None:
+    folders = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")} - BESIDE_ROOMS
+    assert folders <= set(MAY_IMPORT)
+    inside = {path.parent.name for path in (ROOT / "tests" / "runtimes").glob("*/test_*.py")}
+    assert inside <= {path.name for path in (ROOT / "runtimes").iterdir()}
+
+
 def test_files_are_short() -> None:
     files = [p for top in (*PACKAGES, "tests", "examples") for p in (ROOT / top).rglob("*.py")]
     lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in files}

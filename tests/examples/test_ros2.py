@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.executor.simulation import TO, FakeClock, ScriptedPolicy, workers
 from tests.once import Once
+from tests.runtimes.executor.simulation import TO, FakeClock, ScriptedPolicy, workers
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings

@@ -96,8 +96,8 @@ def _ragged(rng: random.Random) -> Any:
 
 @cache
 def _server() -> Any:
-    from tests.executor.simulation import FakeClock
-    from tests.server.serving import Quick
+    from tests.runtimes.executor.simulation import FakeClock
+    from tests.runtimes.server.serving import Quick
     from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
     from ttscompile.runtimes.server.executor_server import ExecutorServer
     from ttscompile.runtimes.server.limits import ServerLimits

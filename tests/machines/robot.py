@@ -33,10 +33,15 @@ GROWTH = 2.0
 different eight-bit numbers: they are as far from each other as each is from fp32."""
 
 TESTS = (
-    *("tests/executor", "tests/cli/test_ending.py", "tests/cli/test_words.py"),
-    *("tests/test_correction.py", "tests/test_lattice.py", "tests/test_machine.py", "tests/test_timer.py"),
+    *("tests/runtimes/executor", "tests/cli/test_ending.py", "tests/cli/test_words.py"),
+    *(
+        "tests/core/test_correction.py",
+        "tests/core/test_lattice.py",
+        "tests/measure/test_machine.py",
+        "tests/measure/test_timer.py",
+    ),
 )
-LEFT_OUT = ("tests/executor/test_prefix.py",)
+LEFT_OUT = ("tests/runtimes/executor/test_prefix.py",)
 """Imports diffusers, for its schedulers."""
 
 ARTIFACTS = "--artifacts"

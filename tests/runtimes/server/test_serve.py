@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from tests.executor.simulation import FakeClock
+from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError
 from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.server.executor_server import ExecutorServer

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.server.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
+from tests.runtimes.server.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.server.limits import ServerLimits

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.frontends.integration import NOISE, by_table, euler, rk4, velocity
 from tests.rounding import assert_equal_but_for_rounding
+from tests.samplers.integration import NOISE, by_table, euler, rk4, velocity
 from ttscompile import SamplerTable, flow_matching_table
 from ttscompile.errors import SpecError
 

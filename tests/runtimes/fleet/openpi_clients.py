@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ttscompile
-from tests.server.serving import LIMITS, listening
+from tests.runtimes.server.serving import LIMITS, listening
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.fleet import OpenPiServer
 from ttscompile.runtimes.server.limits import ServerLimits

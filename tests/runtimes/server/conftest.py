@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.executor.conftest import _no_thread_is_left, toy_compiled
+from tests.runtimes.executor.conftest import _no_thread_is_left, toy_compiled
 from ttscompile.runtimes.server.admission import AUDIT
 
 __all__ = ["_no_thread_is_left", "toy_compiled"]

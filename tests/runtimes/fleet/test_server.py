@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from tests.plans import store_schedules
+from tests.runtimes.server.serving import LIMITS, Client, ServerError, connected, listening, vanish
+from tests.runtimes.server.watching import figures, get
 from tests.runtimes.toys import toy_program, written_artifact
-from tests.server.serving import LIMITS, Client, ServerError, connected, listening, vanish
-from tests.server.watching import figures, get
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError

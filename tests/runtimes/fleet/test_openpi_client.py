@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import ttscompile
-from tests.server.serving import listening
+from tests.runtimes.server.serving import listening
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.fleet import OpenPiServer
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 PYTHON = ROOT / "build" / "openpi-venv" / "bin" / "python"
 TOKEN = "a-token-of-these-tests-alone"
 
@@ -32,7 +32,8 @@ pytestmark = [
 
 def drive(*words: str) -> Any:
     """What the client saw."""
-    done = subprocess.run([PYTHON, ROOT / "tests/fleet/openpi_drive.py", *words], capture_output=True, timeout=60)
+    drives = Path(__file__).with_name("openpi_drive.py")
+    done = subprocess.run([PYTHON, drives, *words], capture_output=True, timeout=60)
     assert done.returncode == 0, done.stderr.decode()
     return json.loads(done.stdout)
 

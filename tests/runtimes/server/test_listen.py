@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.executor.simulation import FakeClock
+from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.server.admission import Admission, AdmittingSocket

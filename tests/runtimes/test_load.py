@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 import ttscompile
+from tests.source import source_copy
 
-from .source import source_copy
-
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 COMPILERS_ONLY = ["diffusers", "matplotlib", "onnx", "onnx_ir", "onnxscript", "pydantic", "safetensors", "torch"]
 
 ACT = textwrap.dedent(

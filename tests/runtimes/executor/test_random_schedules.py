@@ -1,6 +1,6 @@
 """Random schedules of everything that can happen, against a model of what may come out.
 
-A short run is part of every test run; ``pytest tests/executor -m soak`` runs at least 100,000 ticks.
+A short run is part of every test run; ``pytest tests/runtimes/executor -m soak`` runs at least 100,000 ticks.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import pytest
 
 import ttscompile
 from tests.hostile.mutate import damaged
-from tests.server.serving import LIMITS
+from tests.runtimes.server.serving import LIMITS
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.fleet import OpenPiServer
 

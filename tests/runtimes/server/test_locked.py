@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from tests.executor.simulation import FakeClock
+from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.cli import main
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor

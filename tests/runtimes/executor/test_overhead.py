@@ -1,4 +1,4 @@
-"""What the executor costs the control loop. ``pytest tests/executor/test_overhead.py --benchmark-only`` for figures."""
+"""What the executor costs the control loop. Figures: ``pytest FILE --benchmark-only``."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.executor.simulation import FakeClock, ScriptedPolicy
+from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.server.executor_server import ExecutorServer
@@ -25,7 +25,7 @@ from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock
 
-CLIENT = Path(__file__).parents[2] / "examples" / "serve" / "client.py"
+CLIENT = Path(__file__).parents[3] / "examples" / "serve" / "client.py"
 spec = importlib.util.spec_from_file_location("serve_client", CLIENT)
 assert spec is not None
 assert spec.loader is not None

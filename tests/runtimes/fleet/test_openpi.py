@@ -17,8 +17,8 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.server.serving import LIMITS, handshake, listening, raw
-from tests.server.watching import figures, get
+from tests.runtimes.server.serving import LIMITS, handshake, listening, raw
+from tests.runtimes.server.watching import figures, get
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import Instruction, ObservationSpec

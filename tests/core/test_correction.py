@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.runtimes.plans import jumping
 from ttscompile.core.correction import (
     COMPONENTS,
     HIDDEN,
@@ -23,8 +24,6 @@ from ttscompile.core.correction import (
     numbers_of,
 )
 from ttscompile.errors import IllegalPlanError
-
-from .runtimes.plans import jumping
 
 
 def test_no_correction_has_the_shapes_of_the_policy() -> None:

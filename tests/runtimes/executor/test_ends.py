@@ -203,7 +203,7 @@ def program(body: str, artifact: Path) -> subprocess.CompletedProcess[str]:
         text=True,
         timeout=REAL_LIMIT * 3,
         check=False,
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
     )
 
 
