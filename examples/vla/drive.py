@@ -20,7 +20,8 @@ import numpy as np
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import PolicySpec
-from ttscompile.runtimes.instruct import TASK, Instruct
+from ttscompile.core.tokenizer import TASK
+from ttscompile.runtimes.instruct import Instruct
 
 IMAGE = (48, 64)
 """Height and width of what the cameras give; the policy resizes images, whatever their size is."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -132,7 +133,7 @@ def test_a_tokenizer_that_is_missing_is_named(tmp_path: Path) -> None:
 
 def test_the_doctor_looks_at_tokens_that_it_can_make(tmp_path: Path, tokenizer: Path) -> None:
     spec = test_fits.policy()
-    held = {test_fits.STATE: test_fits.states(), test_fits.FRONT: test_fits.pictures(0.2)}
+    held: dict[str, Any] = {test_fits.STATE: test_fits.states(), test_fits.FRONT: test_fits.pictures(0.2)}
     held |= {test_fits.WRIST: test_fits.pictures(0.7), "task": np.array(["push left"] * 40)}
     np.savez(tmp_path / "calls.npz", meta=np.array('{"frames": true}'), episode_ends=np.array([20, 40]), **held)
     told = type(spec)(spec.sample, {**spec.observations, **LANGUAGE}, spec.sampler, spec.chunk, instruction=TOLD)

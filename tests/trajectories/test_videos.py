@@ -64,7 +64,12 @@ def test_a_policy_of_one_frame_sees_those_of_its_calls(
 def test_only_the_frames_of_calls_become_floats(tmp_path: Path, here: None, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = list[int]()
     whole = frames._as_image
-    monkeypatch.setattr(frames, "_as_image", lambda array, spec: seen.append(len(array)) or whole(array, spec))
+
+    def counted(array: np.ndarray, spec: ObservationSpec) -> np.ndarray:
+        seen.append(len(array))
+        return whole(array, spec)
+
+    monkeypatch.setattr(frames, "_as_image", counted)
     load_trajectories([as_lerobot_with_videos(tmp_path)], {"top": ObservationSpec((1, 3, 16, 32))}, 4)
     assert seen == [3], "of nine frames, calls begin with these"
 

@@ -62,7 +62,7 @@ def load_trajectories(
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
     sources: Mapping[str, Sequence[str]] | None = None,
-    told: Instruction | None = None,
+    instruction: Instruction | None = None,
 ) -> list[Episode]:
     """Read episodes from files.
 
@@ -71,7 +71,7 @@ def load_trajectories(
         sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
             are called otherwise; ``NAME:N`` are the first N numbers of one. With ``task``, the path of a tokenizer, the
             recorded instructions are made the policy's tokens.
-        told: how the policy is told its task in words.
+        instruction: how the policy is told its task in words.
 
     Returns:
         The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning; so
@@ -89,8 +89,8 @@ def load_trajectories(
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
-    sources = sources or {}
-    for episode in [each for path in paths for each in _read(Path(path), observations, action_steps, sources, told)]:
+    how = observations, action_steps, sources or {}, instruction
+    for episode in [each for path in paths for each in _read(Path(path), *how)]:
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
@@ -107,10 +107,10 @@ def _read(
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
     given: Mapping[str, Sequence[str]],
-    told: Instruction | None,
+    instruction: Instruction | None,
 ) -> list[Episode]:
     sources = {key: parts for key, parts in given.items() if key != TASK}
-    text = {told.tokens, told.mask} if TASK in given and told is not None else set()
+    text = {instruction.tokens, instruction.mask} if TASK in given and instruction is not None else set()
     seen = {key: spec for key, spec in observations.items() if key not in text}
     used = {part.partition(":")[0] for key in seen for part in sources.get(key, (key,))} | ({TASK} & set(given))
     other, held, frames = _opened(path, sorted(used))
@@ -125,7 +125,7 @@ def _read(
         ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
     if TASK in given:
-        arrays |= instruction_rows(path, held, told, observations, os.fspath(given[TASK][0]))
+        arrays |= instruction_rows(path, held, instruction, observations, os.fspath(given[TASK][0]))
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}

@@ -6,6 +6,7 @@ model of the arm is Gymnasium-Robotics'. Actions are ``[4]``: displacement of th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import gymnasium_robotics
@@ -30,7 +31,7 @@ _LEFT_OR_RIGHT = (
     "shove the {} cube to the {}",
 )
 _LEFT_OR_RIGHT_UNSEEN = ("slide the {} cube {}", "move the {} cube to the {} side")
-SEEN = {
+SEEN: Mapping[str, tuple[str, ...]] = {
     "touch": (
         "touch the {} block",
         "reach for the {} block",
@@ -48,7 +49,7 @@ SEEN = {
     ),
 }
 """By kind, the phrasings of demonstrations."""
-UNSEEN = {
+UNSEEN: Mapping[str, tuple[str, ...]] = {
     "touch": ("touch the {} cube", "reach the {} block", "move to the {} cube"),
     "push": _LEFT_OR_RIGHT_UNSEEN,
     "lift": ("lift the {} cube up", "grasp and raise the {} block"),
@@ -112,7 +113,7 @@ _BLOCK = """
     </body>"""
 
 
-def instruction(task: str, number: int, phrasings: dict[str, tuple[str, ...]] = SEEN) -> str:
+def instruction(task: str, number: int, phrasings: Mapping[str, tuple[str, ...]] = SEEN) -> str:
     """A task in words.
 
     Args:
@@ -165,7 +166,7 @@ class FetchBlocks:
         self._fingers = [joints[self._model.joint(f"robot0:{side}_gripper_finger_joint").id] for side in "lr"]
         self._blocks = [joints[self._model.joint(name).id] for name in COLOURS]
         self._begin()
-        self.phrasings = SEEN
+        self.phrasings: Mapping[str, tuple[str, ...]] = SEEN
         self.task, self.instruction, self.done, self.success, self.score = "", "", True, False, 0.0
         self.measures: dict[str, float] = {}
 

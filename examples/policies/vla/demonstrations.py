@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,7 @@ SEEDS = 1_000_000
 """Seed of the first scene; an evaluation's are below."""
 
 
-def episode(world: FetchBlocks, scene: int, task: str, noise: float) -> dict[str, npt.NDArray[np.generic]] | None:
+def episode(world: FetchBlocks, scene: int, task: str, noise: float) -> dict[str, npt.NDArray[Any]] | None:
     """Record an expert.
 
     Args:
@@ -41,12 +42,17 @@ def episode(world: FetchBlocks, scene: int, task: str, noise: float) -> dict[str
     """
     random = np.random.default_rng((scene, TASKS.index(task)))
     world.reset(scene, task, scene)
-    rows = dict[str, list[npt.NDArray[np.generic]]]()
+    rows = dict[str, list[npt.NDArray[Any]]]()
     drift, after = np.zeros(3), 0
     while after < AFTER and not (world.done and not world.success):
         action = act(world, task)
         blocks = np.concatenate([world.block(number) for number in range(len(COLOURS))]).astype(np.float32)
-        seen = {"front": world.view("front"), "wrist": world.view("wrist"), "state": world.state(), "blocks": blocks}
+        seen: dict[str, Any] = {
+            "front": world.view("front"),
+            "wrist": world.view("wrist"),
+            "state": world.state(),
+            "blocks": blocks,
+        }
         for name, value in {**seen, "action": np.clip(action, -1.0, 1.0)}.items():
             rows.setdefault(name, []).append(value)
         drift = 0.7 * drift + noise * random.normal(size=3)
@@ -62,7 +68,7 @@ def folder(world: FetchBlocks, out: Path, number: int) -> None:
     """
     if (out / f"{number:04}").exists():
         return
-    found, episodes, begin = dict[str, list[npt.NDArray[np.generic]]](), list[tuple[int, ...]](), 0
+    found, episodes, begin = dict[str, list[npt.NDArray[Any]]](), list[tuple[int, ...]](), 0
     for scene in range(SEEDS + number * SCENES, SEEDS + (number + 1) * SCENES):
         random = np.random.default_rng((scene, 2))
         tasks = random.choice(len(TASKS), TASKS_OF_A_SCENE, replace=False)

@@ -29,7 +29,7 @@ from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors
 from torch import Tensor, nn
 from torch import distributed as dist
-from torch import multiprocessing as mp
+from torch.multiprocessing.spawn import spawn
 from torch.nn import functional
 
 sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
@@ -44,6 +44,8 @@ REPEATS = 4
 WARM_UP, SMOOTHING, AUXILIARY, REPORTED = 300, 0.999, 0.5, 50
 UNIT, MIDDLE = 0.1, (1.31, 0.75, 0.42)
 """Metres, of what the network says about blocks."""
+
+Batch = tuple[dict[str, Any], Tensor, Tensor]
 
 
 class Demonstrations:
@@ -74,7 +76,7 @@ class Demonstrations:
             found[key] = {"mean": torch.tensor(rows.mean(0)).float(), "std": torch.tensor(rows.std(0)).float()}
         return found
 
-    def batch(self, size: int, random: np.random.Generator) -> tuple[dict[str, Any], Tensor, Tensor]:
+    def batch(self, size: int, random: np.random.Generator) -> Batch:
         """Frames as lerobot's processor takes them, which actions are none, and where the blocks are from the grip.
 
         Two episodes of a scene follow each other: pictures that are alike, and instructions that are not. The last
@@ -267,7 +269,7 @@ def averaged(parameters: list[nn.Parameter], processes: int) -> None:
         gradient.copy_(part.view_as(gradient) / processes)
 
 
-def batches(settings: Settings, demonstrations: Demonstrations, first: int, rank: int) -> Iterator[tuple[int, Any]]:
+def batches(settings: Settings, demonstrations: Demonstrations, first: int, rank: int) -> Iterator[tuple[int, Batch]]:
     """The remaining updates, with what each is computed from. New folders are looked for now and then."""
     for update in range(first, settings.updates):
         if update % 200 == 0:
@@ -332,7 +334,7 @@ def main() -> None:
     if settings.processes == 1:
         work(0, settings)
     else:
-        mp.spawn(work, (settings,), settings.processes)
+        spawn(work, (settings,), settings.processes)
 
 
 if __name__ == "__main__":
