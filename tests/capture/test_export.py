@@ -57,7 +57,7 @@ def test_the_users_module_is_not_touched() -> None:
         (lambda y, t, o: (y, y), "returns 2 values"),
         (lambda y, t, o: y[:, :2], r"returns float32\[B, 2, 2\]; expected the type of its sample, float32\[B, 4, 2\]"),
         (lambda y, t, o: y.double(), "returns float64"),
-        (lambda y, t, o: (y.bfloat16() + 1).float(), r"_to_copy \(test_capture.py:\d+ in \S+\) computes in bfloat16"),
+        (lambda y, t, o: (y.bfloat16() + 1).float(), r"_to_copy \(test_export.py:\d+ in \S+\) computes in bfloat16"),
         (lambda y, t, o: torch.cat([y, y, y[:1]])[: y.shape[0]], "not a multiple of the batch size"),
         (lambda y, t, o: y[o[:, 0] > 0], "size u0 at %index .* is not a multiple of the batch size"),
     ],
@@ -81,7 +81,7 @@ def test_the_error_is_all_that_is_said(
     for logger in loggers:
         logger.addHandler(caplog.handler)
     try:
-        with pytest.raises(CaptureError, match=r" at test_capture.py:\d+ in <lambda>: ") as caught:
+        with pytest.raises(CaptureError, match=r" at test_export.py:\d+ in <lambda>: ") as caught:
             capture(Denoiser(then), toy_spec())
     finally:
         for logger in loggers:
@@ -159,4 +159,4 @@ def test_state_that_changes_is_refused() -> None:
 def test_messages_name_a_line_and_no_path() -> None:
     graph, _ = capture(Denoiser(lambda y, t, o: y), toy_spec())
     (node,) = [n for n in graph.nodes if n.op == "aten.linear.default"]
-    assert node.source.startswith("test_capture.py:") and "/" not in node.source
+    assert node.source.startswith("test_export.py:") and "/" not in node.source
