@@ -280,7 +280,7 @@ def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
     said = (
         f"Within a tenth the largest loss was {losses}**, where nothing can be told, **and {-many['points']:.1f} in"
         f" {many['episodes']:,}**; between a tenth and a quarter"
-        f" {['none', 'one', 'two', 'three'][sum(points <= -6 for points in between)]} of"
+        f" {['none', 'one', 'two', 'three', 'four'][sum(points <= -6 for points in between)]} of"
         f" {['seven', 'eight', 'nine'][len(between) - 7]} lost 6 points or more, {-min(between):.1f} at most; the one"
         f" beyond lost {-beyond:.1f}"
     )

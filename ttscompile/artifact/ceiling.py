@@ -9,7 +9,7 @@ BOUND = 0.1
 0.16 lost 6 points in 800 paired episodes ("What a distance means" in ``docs/evidence/results.md``)."""
 
 FARTHEST = 0.25
-"""Distance up to which a plan is offered at all. Up to it plans lost as many as 10.5 points of success; same page."""
+"""Distance up to which a plan is offered at all. Up to it plans lost as many as 16.5 points of success; same page."""
 
 TYPICAL_SPARSITY = 0.95
 """What the method's authors aim at, with 100 steps."""

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from .trials import Trials
 
 
-SURE = 2.0
-"""The upper limit of the distance, with 95 % confidence over episodes, may be so many times as far. Of a plan of
+SURE = 1.25
+"""The upper limit of the distance, with 95 % confidence over episodes, may be so many times as far. One of 0.099 [-0.008,
+0.142] lost 9 points of success in 200 episodes. Of a plan of
 another sampler four episodes tell no less: the root of an energy distance near 0 has wide limits."""
 
 SAFER = 0.7

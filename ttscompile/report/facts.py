@@ -259,9 +259,9 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
         return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
     where, lost = "above a quarter", "one lost 18.5"
     if distance <= BOUND:
-        where, lost = "within a tenth", "they lost at most 3.5"
+        where, lost = "within a tenth", "they lost at most 9.0"
     elif distance <= FARTHEST:
-        where, lost = "within a quarter", "they lost at most 10.5"
+        where, lost = "within a quarter", "they lost at most 16.5"
     told = f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes"
     page = "docs/evidence/results.md, 'What a distance means'"
     return (f"{told}. Where such plans were driven, {lost} points of success ({page}).",)
