@@ -42,7 +42,7 @@ from ttscompile.report.summary import document
     "--error",
     ERROR,
     "Largest distance from the original that a plan may have, in units of what other noise changes; with 95 %"
-    " confidence it is at most a quarter more. Without this option it is 0.1 for the default plan, and 0.25 for others; if"
+    " confidence at most a quarter more. Without this option it is 0.1 for the default plan, and 0.25 for others; if"
     " no plan is within 0.1, the nearest is the default, with a warning.",
 )
 @threads_option("Threads that the policy will have on the robot.")
