@@ -1,6 +1,6 @@
 """Train lerobot's ``smolvla`` from nothing on the demonstrations, on one or several processors; resumes where it was.
 
-    OMP_NUM_THREADS=1 python examples/policies/vla/train.py DEMOS OUT --updates 30000 --processes 2
+    OMP_NUM_THREADS=1 python examples/policies/vla/train.py DEMOS OUT --updates 16000 --decay 6000 --processes 2
 
 The network, its processors and its files are lerobot's. The loss is that of ``SmolVLAPolicy.forward``, computed as
 inference does it, the prefix first: so one prefix, which is most of the work, serves several noises and times. Beside
@@ -320,8 +320,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("demos", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--updates", type=int, default=30_000)
-    parser.add_argument("--decay", type=int, default=8_000, help="updates at the end in which the rate goes down")
+    parser.add_argument("--updates", type=int, default=16_000)
+    parser.add_argument("--decay", type=int, default=6_000, help="updates at the end in which the rate goes down")
     parser.add_argument("--batch", type=int, default=32, help="frames of one process")
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--processes", type=int, default=2)
