@@ -13,6 +13,7 @@ NOT_RUN = {
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
     "ttscompile build": "takes a minute; tests/test_builder.py runs it",
+    "ttscompile bench compiled/ --choose": "needs plans that are near; tests/cli/test_choosing.py runs it",
     "ttscompile serve": "has no end; tests/runtimes/server and tests/runtimes/fleet start it",
     "ttscompile calibrate compiled/ --trajectories calls.npz --learn tokens": "needs tokens: tests/calibration",
     "ttscompile calibrate compiled/ --trajectories calls.npz --learn schedule,start": "a short search ends with 1",

@@ -10,7 +10,6 @@ Everything that decides is a state machine without clock or thread, driven by ``
 - ``state``: all of these together.
 - ``statistics``, ``trace``: what happened.
 - ``shadow``: a compiled policy beside the original that acts.
-- ``server``, ``protocol``: the executor for other processes.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -76,7 +76,7 @@ class MeasuredPoint:
     flops: float
     by_number: tuple[float, ...] = ()
     errors: tuple[float, ...] = ()
-    furthest: tuple[FarCall, ...] = ()
+    furthest: tuple[FarCall, ...] = field(default=(), compare=False)
 
     @property
     def point(self) -> Point:
