@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import ttscompile
+from tests.calibration import policies
 from tests.plans import store_schedules
 from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact, load_artifact
@@ -99,6 +100,29 @@ def test_the_deadline_of_the_build_holds(toy_compiled: Path, tmp_path: Path) -> 
     directory = made(toy_compiled, tmp_path, scores, budget={"latency_ms": 3.0})
     assert again(directory, timed(schedule=2.0, safe=4.0))[1].manifest.default_plan == "schedule"
     assert again(directory, timed(schedule=2.0, safe=2.9))[1].manifest.default_plan == "safe"
+
+
+def test_a_plan_of_this_name_in_another_artifact_or_with_more_threads_is_not_this_one(built: Path) -> None:
+    others = timed(schedule=0.1, safe=8.0)
+    told, after = again(built, timed(schedule=4.0, safe=2.0) + others)
+    assert told == "The default was 'schedule', and is 'safe'. schedule 4 ms, safe 2 ms."
+    assert after.manifest.default_plan == "safe"
+
+
+def test_a_plan_that_becomes_fp32_is_no_longer_told_to_be_in_eight_bits(tmp_path: Path) -> None:
+    directory, spec = tmp_path / "mixer", policies.spec()
+    ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, directory, precision="int8")
+    tried = [{"name": name, "told": "int8 in blocks"} for name in ("schedule", "safe")]
+    record = {"strategy": "tts", "plans": {"schedule": score(0.05)}, "frontier": tried}
+    cells = {"schedule": uniform_plan(spec.sampler.steps, 6, 2)}
+    store_schedules(directory, None, cells, "schedule", record)
+    assert "int8" in load_artifact(directory).default.in_words()
+    told, after = again(directory, [*timed(schedule=2.0), Measurement("fp32", "schedule@fp32", (1.0,))])
+    assert told == "The default is 'schedule', in fp32. schedule 2 ms, schedule@fp32 1 ms."
+    assert not after.default.precision
+    rows = {row["name"]: row["told"] for row in (after.manifest.calibration or {})["frontier"]}
+    assert rows == {"schedule": after.default.in_words(), "safe": "int8 in blocks"}
+    assert "int8" not in rows["schedule"]
 
 
 def test_a_plan_whose_limit_is_far_is_not_near(toy_compiled: Path, tmp_path: Path) -> None:

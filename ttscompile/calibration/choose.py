@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.plan import DENSE, FULL, Plan
 from ..errors import CalibrationFailedError
-from ..measure.points import ALIKE, Point, efficient, fastest
+from ..measure.points import ALIKE, Point, best_plan, efficient
 from ..measure.timer import Times
 from .judge import Score, judge, timed
 from .kept import Kept
@@ -41,11 +41,10 @@ class Frontier:
 def choose(kept: Kept, request: Request) -> Frontier:
     """Judge and time every plan, in each precision that it can have, and choose.
 
-    Without a deadline the fastest plan that is near enough is the default, or the nearest of those that are as fast
-    (``ALIKE``). With one it is the nearest of those whose longest call keeps it. Where none is within ``Request.bound``
-    it is the nearest within ``Request.farthest``, with a warning. ``schedule`` is the name of the default, ``safe``
-    that of the fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that
-    is not too far.
+    The default is ``best_plan`` of those within ``Request.farthest``, where those within ``Request.bound`` are near
+    enough; there is a warning if it is not one of them. ``schedule`` is the name of the default, ``safe`` that of the
+    fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that is not too
+    far.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -68,8 +67,11 @@ def choose(kept: Kept, request: Request) -> Frontier:
     times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))
     points = {name: Point("", name, scores[name].distance, times[name].median) for name in entered}
     best = {point.name for point in efficient(list(points.values()))}
-    allowed = [name for name in entered if name != DENSE and near(scores[name], request.farthest)]
-    close = [name for name in allowed if near(scores[name], request.bound)]
+
+    def up_to(bound: float) -> list[str]:
+        return [n for n, one in scores.items() if n != DENSE and near(one.distance, one.interval, bound)]
+
+    allowed, close = up_to(request.farthest), up_to(request.bound)
     chosen = _chosen(close, allowed, scores, times, request)
     named = {chosen: SCHEDULE}
     others = [name for name in best if name not in (DENSE, chosen)]
@@ -120,17 +122,13 @@ def _chosen(
     if not allowed:
         name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
         raise CalibrationFailedError(too_far(name, scores[name], request.farthest))
-    if request.deadline_ms is None:
-        distances = {name: score.distance for name, score in scores.items()}
-        if close:
-            return fastest({name: times[name].median for name in close}, distances)
-        return min(allowed, key=distances.__getitem__)
-    in_time = [name for name in allowed if max(times[name].ms) <= request.deadline_ms]
-    if not in_time:
+    distances = {name: scores[name].distance for name in allowed}
+    chosen = best_plan({name: times[name] for name in allowed}, distances, close, request.deadline_ms)
+    if chosen is None:
         name = min(allowed, key=lambda name: max(times[name].ms))
         raise CalibrationFailedError(
             f"no plan that is near enough keeps {request.deadline_ms:.3g} ms: the fastest, {name!r}, took"
             f" {times[name].median:.3g} ms, and {max(times[name].ms):.3g} at worst, with {request.threads} thread"
             f"{'s' * (request.threads > 1)}. Allow more threads, a larger error, or a slower loop."
         )
-    return min(in_time, key=lambda name: scores[name].distance)
+    return chosen

@@ -7,7 +7,7 @@ Members as those of the algorithms of NNCF: whether it applies, what it does, an
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -35,9 +35,9 @@ SAFER = 0.7
 """Of the default's distance: at most so much has the plan ``safe`` where the default is chosen among many."""
 
 
-def near(score: Score, bound: float) -> bool:
-    """Whether a plan of this score is within a bound, by its distance and by the limit of that."""
-    return score.distance <= bound and score.interval[1] <= SURE * bound
+def near(distance: float, interval: Sequence[float], bound: float) -> bool:
+    """Whether a plan this far away is within a bound, by its distance and by the 95 % limits of that."""
+    return distance <= bound and max(interval) <= SURE * bound
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ttscompile.artifact.ceiling import BOUND, FARTHEST
 from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact
-from ttscompile.calibration.proposer import SURE
+from ttscompile.calibration.proposer import near
 from ttscompile.core.plan import DENSE, UNIFORM
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError
 from ttscompile.measure.machine import fingerprint
-from ttscompile.measure.points import fastest
+from ttscompile.measure.points import best_plan
+from ttscompile.measure.timer import Times
 from ttscompile.measure.units import ms
 from ttscompile.report.facts import scores
 from ttscompile.report.timing import Measurement
@@ -31,8 +33,8 @@ def choosable(artifact: Artifact, bound: float = FARTHEST) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for name, score in scores(artifact.manifest.calibration, ("distance", "interval")).items():
-        within = score["distance"] <= bound and max(score["interval"]) <= SURE * bound
-        if within and name in artifact.manifest.plans and name not in (DENSE, UNIFORM):
+        within = name in artifact.plans and near(score["distance"], score["interval"], bound)
+        if within and name not in (DENSE, UNIFORM):
             found[name] = score["distance"]
             if artifact.plans[name].precision and artifact.plans[name].tokens is None:
                 found[name + IN_FP32] = score["distance"]
@@ -57,19 +59,22 @@ def choose_again(
     """
     record, far, close = dict(artifact.manifest.calibration or {}), choosable(artifact), choosable(artifact, BOUND)
     deadline = record.get("budget", {}).get("latency_ms") if deadline_ms is None else deadline_ms
-    times = {one.plan: one for one in measured if one.plan in far}
-    if deadline is None:
-        medians = {name: one.median_ms for name, one in times.items()}
-        near = {name: medians[name] for name in medians if name in close}
-        chosen = fastest(near, far) if near else min(medians, key=lambda name: (far[name], medians[name]))
-    elif in_time := [name for name, one in times.items() if max(one.times_ms) <= deadline]:
-        chosen = min(in_time, key=lambda name: (far[name], times[name].median_ms))
-    else:
+    times: dict[str, Times] = {}
+    for one in measured:
+        if one.plan in far:  # of another artifact, or with more threads, it is timed later
+            times.setdefault(one.plan, Times(one.times_ms))
+    chosen = best_plan(times, far, close.keys() & times.keys(), deadline)
+    if chosen is None:
         return None
     name, before = chosen.removesuffix(IN_FP32), artifact.manifest.default_plan
-    told = ", ".join(f"{each} {ms(one.median_ms)} ms" for each, one in times.items())
+    told = ", ".join(f"{each} {ms(one.median)} ms" for each, one in times.items())
     here = f"{fingerprint()['processor']}, {threads} thread{'s' * (threads > 1)}: {told}"
-    precision: dict[str, str] | None = {} if chosen != name else None
-    choose_default(directory, name, {**record, "default_plan": name, "chosen_on": here}, precision, artifact)
+    record |= {"default_plan": name, "chosen_on": here}
+    precision: dict[str, str] | None = None
+    if chosen != name:
+        precision, words = {}, replace(artifact.plans[name], precision={}).in_words()
+        tried = record.get("frontier", ())
+        record["frontier"] = [{**row, "told": words} if row["name"] == name else row for row in tried]
+    choose_default(directory, name, record, precision, artifact)
     changed = "is" if name == before else f"was {before!r}, and is"
     return f"The default {changed} {name!r}{', in fp32' * (chosen != name)}. {told}."

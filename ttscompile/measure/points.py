@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+
+from .timer import Times
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,25 @@ def fastest(times_ms: Mapping[str, float], distances: Mapping[str, float]) -> st
     most = ALIKE * min(times_ms.values())
     alike = [name for name in times_ms if times_ms[name] <= most]
     return min(alike, key=lambda name: (distances[name], times_ms[name]))
+
+
+def best_plan(
+    times: Mapping[str, Times], distances: Mapping[str, float], near: Collection[str], deadline_ms: float | None
+) -> str | None:
+    """The rule by which one of several plans is the default: its name.
+
+    Without a deadline it is the ``fastest`` of those that are near enough, or the nearest of all if none is. With one
+    it is the nearest of those whose longest call keeps it; None if none does.
+
+    Args:
+        times: of the plans that may be taken.
+        near: names of those that are near enough.
+        deadline_ms: that a call may take, milliseconds.
+    """
+    if near and deadline_ms is None:
+        return fastest({name: times[name].median for name in times if name in near}, distances)
+    in_time = [name for name, one in times.items() if deadline_ms is None or max(one.ms) <= deadline_ms]
+    return min(in_time, key=lambda name: (distances[name], times[name].median), default=None)
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
     assert not own["wrong"], "with every step computed it is somewhere else"
     assert "wrong is" in proposer.told and "with every step computed" in proposer.told
     last, score = list(found.values())[-1]
-    assert not last.beside and last.plan.loop == "short" and near(score, 0.4)
+    assert not last.beside and last.plan.loop == "short" and near(score.distance, score.interval, 0.4)
     assert len(own["short"]) == 2, "the one that is near enough, and one of more steps for what follows"
     # It uses more than half of the bound; so the original, slow as it is, is searched for one that is clearly nearer.
     by_steps = sorted(own[ORIGINAL], key=lambda name: int(name.partition(".")[2]))

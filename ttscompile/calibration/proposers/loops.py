@@ -189,14 +189,15 @@ class Loops:
             return
         score, alone = self._scores[proposal.name], replace(proposal, beside=False, margin=float("inf"))
         again = self._best is not None and self._best.name == proposal.name  # nearer now
-        if near(score, self._bound) and (again or cost < self._fastest):
+        if near(score.distance, score.interval, self._bound) and (again or cost < self._fastest):
             self._best, self._fastest = alone, cost
-        if near(score, self._farthest) and self._is_nearest(proposal.name):
+        if near(score.distance, score.interval, self._farthest) and self._is_nearest(proposal.name):
             self._nearest = alone
 
     def _reached(self, loop: str, count: int, wanted: float) -> bool:
         """Whether a plan of so many steps is as near as is wanted; with a deadline as many are tried as keep it."""
-        return near(self._scores[_name(loop, count)], wanted) and self._deadline is None
+        score = self._scores[_name(loop, count)]
+        return near(score.distance, score.interval, wanted) and self._deadline is None
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
         limit, now = trials.clock.limit, trials.clock.elapsed()
