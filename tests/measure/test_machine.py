@@ -6,6 +6,7 @@ import getpass
 import json
 import platform
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,3 +47,13 @@ def test_integer_dot_products_are_read_from_the_flags(
     monkeypatch.setattr(machine, "CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(platform, "machine", lambda: processor)
     assert machine.has_integer_dot_product() is expected
+
+
+def test_a_busy_machine_is_named_with_its_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    loads: Any = (0.0, 0.0, 0.0)
+    monkeypatch.setattr("os.getloadavg", lambda: loads)
+    assert machine.busy() is None
+    loads = (1000.0, 0.0, 0.0)
+    warning = machine.busy()
+    assert warning is not None
+    assert "load 1000" in warning

@@ -11,7 +11,7 @@ from math import floor
 from pathlib import Path
 
 from ..core.finding import Finding, Level
-from ..measure.machine import X86, cpuinfo
+from ..measure.machine import BUSY, X86, cpuinfo
 
 _X86 = {
     "avx2": "AVX2",
@@ -29,9 +29,6 @@ _AS_GOOD = {"avx_vnni": {"avx512_vnni"}, "avx512_vnni": {"avx_vnni"}}
 """What does the same, so that its absence is not worth a word."""
 
 _FAST_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page")
-_BUSY = 0.5
-"""Load for each core from which timings say little."""
-
 _LATE_MS = 1.0
 """How late a sleep may wake in the median before a control loop should worry."""
 
@@ -105,7 +102,7 @@ def _cores(root: Path) -> list[Finding]:
         found.append(Finding.judged(part, "frequency governor", governor, governor != "performance", remedy))
     load = os.getloadavg()[0]
     remedy = "Timings taken now say little: stop what else runs, or reserve cores (taskset)."
-    return [*found, Finding.judged(part, "load", f"{load:.1f} over the last minute", load > _BUSY * usable, remedy)]
+    return [*found, Finding.judged(part, "load", f"{load:.1f} over the last minute", load > BUSY * usable, remedy)]
 
 
 def _memory(root: Path) -> list[Finding]:

@@ -13,6 +13,8 @@ CPUINFO, CGROUP = Path("/proc/cpuinfo"), Path("/sys/fs/cgroup/memory.max")
 PACKAGES = ("ttscompile", "numpy", "onnxruntime", "torch")
 _DOT_PRODUCTS = ("avx512_vnni", "avx_vnni", "amx_int8")
 X86 = ("x86_64", "amd64", "i386", "i686")
+BUSY = 1.0
+"""Load for each core from which timings say little: more wants to run than can."""
 _INSTRUCTIONS = ("avx2", "avx512f", "avx512_vnni", "amx_int8", "asimd", "sve")
 
 
@@ -44,7 +46,7 @@ def busy() -> str | None:
     machine = fingerprint()
     load, cores = machine["load_average"], machine["cores"]
     told = f"other programs keep this machine busy (load {load:g} on {cores} cores), so times say little"
-    return f"{told}. Measure again when they are done." if load > cores else None
+    return f"{told}. Measure again when they are done." if load > BUSY * cores else None
 
 
 def memory_bytes(limit: Path | None = None) -> int:
