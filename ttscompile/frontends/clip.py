@@ -65,10 +65,10 @@ class TowerConfig:
 
 
 @dataclass(frozen=True)
-class VisionConfig(TowerConfig):
-    """The image encoder: square images of ``image_size`` pixels in patches of ``patch_size``.
+class ImageTowerConfig(TowerConfig):
+    """An image encoder: square images of ``image_size`` pixels in patches of ``patch_size``.
 
-    Defaults are what transformers takes for an entry that its file leaves out.
+    Defaults, here and in the others, are what transformers takes for an entry that a file leaves out.
     """
 
     hidden_size: int = 768
@@ -77,6 +77,17 @@ class VisionConfig(TowerConfig):
     num_attention_heads: int = 12
     image_size: int = 224
     patch_size: int = 32
+
+    @property
+    def side(self) -> int:
+        """Patches along a side."""
+        return self.image_size // self.patch_size
+
+
+@dataclass(frozen=True)
+class VisionConfig(ImageTowerConfig):
+    """CLIP's image encoder."""
+
     num_channels: int = 3
 
     def __post_init__(self) -> None:
@@ -89,7 +100,7 @@ class VisionConfig(TowerConfig):
     @property
     def patches(self) -> int:
         """Tokens of an image, without the class token."""
-        return (self.image_size // self.patch_size) ** 2
+        return self.side**2
 
 
 @dataclass(frozen=True)

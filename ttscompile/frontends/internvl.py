@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .clip import ACTIVATIONS, Layers, TowerConfig
+from .clip import ACTIVATIONS, ImageTowerConfig, Layers
 from .language_layers import LanguageConfig, Layer, Norm, added, rotation
 from .siglip import squares
 
@@ -23,10 +23,8 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
-class InternVitConfig(TowerConfig):
-    """The image encoder: square images of ``image_size`` pixels in patches of ``patch_size``.
-
-    Defaults are what transformers takes for an entry that its file leaves out.
+class InternVitConfig(ImageTowerConfig):
+    """The image encoder.
 
     Attributes:
         use_mean_pooling: whether what leaves the last layer is not normalised.
@@ -42,11 +40,6 @@ class InternVitConfig(TowerConfig):
     image_size: int = 448
     patch_size: int = 14
     use_mean_pooling: bool = True
-
-    @property
-    def side(self) -> int:
-        """Patches along a side."""
-        return self.image_size // self.patch_size
 
 
 @dataclass(frozen=True)

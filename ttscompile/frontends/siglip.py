@@ -12,29 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from .clip import Layers, TowerConfig
+from .clip import ImageTowerConfig, Layers
 
 
 @dataclass(frozen=True)
-class SiglipConfig(TowerConfig):
-    """The encoder; images have ``image_size`` pixels a side where every patch has its own position.
-
-    Defaults are what transformers takes for an entry that SmolVLM's file leaves out.
-    """
+class SiglipConfig(ImageTowerConfig):
+    """The encoder, as SmolVLM has it; in images of ``image_size`` pixels a side every patch has its own position."""
 
     hidden_size: int = 1152
-    intermediate_size: int = 3072
-    num_hidden_layers: int = 12
     num_attention_heads: int = 16
     hidden_act: str = "gelu_pytorch_tanh"
     layer_norm_eps: float = 1e-6
-    image_size: int = 224
-    patch_size: int = 32
-
-    @property
-    def side(self) -> int:
-        """Patches along a side."""
-        return self.image_size // self.patch_size
 
 
 class _Embeddings(nn.Module):
