@@ -139,6 +139,7 @@ def _step_graph(
 
 
 def _evaluate_tables(prologue: Graph, names: list[str], program: Cut) -> dict[str, dict[str, npt.NDArray[Any]]]:
+    """By loop, rows of every table value, ``[K, *shape at a batch of one]``."""
     loops, timestep = program.spec.all_loops, program.spec.timestep_argument
     if not names:
         return {loop: {} for loop in loops}

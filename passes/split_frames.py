@@ -71,7 +71,10 @@ class SplitFrames(Pass[Program, Program]):
         if not found:
             return PassResult(program, tuple(declined.values()))
         order = {node.name: i for i, node in enumerate(graph.nodes)}
-        groups = _alike(sorted(found, key=lambda one: order[one.entries[0]]))
+        alike: dict[tuple[int, str], list[_Tower]] = {}  # what does the same with the same weights, together
+        for tower in sorted(found, key=lambda one: order[one.entries[0]]):
+            alike.setdefault((tower.rows, _form(tower.graph)), []).append(tower)
+        groups = list(alike.values())
         for group in groups:
             _require_apart(self, group[0].graph, program.weights)
         frames, condition = _rows_graph(graph, groups), _rest(graph, groups)
@@ -120,6 +123,7 @@ def _is_frame(spec: ObservationSpec) -> bool:
 def _largest(
     graph: Graph, found: Collection[_Tower], frames: Collection[str], declined: Collection[str]
 ) -> _Tower | None:
+    """The tower with the most FLOPs among what is in no other."""
     taken = {name for tower in found for name in (*tower.inside, *tower.before)}
     observed, starts = reachable_from(graph, graph.inputs), list[tuple[str, ...]]()
     types = graph.types()
@@ -156,6 +160,7 @@ def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, Ten
 
 
 def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], taken: Collection[str]) -> _Tower | None:
+    """All that follows from these rows alone; None if that is nothing."""
     types, users, banned = graph.types(), graph.users(), set(taken)
     rows = _rows(types, entries[0])
     while True:
@@ -197,6 +202,7 @@ def _crossing(name: str) -> str:
 
 
 def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
+    """The graph of one row for each that ``rows * B`` stand for."""
 
     def size(batch: Batch) -> Batch:
         return Batch(batch.multiple // rows)
@@ -206,13 +212,6 @@ def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
     out = tuple(Node(_crossing(n), "aten.clone.default", (Ref(n),), (), (types[n],)) for n in exits)
     inputs = {name: type_.resized(size) for name, type_ in graph.inputs.items()}
     return Graph(inputs, graph.constants, (*nodes, *out), tuple(map(_crossing, exits)))
-
-
-def _alike(towers: list[_Tower]) -> list[list[_Tower]]:
-    groups: dict[tuple[int, str], list[_Tower]] = {}
-    for tower in towers:
-        groups.setdefault((tower.rows, _form(tower.graph)), []).append(tower)
-    return list(groups.values())
 
 
 def _form(graph: Graph) -> str:

@@ -205,6 +205,7 @@ def _reshaped(splitter: _Splitter, node: Node, source: _Parts, type_: TensorType
 
 
 def _factors(shape: Sequence[Size]) -> tuple[int, int]:
+    """Numbers and batches in a product of sizes."""
     numbers = math.prod(n.multiple if isinstance(n, Batch) else n for n in shape)
     return numbers, sum(isinstance(n, Batch) for n in shape)
 

@@ -285,12 +285,14 @@ class CompiledPolicy:
     def _chunk(
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
+        """What is executed of a call, ``[B, Ta, Da]``."""
         chunk = self._spec.chunk
         return self._predict(obs, noise, plan, prefix)[:, chunk.start : chunk.stop]
 
     def _predict(
         self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
     ) -> FloatArray:
+        """One call; the actions ``[B, T, Da]``, which are finite."""
         self._report, wanted = None, self._plan(plan)
         spec = self._runtime.view(wanted).manifest.spec
         obs = check_observation(obs, spec.observations)

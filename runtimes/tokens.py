@@ -99,7 +99,8 @@ class TokenTower:
             kept.age += 1
             self._lanes[lane] = kept
             return kept.values, 0
-        arrays = self._blank() if kept is None else kept.arrays
+        nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
+        arrays = nothing if kept is None else kept.arrays
         values = self._renew(self._part, {PIXELS: pixels, INDEX: index}, arrays)
         if kept is None or len(index) == self.tokens:
             kept = _Kept(pixels[0], arrays, values)
@@ -110,9 +111,6 @@ class TokenTower:
             kept.values, kept.age = values, kept.age + 1
         self._lanes[lane] = kept
         return values, len(index)
-
-    def _blank(self) -> dict[str, Array]:
-        return {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
 
     def _changed(self, kept: _Kept | None, pixels: Array) -> Array:
         """Numbers of the tokens to compute, int64; none where no patch changed."""
@@ -137,6 +135,7 @@ class TokenTower:
             )
 
     def _differences(self, one: Array, other: Array) -> Array:
+        """The mean absolute difference of each patch of ``[C, H, W]``, row by row."""
         high, wide = self._record.patch
         _, rows, columns, *_ = self._patches(one).shape
         off = one[:, : rows * high, : columns * wide] - other[:, : rows * high, : columns * wide]

@@ -186,6 +186,7 @@ class ExecutorState:
             self.recorder.counts.deadlines_missed += 1
 
     def _reason(self, now: float) -> tuple[str, bool]:
+        """Why nothing is scheduled, and whether observations are to blame."""
         if self._schedule.refusal is not None:
             return f"the guard refused the last chunk: {self._schedule.refusal}", False
         if self._job is not None:

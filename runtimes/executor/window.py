@@ -197,6 +197,7 @@ class ObservationWindow:
         return self.complete
 
     def _window(self, newest: int) -> Window | None:
+        """The window whose newest frame has this index; None if it is not complete."""
         times, chosen, before = self._times, [newest], newest
         for back in range(1, self._steps):
             before = self._nearest(times[newest] - back * self._period, before)

@@ -68,6 +68,7 @@ class ContextValues:
         return self._manifest.contexts[name], self.values[name]
 
     def _run_step(self, piece: PieceRecord) -> None:
+        """The step values of all steps in one batch of K * B, step-major."""
         feed, steps = {}, self._manifest.steps
         for name in piece.inputs:
             context = self._manifest.contexts[name]

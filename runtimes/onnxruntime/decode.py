@@ -140,6 +140,7 @@ def _apart(work: Workspace, lowered: Sequence[Instructions], keep: BoolArray) ->
 def _run_dense_apart(
     work: Workspace, operands: Sequence[_Operands], streams: Sequence[int], k: int, keep: BoolArray
 ) -> None:
+    """All blocks at step k for these streams, all of the batch or some."""
     if len(streams) == work.streams:
         work.run_dense(k)
     else:

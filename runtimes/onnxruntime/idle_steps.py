@@ -125,4 +125,5 @@ class IdleSteps:
 
 
 def _by_part(array: FloatArray, horizon: int) -> FloatArray:
+    """``[D, B, n T]`` seen as ``[n, D, B, T]``."""
     return array.reshape(*array.shape[:2], array.shape[2] // horizon, horizon).transpose(2, 0, 1, 3)

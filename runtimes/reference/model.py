@@ -301,6 +301,7 @@ class ReferenceModel:
         return whole
 
     def _gates(self, gates: Tensor | PlanArray, streams: int) -> tuple[Tensor, PlanArray]:
+        """Gates as float32 ``[B, K, blocks, 4]`` and the plan that they stand for."""
         if not isinstance(gates, Tensor):
             plan = check_plan(gates, self.steps, self.blocks, streams)
             return torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float(), plan

@@ -264,6 +264,7 @@ class _Writer:
         return self._seen[root, *place]
 
     def _text(self, node: Node, argument: Argument, reads: list[str]) -> str:
+        """An argument in the source; names that it reads go to ``reads``."""
         if isinstance(argument, Ref):
             reads.append(self._named(argument.name))
             return reads[-1]
@@ -288,6 +289,7 @@ class _Writer:
 
 
 def _storage(value: Tensor) -> int:
+    """Which memory a tensor sees; a packed weight has none that can be seen."""
     return -1 if value.is_mkldnn else int(value.untyped_storage()._cdata)
 
 

@@ -213,6 +213,7 @@ class StreamsNetwork:
         return self.values[name][k] if stepwise else self.values[name]
 
     def _step_inputs(self, graph: Graph) -> list[Tensor]:
+        """What the step piece reads, with a batch of K * B, step-major."""
         found = []
         for name in graph.inputs:
             context, value = self._parts.manifest.contexts[name], self.values[name]

@@ -151,6 +151,7 @@ def denoise_as_planned(
 def _evaluated(
     network: PlainNetwork, name: str, stream: Tensor, contexts: Mapping[str, Tensor], computing: Tensor, reused: Tensor
 ) -> Tensor:
+    """A block's residual, for the streams that compute it."""
     residual = torch.where(computing, network.run(name, stream, contexts), reused)
     return residual.clone(memory_format=torch.contiguous_format)  # both branches of a cond have to have one layout
 

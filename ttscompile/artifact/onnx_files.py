@@ -127,6 +127,7 @@ def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:
 
 
 def _read(message: memoryview, left: _Left) -> Iterator[tuple[int, memoryview | None]]:
+    """Number and content of each field; None for numbers."""
     position, end = 0, len(message)
     while position < end:
         left.fields -= 1

@@ -256,4 +256,5 @@ def last(samples: Iterable[Tensor]) -> Tensor:
 
 
 def _numbers(streams: BoolArray, beside: Tensor) -> Tensor:
+    """Numbers of those streams that are True, on the device of a tensor."""
     return torch.from_numpy(np.flatnonzero(streams)).to(beside.device)

@@ -15,7 +15,7 @@ noise changes nothing the unit is another one (``measure.energy.pairs``).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -81,8 +81,7 @@ class Score:
 
     def record(self) -> dict[str, Any]:
         """As JSON, for the record of a calibration; the same on every machine."""
-        known = {name: one for name, one in asdict(self).items() if one is not None}
-        return {name: one for name, one in known.items() if name not in ("gaps", "answers")}
+        return {name: one for name, one in vars(self).items() if one is not None and name not in ("gaps", "answers")}
 
 
 def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:

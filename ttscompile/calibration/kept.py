@@ -80,6 +80,7 @@ class Kept:
         return True
 
     def _no_better(self, trials: Trials, score: Score, margin: float | None) -> str | None:
+        """Why a plan does not take the place of the best one so far."""
         if margin == float("inf"):
             return None
         if self.default not in self.scores:

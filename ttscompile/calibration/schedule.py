@@ -113,6 +113,7 @@ class Schedule:
             yield replace(proposal, refusal=_no_safer) if name == SAFE else proposal
 
     def _budget(self, trials: Trials, view: View, clock: Clock) -> Budget | None:
+        """The budget; None where it is found on the calls to learn from."""
         goal, manifest = self._request.goal, view.manifest
         if goal.kind == ERROR:
             return None

@@ -37,6 +37,7 @@ class StateFile:
 
     Attributes:
         progress: how far the work is, as JSON.
+        WORK, AGAIN: what errors call the work, and how to do it again; a subclass has its own.
     """
 
     WORK, AGAIN = "calibration", "Calibrate"
@@ -132,6 +133,7 @@ class StateFile:
 
 
 def _checksum(arrays: Mapping[str, Array]) -> bytes:
+    """The sha256 of names, types and contents, whatever their order."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

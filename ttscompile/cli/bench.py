@@ -102,7 +102,12 @@ SECTIONS = (
     help="Make the plan the default that 'ttscompile build' would choose by these times, without calibrating again."
     " With --control-hz it is the nearest plan that keeps up. The exit status is 1 if none does.",
 )
-@click.option("--plot", "picture", type=PICTURE, help="Draw distance against latency; the furthest calls go beside it.")
+@click.option(
+    "--plot",
+    "picture",
+    type=PICTURE,
+    help="Draw distance against latency into this file (.png, .svg or .pdf), and the furthest calls beside it.",
+)
 @click.pass_context
 def bench(
     context: click.Context,
@@ -148,7 +153,8 @@ def bench(
         measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
         status.update("judging")
         judged = None if loop is None else loop.judge(entered, measured)
-    asked = {"observation": sources, "plans": plans, "calls": calls, "seed": _seed(artifact), **vars(ways[0])}
+    seed = (artifact.manifest.calibration or {}).get("seed", 0)  # holds out the episodes that its calibration held out
+    asked = {"observation": sources, "plans": plans, "calls": calls, "seed": int(seed), **vars(ways[0])}
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
     limit = None if judged is None else judged.may_take_ms
     chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
@@ -192,11 +198,6 @@ def _ways(runtimes: Sequence[str], device: str | None, threads: Sequence[int]) -
         raise click.UsageError("--runtime torch has one number of threads in a process: give --threads one number.")
     others = None if "torch" in runtimes else device
     return [Way(one, device if one == "torch" else others, number) for one in runtimes for number in threads]
-
-
-def _seed(artifact: Artifact) -> int:
-    """Of its calibration: with the same seed the same episodes are held out."""
-    return int((artifact.manifest.calibration or {}).get("seed", 0))
 
 
 def _by_threads(entered: Sequence[Contestant], measured: Sequence[Measurement], plan: str) -> dict[int, float]:

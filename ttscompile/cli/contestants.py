@@ -12,7 +12,7 @@ import numpy as np
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import marked
 from ttscompile.artifact.view import view_of
-from ttscompile.core.plan import DENSE, Plan
+from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import Affine, Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.report.timing import Contestant, plan_contestant
@@ -83,17 +83,15 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
             known = [name for name in dict.fromkeys(plans) if name.partition("@")[0] in known]
         for way in ways:
             wanted = known if made else list(dict.fromkeys((DENSE, *known)))
-            for plan in wanted:
-                require_able(way.runtime, artifact, artifact.plan(plan))
-            pair = [way.open(artifact, plan) for plan in wanted[:2]]
-            for plan in wanted:
-                own = _goes_on(artifact, artifact.plan(plan))
-                enter(series, way.open(artifact, plan) if own else pair[len(made) % len(pair)], plan, way)
+            for name in wanted:
+                require_able(way.runtime, artifact, artifact.plan(name))
+            pair = [way.open(artifact, name) for name in wanted[:2]]
+            for name in wanted:
+                plan = artifact.plan(name)
+                goes_on = plan.otherwise is not None or plan.tokens is not None
+                goes_on = goes_on or reads_earlier_calls(view_of(artifact, plan), plan)
+                enter(series, way.open(artifact, name) if goes_on else pair[len(made) % len(pair)], name, way)
     return made
-
-
-def _goes_on(artifact: Artifact, plan: Plan) -> bool:
-    return plan.otherwise is not None or plan.tokens is not None or reads_earlier_calls(view_of(artifact, plan), plan)
 
 
 def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:

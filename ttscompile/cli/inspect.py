@@ -70,7 +70,10 @@ def inspect(
     if output is not None:
         require_page(output)
     console, artifact = progress(), load_artifact(directory)
-    episode = _first_episode(artifact, trajectories, sources) if trajectories else None
+    spec, episode = artifact.manifest.spec, None
+    if trajectories:
+        executed = spec.chunk.stop - spec.chunk.start
+        episode = load_trajectories(trajectories, spec.observations, executed, sources, spec.instruction)[0]
     passed, section = True, NOT_RUN
     if output is not None:
         with only_results_on_stdout(), console.status("loading") as status:
@@ -91,12 +94,6 @@ def inspect(
     if not passed:
         say(console, "failed: the artifact does not hold what it promises; the page says where.")
         context.exit(1)
-
-
-def _first_episode(artifact: Artifact, trajectories: tuple[Path, ...], sources: Sources) -> Episode:
-    spec = artifact.manifest.spec
-    steps = spec.chunk.stop - spec.chunk.start
-    return load_trajectories(trajectories, spec.observations, steps, sources, spec.instruction)[0]
 
 
 def _drawn_by_default(artifact: Artifact, episode: Episode | None) -> str:

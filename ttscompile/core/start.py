@@ -73,6 +73,7 @@ def rest_of(table: SamplerTable, last_steps: int) -> tuple[SamplerTable, Start]:
 
 
 def _shares(table: SamplerTable, step: int) -> tuple[float, float]:
+    """Of action and of noise in the sample before a step."""
     sample, out = float(table.sample_to_x0[step]), float(table.out_to_x0[step])
     if table.name == "euler" and sample == 1 and 0 < abs(out) <= 1:  # x0 = x + left v; x = (1 - left) x0 + left noise
         return 1 - abs(out), abs(out)

@@ -97,9 +97,10 @@ def fetch_checkpoint(text: str) -> Fetched:
         if name.inside.endswith(_CHECKPOINT):
             return _fetched(hub, name, text, folder.name, [name.inside])
         try:
-            files = _listing(hub, name.repository, folder.name)
+            tree = hub.HfApi().list_repo_tree(name.repository, revision=folder.name, recursive=True)
+            files = [each.path for each in tree if isinstance(each, hub.hf_api.RepoFile)]
         except Exception:  # no network, of whichever library: what was downloaded before may be enough
-            files = _kept(folder)
+            files = [each.relative_to(folder).as_posix() for each in folder.rglob("*") if each.is_file()]
             if not _whole(name, files):
                 raise
         return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, files))
@@ -161,15 +162,6 @@ def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str],
         (ref := folder.parents[1] / "refs" / branch).parent.mkdir(parents=True, exist_ok=True)
         ref.write_text(commit)
     return folder
-
-
-def _listing(hub: Any, repository: str, commit: str) -> list[str]:
-    tree = hub.HfApi().list_repo_tree(repository, revision=commit, recursive=True)
-    return [each.path for each in tree if isinstance(each, hub.hf_api.RepoFile)]
-
-
-def _kept(folder: Path) -> list[str]:
-    return [each.relative_to(folder).as_posix() for each in folder.rglob("*") if each.is_file()]
 
 
 def _listed(manifest: Path, text: str) -> list[str]:

@@ -177,6 +177,7 @@ class Evaluator:
         return call
 
     def _argument(self, node: Node, argument: Argument) -> tuple[Any, Getter | None]:
+        """Either a value, or a getter of a value that depends on the frame or on B."""
         if isinstance(argument, Ref):
             if argument.name not in self._slots:
                 raise CaptureError(f"{_where(node)} reads %{argument.name}, which nothing before it computes.")

@@ -184,6 +184,7 @@ def _split_at_norm(tail: Graph, stream: str) -> tuple[Node, Graph]:
 
 
 def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wide, float]:
+    """Scale ``[W]``, shift ``[W]`` and epsilon."""
     shape, scale, shift, eps = (*norm.args[1:5], *(None, None, 1e-5)[len(norm.args) - 2 :])[:4]
     if shape != (width,) or norm.kwargs or not isinstance(eps, float):
         raise _Declined(f"{norm} is not over the {width} numbers of a token")

@@ -124,6 +124,7 @@ def _tensordot(node: Node, types: Types) -> int:
 
 
 def _bilinear(node: Node, types: Types) -> int:
+    """Both inputs meet in each number of the result."""
     return 2 * math.prod(node.type.at(1)) * math.prod(_shape(types, node.args[2])[1:])
 
 
@@ -158,6 +159,7 @@ def _einsum(node: Node, types: Types) -> int:
 
 
 def _recurrent(node: Node, types: Types) -> int:
+    """Every matrix of every layer meets each frame."""
     parameters = node.args[2]
     assert isinstance(parameters, tuple)
     sizes = [math.prod(shape) for shape in (_shape(types, p) for p in parameters) if len(shape) == 2]

@@ -127,6 +127,7 @@ def _joined(node: Node) -> int:
 
 
 def _numbers(sizes: tuple[Size, ...]) -> int:
+    """Product of sizes; 0 if the batch is among them."""
     return math.prod(size if isinstance(size, int) else 0 for size in sizes)
 
 

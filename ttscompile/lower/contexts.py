@@ -66,6 +66,7 @@ class Contexts:
         return rows[0] if len(rows) == 1 else self._main.op("Concat", *rows, axis=1)
 
     def _step_values(self, model: ModelProto) -> dict[str, str]:
+        """Step values, made for all steps in one batch of K * B."""
         step, main = self.pieces.step, self._main
         assert step is not None
         feeds = {}

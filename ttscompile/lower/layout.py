@@ -302,6 +302,7 @@ def _split(atoms: Sequence[_Atom], split: dict[_Atom, tuple[_Atom, ...]]) -> tup
 
 
 def _chunks(order: Sequence[_Atom], target: Sequence[_Atom], picked: set[_Atom]) -> list[tuple[_Atom, ...]]:
+    """The factors of the base, those that stay neighbours in the target merged."""
     chunks: list[tuple[_Atom, ...]] = []
     for atom in order:
         if chunks and atom not in picked and chunks[-1][-1] not in picked:

@@ -319,6 +319,7 @@ class DenoisingLoop:
         return w.choose(is_anchor, anchor.body("anchor", longer), other.body("other", same))[0]
 
     def _following(self, w: GraphWriter, k: str) -> str:
+        """The next step; of the last one itself, whose stream nobody reads."""
         return w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
 
     def _feeds(self, w: GraphWriter, piece: LoopPiece, stream: str, k: str) -> dict[str, str]:

@@ -182,7 +182,10 @@ def flatten_attention(model: ModelProto) -> ModelProto:
     result = ModelProto()
     result.CopyFrom(model)
     graph = result.graph
-    shapes = _shapes(graph)
+    shapes = {  # with zero for a size that depends on the batch
+        value.name: tuple(d.dim_value for d in value.type.tensor_type.shape.dim)
+        for value in [*graph.value_info, *graph.input, *graph.output]
+    }
     makers = {value: node for node in graph.node for value in node.output}
     nodes: list[NodeProto] = []
     constants: dict[str, list[int]] = {}
@@ -241,10 +244,3 @@ def _heads(node: NodeProto, shapes: Mapping[str, Sequence[int]]) -> tuple[int, i
         return None
     query, key = (shapes.get(value, ()) for value in node.input[:2])
     return (query[1], key[1]) if len(query) == len(key) == 4 and query[1] > 0 and key[1] > 0 else None
-
-
-def _shapes(graph: GraphProto) -> Mapping[str, tuple[int, ...]]:
-    return {
-        value.name: tuple(d.dim_value for d in value.type.tensor_type.shape.dim)
-        for value in [*graph.value_info, *graph.input, *graph.output]
-    }

@@ -162,6 +162,7 @@ def _ranks(groups: Sequence[int]) -> list[int]:
 
 
 def _shifted(w: GraphWriter, rows: str, steps: int) -> str:
+    """Each row's predecessor; the first row's is itself."""
     return w.op("Gather", rows, w.constant(np.maximum(np.arange(steps) - 1, 0)))
 
 

@@ -216,6 +216,7 @@ def _observed(main: GraphWriter, spec: PolicySpec, condition: str) -> str:
 
 
 def _zeros(main: GraphWriter, spec: PolicySpec, streams: str, count: int) -> str:
+    """``[D, B, count * T]``."""
     horizon, dimensions = spec.sample
     shape = main.op("Concat", main.constant([dimensions]), streams, main.constant([count * horizon]), axis=0)
     return main.op("ConstantOfShape", shape)

@@ -105,7 +105,7 @@ def card(
 ) -> str:
     """The text of ``README.md``."""
     manifest = artifact.manifest
-    base = _base(manifest)
+    base = None if (told := manifest.spec.source.get(BASE)) is None else read_name(told)
     head = {
         **({} if licence is None else {"license": licence}),
         **({} if base is None else {"base_model": base.repository, "base_model_relation": "quantized"}),
@@ -130,11 +130,6 @@ def card(
     ):
         lines += ["", *_markdown(section)]
     return "\n".join(lines) + "\n"
-
-
-def _base(manifest: Manifest) -> HubName | None:
-    told = manifest.spec.source.get(BASE)
-    return None if told is None else read_name(told)
 
 
 def _what(manifest: Manifest, base: HubName | None, licence: str | None) -> Section:
@@ -174,16 +169,15 @@ def _success(found: Sequence[Success]) -> Section:
             "Success", ("No success figures were given. Evaluate it on your own task before a robot moves.",)
         )
     rows = tuple(
-        (each.environment, each.variant, str(each.episodes), *(_shown(each.figures[k]) for k in ("success", "score")))
+        (
+            *(each.environment, each.variant, str(each.episodes)),
+            *("{:.3f} [{:.3f}, {:.3f}]".format(*each.figures[name]) for name in ("success", "score")),
+        )
         for each in found
     )
     head = ("task", "plan", "episodes", "success [95 % interval]", "score [95 % interval]")
     text = f"Intervals are of the bootstrap over episodes. The episodes ran on {found[0].machine}."
     return Section("Success", (text,), (Table(head, rows),))
-
-
-def _shown(figure: tuple[float, float, float]) -> str:
-    return "{:.3f} [{:.3f}, {:.3f}]".format(*figure)
 
 
 def _speed(measured: Sequence[Measurement], manifest: Manifest) -> Section:

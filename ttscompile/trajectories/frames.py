@@ -126,6 +126,7 @@ def few(names: Sequence[str]) -> str:
 
 
 def _flat(path: Path, name: str, array: Array) -> Array:
+    """Frames as ``[F, numbers]``."""
     if not array.ndim or not array.size:
         raise TrajectoryError(f"{path}: {name!r} is {list(array.shape)}; expected frames [F, ...] that are not empty.")
     return array.reshape(len(array), -1)

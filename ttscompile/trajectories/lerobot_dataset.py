@@ -124,6 +124,7 @@ def _images_or_numbers(path: Path, name: str, kind: Any) -> bool:
 
 
 def _rows(values: Any) -> Array:
+    """Numbers as ``[n, ...]``, of lists of lists a level at a time."""
     import pyarrow
     from pyarrow import compute
 

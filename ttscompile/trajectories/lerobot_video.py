@@ -69,7 +69,10 @@ def video_frames(
         raise TrajectoryError(f"{told}. Copy it again.")
     for file, group in groupby(wanted, key=lambda each: each[0]):
         with one_error(f"{path}: the video {file.relative_to(path)} cannot be decoded", ". Copy it again"):
-            yield from _at(file, [time for _, time in group], 0.5 / fps)
+            seconds = [time for _, time in group]
+            back = np.cumsum(np.diff(seconds, prepend=seconds[0]) < 0)  # where times go back the file is opened again
+            for _, rising in groupby(zip(seconds, back, strict=True), lambda each: each[1]):
+                yield from _forward(file, [time for time, _ in rising], 0.5 / fps)
 
 
 def _begins(path: Path, name: str, info: Mapping[str, Any], column: Column) -> dict[int, tuple[Path, float]]:
@@ -84,14 +87,6 @@ def _begins(path: Path, name: str, info: Mapping[str, Any], column: Column) -> d
         return {int(n): (folder / f"chunk-{int(c):03d}" / f"file-{int(f):03d}.mp4", float(t)) for n, c, f, t in rows}
     files = (path / "videos").glob(f"chunk-*/{name}/episode_*.mp4")
     return {int(file.stem.removeprefix("episode_")): (file, 0.0) for file in files}
-
-
-def _at(file: Path, times: Sequence[float], half: float) -> Iterator[Array]:
-    """The frames of a file at these times, each within half a frame; where times go back it is opened again."""
-    for _, rising in groupby(
-        zip(times, np.cumsum(np.diff(times, prepend=times[0]) < 0), strict=True), lambda each: each[1]
-    ):
-        yield from _forward(file, [time for time, _ in rising], half)
 
 
 def _forward(file: Path, times: Sequence[float], half: float) -> Iterator[Array]:

@@ -142,6 +142,7 @@ def _measure(
 
 
 def _fault(plan: PlanRecord, one: Engagement, cells: int) -> str:
+    """Why a plan is inert; empty if it is not."""
     shown = f"{one.executed:.2%} of the cells"
     if plan.kind == "all":
         alike = one.flops_saved <= 0 and not plan.precision and plan.tokens is None

@@ -213,6 +213,7 @@ class Paper(NothingAfter):
         return round(float(self._task.budget * (self._most / self._task.budget) ** left))
 
     def _logits(self, values: Mapping[str, Array] | Mapping[str, Tensor], calls: Calls) -> Tensor:
+        """What the head says, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.as_tensor(value) for name, value in values.items()}
         if self._observes:
             return self._task.executor.model.logits(calls.contexts, tensors)

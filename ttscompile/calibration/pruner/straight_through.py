@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from ...core.lattice import BoolArray, PlanArray, Source
-from ...runtimes.reference.model import Contexts
 from ...runtimes.reference.reuse import Caches, Cell, reuse
 from ..calls import Calls, IntArray
 from ..execute import Executor, State, latest_before
@@ -63,7 +62,8 @@ class Practice:
                 computed = self._dense[k][b].index_select(axis, there.to(stream.device)).to(stream.dtype)
                 takers = np.flatnonzero(column == Source.COMPUTE)
                 if len(takers):
-                    part = _block(executor, b, k, stream, calls.contexts, takers)
+                    own = takers.tolist() if len(takers) < calls.contexts.streams else None
+                    part = model.block(b, k, stream, calls.contexts, own)
                     computed = computed.index_copy(axis, torch.from_numpy(takers).to(stream.device), part)
                 if (before := _earlier(column, computed.detach(), axis, calls.window)) is not None:
                     caches.rollout[k, b] = before
@@ -92,13 +92,6 @@ def written(plans: PlanArray, window: int) -> BoolArray:
     earlier = np.zeros_like(computed)
     earlier[:, 1:] = np.logical_or.accumulate(computed, axis=1)[:, :-1]
     return np.asarray(earlier.reshape(plans.shape))
-
-
-def _block(executor: Executor, b: int, k: int, stream: Tensor, contexts: Contexts, takers: IntArray) -> Tensor:
-    """What the block computes for the streams that take it; for all, nothing has to be picked."""
-    if len(takers) == contexts.streams:
-        return executor.model.block(b, k, stream, contexts)
-    return executor.model.block(b, k, stream, contexts, takers.tolist())
 
 
 def _earlier(column: PlanArray, computed: Tensor, axis: int, window: int) -> Tensor | None:
