@@ -15,7 +15,7 @@ import pytest
 import record
 import torch
 from click.testing import CliRunner
-from environments import Environment, environment_class, environment_names
+from environments import Environment, disturbances, environment_class, environment_names
 from torch import nn
 
 import ttscompile
@@ -39,7 +39,15 @@ def missing(name: str) -> str | None:
     return package if package is not None and importlib.util.find_spec(package) is None else None
 
 
-@pytest.fixture(scope="module", params=environment_names())
+def all_names() -> Iterator[str]:
+    """Those whose package is missing are there without their disturbances, so that the tests say what is skipped."""
+    for name in environment_names():
+        yield name
+        if missing(name) is None:
+            yield from (f"{name}:{each}" for each in disturbances(name))
+
+
+@pytest.fixture(scope="module", params=all_names())
 def environment(request: pytest.FixtureRequest) -> Iterator[Environment]:
     if (package := missing(request.param)) is not None:
         pytest.skip(
@@ -135,6 +143,19 @@ def test_an_environment_without_its_package_names_the_extra(tmp_path: Path) -> N
     assert done.returncode == 2
     told = "error: the environment 'fetch' needs the package 'gymnasium_robotics', which is not installed."
     assert done.stderr == f"{told} Run: pip install 'ttscompile[examples]'.\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("pusht:edgy", "disturbance of the environment 'pusht': expected one of edge, noisy; found 'edgy'."),
+        ("metaworld:dark", "disturbance of the environment 'metaworld': it has none; found 'dark'."),
+    ],
+)
+def test_a_disturbance_that_is_none_is_named(name: str, told: str) -> None:
+    result = CliRunner().invoke(evaluate.main, ["nowhere", "--environment", name])
+    assert result.exception is not None
+    assert told in str(result.exception)
 
 
 def test_a_mistake_in_an_environment_is_no_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,9 @@
 """What a policy is evaluated in: what an environment has to offer, and which there are.
 
 A new one is one file in this folder, named as ``--environment`` calls it (``_`` for ``-``): a class that satisfies
-``Environment``, and the line ``ENVIRONMENT = TheClass``. ``fetch.py`` is a short one to start from. The tests hold
-every file here against the protocol.
+``Environment``, and the line ``ENVIRONMENT = TheClass``. ``fetch.py`` is a short one to start from. The folder
+``disturbed`` has environments in which something is not as it was in the recordings. The tests hold every file here
+against the protocol.
 
 An environment gives single frames and takes single actions. Windows of To frames, chunks of actions, batches, noise,
 the cache and the tables are the harness's; the specification of the policy says how windows are cut.
@@ -85,26 +86,63 @@ def environment_names() -> list[str]:
     return sorted(file.stem.replace("_", "-") for file in files)
 
 
-def environment_class(name: str) -> type[Environment]:
-    """The class of an environment; call it for one of your own.
+def disturbances(name: str) -> Mapping[str, type[Environment]]:
+    """What can be otherwise in an environment: a class by the name of each.
 
     Args:
         name: one of ``environment_names()``.
 
     Raises:
-        TtscompileError: a package that it needs is not installed.
+        TtscompileError: a package that the environment needs is not installed.
     """
+    if not (Path(__file__).parent / "disturbed" / f"{name.replace('-', '_')}.py").exists():
+        return {}
+    found: Mapping[str, type[Environment]] = _module(name, "disturbed.").DISTURBED
+    return found
+
+
+def environment_class(name: str) -> type[Environment]:
+    """The class of an environment; call it for one of your own.
+
+    Args:
+        name: one of ``environment_names()``; after a colon one of its ``disturbances``.
+
+    Raises:
+        TtscompileError: a package that it needs is not installed, or there is no such disturbance.
+    """
+    name, _, disturbance = name.partition(":")
+    if disturbance:
+        known = disturbances(name)
+        if disturbance not in known:
+            expected = f"expected one of {', '.join(known)}" if known else "it has none"
+            raise TtscompileError(f"disturbance of the environment {name!r}: {expected}; found {disturbance!r}.")
+        return known[disturbance]
+    found: type[Environment] = _module(name).ENVIRONMENT
+    return found
+
+
+def _module(name: str, folder: str = "") -> Any:
     try:
-        module = import_module(f"{__name__}.{name.replace('-', '_')}")
+        return import_module(f"{__name__}.{folder}{name.replace('-', '_')}")
     except ModuleNotFoundError as error:
         if (error.name or __name__).startswith(__name__):
             raise
         lacking = f"the environment {name!r} needs the package {error.name!r}, which is not installed"
         raise TtscompileError(f"{lacking}. Run: pip install 'ttscompile[examples]'.") from error
-    found: type[Environment] = module.ENVIRONMENT
-    return found
+
+
+class _Name(click.Choice[str]):
+    """``NAME`` or ``NAME:DISTURBANCE``; of the latter the class is asked, since to list them imports a simulator."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        name, colon, disturbance = str(value).partition(":")
+        return str(super().convert(name, param, ctx)) + colon + disturbance
 
 
 environment_option = click.option(
-    "--environment", default="pusht", show_default=True, type=click.Choice(environment_names()), help="What to drive."
+    "--environment",
+    default="pusht",
+    show_default=True,
+    type=_Name(environment_names()),
+    help="What to drive; NAME:DISTURBANCE for what was never recorded.",
 )

@@ -1,15 +1,19 @@
-"""Push-T from where no recording begins: the block starts closer to a wall than gym-pusht puts it."""
+"""Push-T from where no recording begins, and with a sensor that errs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
-from .pusht import PushT, keypoints
+from .. import Frame
+from ..pusht import PushT, keypoints
 
 NEAREST, RECORDED = 20.0, (100.0, 400.0)
 """Pixels: every keypoint is that far from the walls; where gym-pusht puts the block, in x and in y."""
+NOISE = 4.0
+"""Pixels, standard deviation of what every number of a frame is off by; the demonstrations have none."""
 
 
 class PushTEdge(PushT):
@@ -33,4 +37,25 @@ def begun_at_the_edge(seed: int) -> list[float]:
             return [*agent.tolist(), *block.tolist(), float(angle)]
 
 
-ENVIRONMENT = PushTEdge
+class PushTNoisy(PushT):
+    """See ``PushT``, from which only what is observed differs."""
+
+    title = f"Push-T, observed with errors of {NOISE:.0f} px"
+
+    def reset(self, seed: int, state: Sequence[float] | None = None) -> None:
+        """Start the episode of this seed, which decides the errors, too."""
+        super().reset(seed, state)
+        self._frame = [seed, 0]
+
+    def observe(self) -> Frame:
+        """As ``PushT`` has it, with errors."""
+        errors = np.random.default_rng(self._frame).normal(0, NOISE, 20).astype(np.float32)
+        return {key: exact + errors for key, exact in super().observe().items()}
+
+    def step(self, action: npt.ArrayLike) -> None:
+        """See ``PushT``."""
+        super().step(action)
+        self._frame[1] += 1
+
+
+DISTURBED = {"edge": PushTEdge, "noisy": PushTNoisy}

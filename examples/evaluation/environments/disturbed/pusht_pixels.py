@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .pusht_pixels import PushTPixels
+from ..pusht_pixels import PushTPixels
 
 RED = (205, 92, 92, 255)
 
@@ -21,4 +21,4 @@ class PushTPixelsRed(PushTPixels):
             shape.color = RED
 
 
-ENVIRONMENT = PushTPixelsRed
+DISTURBED = {"red": PushTPixelsRed}
