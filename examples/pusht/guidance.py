@@ -199,7 +199,7 @@ def opened(text: str, seam: str, checkpoint: Path) -> Variant:
 
 def play(way: Way, checkpoint: Path, seeds: Sequence[int]) -> list[Driven]:
     """Some episodes."""
-    return [drive(opened(way.variant, way.seam, checkpoint), way.setup(), seed) for seed in seeds]
+    return [drive(PushT, opened(way.variant, way.seam, checkpoint), way.setup(), seed) for seed in seeds]
 
 
 def roughness(rollout: Sequence[Driven]) -> list[float]:

@@ -1,4 +1,4 @@
-"""Push-T under ``AsyncExecutor`` with a latency that is given: nothing waits, and every run is the same.
+"""A world under ``AsyncExecutor`` with a latency that is given: nothing waits, and every run is the same.
 
 The world takes one step a tick, whether there is an action or not; a call of the policy takes as long as it is told to,
 on a clock of the simulation. The machine's speed has no part in what comes out.
@@ -7,12 +7,11 @@ on a clock of the simulation. The machine's speed has no part in what comes out.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from environments import Array
-from environments.pusht import PushT
+from environments import Array, Environment
 from rollout import Episode, Recorder
 from variants import Variant, seeded_noise
 
@@ -180,7 +179,7 @@ class Driven:
 
     Attributes:
         episode: what happened.
-        still: ticks without any action, in which the agent was told to stay where it is; those before the first chunk
+        still: ticks without any action, in which the robot was told to stay where it is; those before the first chunk
             are among them.
         bridged: ticks with an action in reserve or with the last one held, because a chunk was late.
         age: ticks from the observation that an action was computed from to when it was executed, median; None if there
@@ -195,16 +194,17 @@ class Driven:
     stalls: int = 0
 
 
-def drive(variant: Variant, setup: Setup, seed: int) -> Driven:
-    """Run one episode. The world never waits, not for the first chunk either: the agent stands still until it comes.
+def drive(make: Callable[[], Environment], variant: Variant, setup: Setup, seed: int) -> Driven:
+    """Run one episode. The world never waits, not for the first chunk either: the robot stands still until it comes.
 
     Args:
+        make: the world.
         variant: policy and plan.
         setup: how it is driven.
         seed: of the initial state and of the noise.
     """
     plan = variant.plan or variant.policy.info.default_plan
-    clock, world = LockStepClock(), Recorder(PushT(), seed)
+    clock, world = LockStepClock(), Recorder(make(), seed)
     latency = setup.latency_ms / 1e3
     policy = DelayedPolicy(variant, clock, latency)
     settings = setup.settings(plan)

@@ -57,7 +57,7 @@ class Telling:
 def played(setup: Setup, ticks: int, seed: int = 3) -> tuple[list[tuple[int, int] | None], Driven, Telling]:
     """Number of the call and index in its chunk of the first actions; None where the agent stood still."""
     policy: Any = Telling()
-    driven = drive(Variant("telling", policy, None, SHAPE), setup, seed)
+    driven = drive(PushT, Variant("telling", policy, None, SHAPE), setup, seed)
     world, told = Recorder(PushT(), seed), []
     for action in driven.episode.actions[:ticks]:
         still = np.array_equal(action, world.environment.rest())
@@ -133,7 +133,7 @@ def test_a_run_can_be_repeated() -> None:
 def test_a_policy_that_fails_is_an_error_at_once() -> None:
     failing: Any = Telling(2)
     with pytest.raises(WorkerDeadError, match="ZeroDivisionError: scripted"):
-        drive(Variant("telling", failing, None, SHAPE), setup(2), seed=0)
+        drive(PushT, Variant("telling", failing, None, SHAPE), setup(2), seed=0)
 
 
 def test_a_policy_that_stands_still_is_counted_and_goes_on_with_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +170,7 @@ def test_the_table_and_the_picture(tmp_path: Path) -> None:
     assert (made.calls, made.age, made.still, made.bridged) == (6.0, 3.0, 0.25, 0.5)
     text = io.StringIO()
     baseline = summarise("the world waits", waiting, waiting)
-    Console(file=text, width=200).print(delays_table(found, baseline))
+    Console(file=text, width=200).print(delays_table("Push-T", found, baseline))
     for told in ("the world waits", "prefix, margin 0, horizon 8", "-0.250 [-0.500, 0.000]", "25.0%", "50.0%", "6.0"):
         assert told in text.getvalue()
     scores = {each: Estimate(0.5, 0.4, 0.6) for each in found}

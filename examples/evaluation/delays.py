@@ -1,11 +1,11 @@
 """What latency does to a policy that is played by the executor, and what seam, margin and horizon do about it.
 
-    python examples/pusht/delays.py DIR --hz 50 --latency-ms 0,20,40,80 --seams replace,blend,prefix
+    python examples/evaluation/delays.py DIR --hz 50 --latency-ms 0,20,40,80 --seams replace,blend,prefix
 
-The world takes a step each tick and never waits, not for the first chunk of an episode either: the agent stands still
+The world takes a step each tick and never waits, not for the first chunk of an episode either: the robot stands still
 until it comes. A call takes as long as ``--latency-ms`` says, in simulated time, so the result is the same on every
 machine and no time is spent waiting. Latencies that are too long for the loop are played too: where there is no action,
-the agent stays where it is. Seeds and differences are as in ``evaluate.py``; the baseline is the policy for which the
+the robot stays where it is. Seeds and differences are as in ``evaluate.py``; the baseline is the policy for which the
 world waits, and which executes all actions of a chunk.
 """
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -24,21 +23,19 @@ from typing import Any, TypeVar
 
 import click
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
-
-from ttscompile.cli.output import identity_of, print_identity
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "evaluation"))
 from delays_plot import plot_delays
 from delays_world import Driven, Setup, drive
-from environments.pusht import PushT
+from environments import environment_class, environment_option
 from episodes import Episodes
 from evaluate import Evaluation, summarise
 from jobs import Processes, fill_cache
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
 from rollout import Rollout, run_episodes
-from variants import cache_option, first_seed_option, open_variant, results_console, run, runtime_option
+from variants import cache_folder, cache_option, first_seed_option, open_variant, results_console, run, runtime_option
+
+from ttscompile.cli.output import identity_of, print_identity
 
 T = TypeVar("T")
 SEEDS_A_JOB = 4
@@ -46,6 +43,7 @@ _opened = lru_cache(open_variant)  # one for each process
 
 
 def drive_all(
+    environment: str,
     text: str,
     runtime: str,
     setups: Sequence[Setup],
@@ -56,6 +54,7 @@ def drive_all(
     """Run every setup on every seed.
 
     Args:
+        environment: its name.
         text: artifact and plan, as ``open_variant`` takes them.
         runtime: of ``ttscompile.load``; each process has one thread of arithmetic.
         setups: to run.
@@ -67,7 +66,7 @@ def drive_all(
     found: dict[tuple[Setup, int], Driven] = {}
     # A fork of a process that has threads of onnxruntime would wait for them for ever.
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        running = {pool.submit(_drive, text, runtime, setup, some): setup for setup, some in parts}
+        running = {pool.submit(_drive, environment, text, runtime, setup, some): setup for setup, some in parts}
         for future in as_completed(running):
             for driven in future.result():
                 found[running[future], driven.episode.seed] = driven
@@ -75,9 +74,10 @@ def drive_all(
     return {setup: [found[setup, seed] for seed in seeds] for setup in setups}
 
 
-def _drive(text: str, runtime: str, setup: Setup, seeds: Sequence[int]) -> list[Driven]:
+def _drive(environment: str, text: str, runtime: str, setup: Setup, seeds: Sequence[int]) -> list[Driven]:
     """Some episodes of one setup."""
-    return [drive(_opened(text, runtime, 1), setup, seed) for seed in seeds]
+    make = environment_class(environment)
+    return [drive(make, _opened(text, runtime, 1), setup, seed) for seed in seeds]
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,11 @@ def figures(setup: Setup, driven: Sequence[Driven], baseline: Rollout) -> Figure
     )
 
 
-def delays_table(found: dict[Setup, Figures], baseline: Evaluation) -> Table:
+def delays_table(world: str, found: dict[Setup, Figures], baseline: Evaluation) -> Table:
     """The figures, a setup a row, and the synchronous policy first."""
     episodes = baseline.rollout.episodes
-    table = Table(
-        title=f"Push-T, {len(episodes)} episodes, seeds {episodes[0].seed}..{episodes[-1].seed}, mean and 95 % interval"
-    )
+    seeds = f"seeds {episodes[0].seed}..{episodes[-1].seed}"
+    table = Table(title=f"{world}, {len(episodes)} episodes, {seeds}, mean and 95 % interval")
     table.add_column("latency, ms", justify="right")
     table.add_column("setup")
     columns = "score", "success", "score, difference", "calls", "age, ticks", "bridged", "standing still", "watchdog"
@@ -174,6 +173,7 @@ def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
 
 @click.command()
 @click.argument("variant", metavar="DIR[:PLAN]")
+@environment_option
 @click.option("--latency-ms", "latencies", default="0,30,60,300,600", show_default=True, callback=several(float))
 @click.option(
     "--seams", default="replace", show_default=True, callback=several(str), help="replace, blend, ensemble, prefix."
@@ -194,7 +194,7 @@ def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
     callback=several(float),
     help="Seconds without movement after which one call is dense and from nothing; 0: no watchdog.",
 )
-@click.option("--hz", default=10.0, show_default=True, type=click.FloatRange(min=0.1), help="Ticks a second.")
+@click.option("--hz", type=click.FloatRange(min=0.1), help="Ticks a second; without this option the world's own.")
 @click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
 @first_seed_option
 @runtime_option
@@ -204,12 +204,13 @@ def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
 @click.option("--json", "as_json", is_flag=True, help="One JSON document instead of a table.")
 def main(
     variant: str,
+    environment: str,
     latencies: list[float],
     seams: list[str],
     margins: list[int],
     horizons: list[int],
     watchdogs: list[float],
-    hz: float,
+    hz: float | None,
     episodes: int,
     first_seed: int,
     runtime: str,
@@ -219,7 +220,9 @@ def main(
     as_json: bool,
 ) -> None:
     """Drive the policy of DIR through the executor with latencies that are given, and compare with waiting for it."""
-    opened, cache = open_variant(variant, runtime, 1), cache or Path("build", "pusht", "episodes")
+    opened, cache = open_variant(variant, runtime, 1), cache or cache_folder(environment)
+    make = environment_class(environment)
+    hz = hz or make.hz
     seeds = range(first_seed, first_seed + episodes)
     setups = [
         Setup(latency, seam, margin, horizon or None, hz, watchdog or None)
@@ -234,15 +237,17 @@ def main(
         def waited(_: str, count: int) -> None:
             progress.update(waiting, completed=count)
 
-        fill_cache("pusht", [variant], seeds, SEEDS_A_JOB, runtime, cache, Processes(jobs), waited)
-        kept = Episodes(cache, "pusht", opened, runtime)
-        rollout = run_episodes(PushT, opened, seeds, SEEDS_A_JOB, cache=kept)
-        driven = drive_all(variant, runtime, setups, seeds, jobs, lambda n: progress.update(going, completed=n))
+        fill_cache(environment, [variant], seeds, SEEDS_A_JOB, runtime, cache, Processes(jobs), waited)
+        kept = Episodes(cache, environment, opened, runtime)
+        rollout = run_episodes(make, opened, seeds, SEEDS_A_JOB, cache=kept)
+        driven = drive_all(
+            environment, variant, runtime, setups, seeds, jobs, lambda n: progress.update(going, completed=n)
+        )
     baseline = summarise("the world waits", rollout, rollout)
     found = {setup: figures(setup, each, rollout) for setup, each in driven.items()}
     identity = identity_of(Path(variant.partition(":")[0]))
     if picture is not None:
-        title = f"Push-T at {hz:g} Hz, {episodes} paired episodes of {variant}; latency simulated"
+        title = f"{make.title} at {hz:g} Hz, {episodes} paired episodes of {variant}; latency simulated"
         scores = {setup: each.evaluation.score for setup, each in found.items()}
         plot_delays(scores, baseline.score, picture, title)
     if as_json:
@@ -251,7 +256,7 @@ def main(
         click.echo(json.dumps(document, indent=2, allow_nan=False))
     else:
         console = results_console()
-        console.print(delays_table(found, baseline))
+        console.print(delays_table(make.title, found, baseline))
         print_identity(identity, console)
 
 
