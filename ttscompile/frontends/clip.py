@@ -55,7 +55,7 @@ class TowerConfig:
     def __post_init__(self) -> None:
         settings = Settings(vars(self), "CLIP's ")
         for field in fields(self):
-            if field.type == "int":
+            if field.type == "int" and (field.name, vars(self)[field.name]) != ("eos_token_id", 0):  # the first token
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
         settings.choice("hidden_act", *ACTIVATIONS)
         if self.hidden_size % self.num_attention_heads:
@@ -317,9 +317,9 @@ class ClipText(nn.Module):
         """See the class."""
         length = tokens.shape[1]
         square = torch.ones(length, length, dtype=torch.bool)
-        # Padding sees at least itself: an attention to nothing is not the same number everywhere. Nobody sees it.
-        allowed = (square.tril() & mask[:, None, None, :]) | torch.eye(length, dtype=torch.bool)
-        added = torch.where(allowed, 0.0, torch.finfo(torch.float32).min)
+        # Padding before a text sees itself: attention to nothing is not the same number everywhere. Nobody sees it.
+        alone = torch.eye(length, dtype=torch.bool) & ~mask[:, None, None, :1]
+        added = torch.where(square.tril() & mask[:, None, None, :] | alone, 0.0, torch.finfo(torch.float32).min)
         features = self.final_layer_norm(self.encoder(self.embeddings(tokens), added))
         ids = tokens.to(torch.int32)  # ArgMax of ONNX knows no int64
         end = (ids if self.end == 2 else (ids == self.end).to(torch.int32)).argmax(dim=-1)
