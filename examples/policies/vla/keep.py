@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
 
 from environments.fetch_blocks import TASKS, FetchBlocks
-from model import NAME
+from smolvla import NAME
 
 SEED = 200_000
 LANGUAGE_MODEL = ("config.json", "tokenizer.json", "tokenizer_config.json")

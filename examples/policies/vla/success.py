@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.policies.factory import make_pre_post_processors
-from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.pretrained import PreTrainedPolicy
 
 sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
 
@@ -28,7 +29,7 @@ from environments.fetch_blocks import SEEN, TASKS, UNSEEN, FetchBlocks, instruct
 FIRST = 100_000
 
 
-def episodes(policy: SmolVLAPolicy, processors: Any, seeds: Sequence[int], words: str) -> dict[str, list[bool]]:
+def episodes(policy: PreTrainedPolicy, processors: Any, seeds: Sequence[int], words: str) -> dict[str, list[bool]]:
     """Drive these episodes in lockstep; success by task.
 
     Args:
@@ -40,6 +41,7 @@ def episodes(policy: SmolVLAPolicy, processors: Any, seeds: Sequence[int], words
     before, after = processors
     worlds = [FetchBlocks() for _ in seeds]
     torch.manual_seed(seeds[0])
+    policy.reset()
     for world, seed in zip(worlds, seeds, strict=True):
         world.phrasings = UNSEEN if words == "unseen" else SEEN
         world.reset(seed)
@@ -53,9 +55,10 @@ def episodes(policy: SmolVLAPolicy, processors: Any, seeds: Sequence[int], words
             if not key.startswith("observation.language")
         }
         given["task"] = [world.instruction for world in worlds]
-        chunks = after(policy.predict_action_chunk(before(given))).numpy()
-        for world, chunk in zip(worlds, chunks, strict=True):
-            for action in chunk[: policy.config.n_action_steps]:
+        batch = before(given)
+        for _ in range(policy.config.n_action_steps):  # a chunk is computed in the first of these, and then taken from
+            actions = after(policy.select_action(batch)).numpy()
+            for world, action in zip(worlds, actions, strict=True):
                 if not world.done:
                     world.step(action)
     found = dict[str, list[bool]]()
@@ -78,7 +81,7 @@ def main() -> None:
     log = None if given.log is None else given.log.resolve()
     os.chdir(given.out)
     update = json.loads(Path("policy/update.json").read_text())["update"]
-    policy = SmolVLAPolicy.from_pretrained("policy").eval()
+    policy = get_policy_class(PreTrainedConfig.from_pretrained("policy").type).from_pretrained("policy").eval()
     processors = make_pre_post_processors(policy.config, pretrained_path="policy")
     began, done = time.perf_counter(), dict[str, list[bool]]()
     for number in range(given.episodes):

@@ -1,10 +1,9 @@
-"""Train lerobot's ``smolvla`` from nothing on the demonstrations, on one or several processors; resumes where it was.
+"""Train a policy of lerobot's from nothing on the demonstrations, on one or several processors; resumes where it was.
 
-    OMP_NUM_THREADS=1 python examples/policies/vla/train.py DEMOS OUT --updates 16000 --decay 6000 --processes 2
+    OMP_NUM_THREADS=1 python examples/policies/vla/train.py smolvla DEMOS OUT --updates 6000 --decay 3500
 
-The network, its processors and its files are lerobot's. The loss is that of ``SmolVLAPolicy.forward``, computed as
-inference does it, the prefix first: so one prefix, which is most of the work, serves several noises and times. Beside
-it the network learns in training to say where the blocks are, from what the expert reads of the state's token.
+The networks, their losses, processors and files are lerobot's. One observation, whose encoding is most of the work,
+serves several noises and times. Beside its loss a network learns in training to say where the blocks are.
 """
 
 from __future__ import annotations
@@ -24,26 +23,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from lerobot.policies.common.vla_utils import make_att_2d_masks
-from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors
 from torch import Tensor, nn
 from torch import distributed as dist
 from torch.multiprocessing.spawn import spawn
-from torch.nn import functional
 
 sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
+os.environ["MUJOCO_GL"] = "disable"  # nothing is drawn, and the LLVM of OSMesa breaks that of triton
 
+from dit import MultiTaskDiT
 from environments.fetch_blocks import COLOURS, TASKS, instruction
-from model import NAME, configuration, save_language_model
+from learner import CHUNK, UNIT, Learner, Statistics
+from smolvla import SmolVLA
 
-WIDTH, LAYERS, PATCH = 96, 4, 12
-CHUNK = 16
-REPEATS = 4
-"""Noises and times for one prefix."""
 WARM_UP, SMOOTHING, AUXILIARY, REPORTED = 300, 0.999, 0.5, 50
-UNIT, MIDDLE = 0.1, (1.31, 0.75, 0.42)
-"""Metres, of what the network says about blocks."""
 
 Batch = tuple[dict[str, Any], Tensor, Tensor]
 
@@ -68,12 +60,13 @@ class Demonstrations:
                 scenes.setdefault(scene, []).append((path.name, begin, count, task))
             self.scenes += list(scenes.values())
 
-    def statistics(self) -> dict[str, dict[str, Tensor]]:
-        """Mean and deviation of state and action, over all that is there."""
+    def statistics(self) -> Statistics:
+        """Of state and action, over all that is there."""
         found = {}
         for key, name in (("observation.state", "state"), ("action", "action")):
             rows = np.concatenate([folder[name] for folder in self.folders.values()]).astype(np.float64)
-            found[key] = {"mean": torch.tensor(rows.mean(0)).float(), "std": torch.tensor(rows.std(0)).float()}
+            told = {"mean": rows.mean(0), "std": rows.std(0), "min": rows.min(0), "max": rows.max(0)}
+            found[key] = {name: torch.tensor(value).float() for name, value in told.items()}
         return found
 
     def batch(self, size: int, random: np.random.Generator) -> Batch:
@@ -107,74 +100,17 @@ class Demonstrations:
         return given, torch.from_numpy(np.stack(padding[:size])), torch.from_numpy(np.stack(places[:size]))
 
 
-class Places(nn.Module):
-    """Says where the blocks are: of training alone.
-
-    From what the last layer of the language model reads of the state's token, which has heard the instruction; and, so
-    that the eyes learn first, from the mean of the tokens of each picture.
-    """
-
-    def __init__(self, policy: SmolVLAPolicy) -> None:
-        super().__init__()
-        self.head = nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, WIDTH), nn.GELU(), nn.Linear(WIDTH, 12))
-        self.eyes = nn.ModuleList(nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 9)) for _ in ("front", "wrist"))
-        model: Any = policy.model.vlm_with_expert.vlm.model
-        model.text_model.layers[-1].input_layernorm.register_forward_pre_hook(self._keep)
-        model.connector.register_forward_hook(self._keep_picture)
-        self._read: Tensor | None = None
-        self._pictures: list[Tensor] = []
-
-    def _keep(self, _: nn.Module, given: tuple[Tensor]) -> None:
-        self._read = given[0][:, -1]
-
-    def _keep_picture(self, _: nn.Module, __: tuple[Tensor], tokens: Tensor) -> None:
-        self._pictures = [*self._pictures[-1:], tokens.mean(1)]
-
-    def forward(self, offsets: Tensor, grip: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors of the state's token and of the pictures, of the prefix that was computed last.
-
-        Args:
-            offsets: ``[B, 4, 3]``, in ``UNIT``: from the grip to the block that was asked for, and to all three.
-            grip: ``[B, 3]``, metres. The fixed camera says where blocks are, that on the gripper where from the grip.
-        """
-        assert self._read is not None
-        told = functional.smooth_l1_loss(self.head(self._read), offsets.flatten(1))
-        from_grip = offsets[:, 1:]
-        fixed = from_grip + (grip - torch.tensor(MIDDLE))[:, None] / UNIT
-        pairs = zip(self.eyes, self._pictures, (fixed, from_grip), strict=True)
-        seen = sum(functional.smooth_l1_loss(eye(picture), wanted.flatten(1)) for eye, picture, wanted in pairs)
-        return told, torch.as_tensor(seen)
-
-
-def flow_loss(policy: SmolVLAPolicy, batch: dict[str, Tensor], padding: Tensor, repeats: int) -> Tensor:
-    """Mean squared error of the velocity, over actions that are some."""
-    model = policy.model
-    actions = policy.prepare_action(batch)
-    images, seen = policy.prepare_images(batch)
-    tokens, counted = (batch[f"observation.language.{name}"] for name in ("tokens", "attention_mask"))
-    embedded, valid, groups = model.embed_prefix(images, seen, tokens, counted, state=policy.prepare_state(batch))
-    _, cache = model.vlm_with_expert.forward(
-        attention_mask=make_att_2d_masks(valid, groups),
-        position_ids=torch.cumsum(valid, dim=1) - 1,
-        past_key_values=None,
-        inputs_embeds=[embedded, None],
-        use_cache=True,
-    )
-    cache.batch_repeat_interleave(repeats)
-    actions, valid, padding = (value.repeat_interleave(repeats, 0) for value in (actions, valid, padding))
-    times, noise = model.sample_time(len(actions), actions.device), torch.randn_like(actions)
-    shares = times[:, None, None]
-    velocity = model.denoise_step(valid, cache, shares * noise + (1 - shares) * actions, times)
-    errors = functional.mse_loss(velocity, noise - actions, reduction="none")[
-        :, :, : policy.config.action_feature.shape[0]
-    ]
-    return (errors.mean(2) * ~padding).sum() / (~padding).sum()
+LEARNERS: dict[str, type[Learner]] = {
+    "smolvla": SmolVLA,
+    "multi_task_dit": MultiTaskDiT,
+}
 
 
 @dataclass
 class Settings:
     """What the command line says."""
 
+    policy: str
     demos: Path
     out: Path
     updates: int
@@ -204,11 +140,10 @@ class Training:
 
     def __init__(self, settings: Settings) -> None:
         torch.manual_seed(settings.seed)
-        self.policy = SmolVLAPolicy(configuration(LAYERS)).train()
-        self.policy.requires_grad_(True)  # lerobot would leave the last layer of the language model as it was drawn
-        self.places = Places(self.policy)
-        self.processors = make_smolvla_pre_post_processors(self.policy.config, torch.load("statistics.pt"))
-        self.parameters = [*self.policy.parameters(), *self.places.parameters()]
+        self.learner = LEARNERS[settings.policy](torch.load("statistics.pt"))
+        self.policy, self.places = self.learner.policy, self.learner.places
+        every = [*self.policy.parameters(), *self.places.parameters()]
+        self.parameters = [parameter for parameter in every if parameter.requires_grad]
         how: dict[str, Any] = {"betas": (0.9, 0.95), "weight_decay": 1e-4, "fused": True}
         self.optimizer = torch.optim.AdamW(self.parameters, settings.rate, **how)
         self.smoothed = {name: value.clone() for name, value in self.policy.state_dict().items()}
@@ -225,10 +160,9 @@ class Training:
         for group in self.optimizer.param_groups:
             group["lr"] = rate(settings, self.done)
         grip = given["observation.state"][:, :3].clone()
-        loss = flow_loss(self.policy, self.processors[0](given), padding, REPEATS)
-        told, seen = self.places(offsets, grip)
+        loss, *others = self.learner.losses(self.learner.processors[0](given), padding, offsets, grip)
         self.optimizer.zero_grad(set_to_none=True)
-        (loss + AUXILIARY * (told + seen)).backward()
+        (loss + AUXILIARY * sum(others)).backward()
         averaged(self.parameters, settings.processes)
         nn.utils.clip_grad_norm_(self.parameters, 1.0)
         self.optimizer.step()
@@ -238,7 +172,7 @@ class Training:
                 mean = self.smoothed[name]
                 mean.lerp_(value, 1 - share) if value.is_floating_point() else mean.copy_(value)
         self.done += 1
-        return [loss.item(), told.item(), seen.item()]
+        return [each.item() for each in (loss, *others)]
 
     def save(self) -> None:
         """Write the state, and the smoothed policy as lerobot's directory ``policy``; each is replaced as a whole."""
@@ -250,7 +184,7 @@ class Training:
         part, at = Path("policy.part"), Path("policy")
         shutil.rmtree(part, ignore_errors=True)
         self.policy.save_pretrained(part)
-        for processor in self.processors:
+        for processor in self.learner.processors:
             processor.save_pretrained(part)
         self.policy.load_state_dict(present)
         (part / "update.json").write_text(json.dumps({"update": self.done}))
@@ -287,7 +221,7 @@ def work(rank: int, settings: Settings) -> None:
         dist.init_process_group("gloo", init_method=address, rank=rank, world_size=settings.processes)
     demonstrations = Demonstrations(settings.demos)
     if rank == 0 and not Path("statistics.pt").exists():
-        save_language_model(Path(NAME), WIDTH, LAYERS, PATCH)
+        LEARNERS[settings.policy].prepare()
         torch.save(demonstrations.statistics(), "statistics.pt")
     if settings.processes > 1:
         dist.barrier()
@@ -318,10 +252,11 @@ def report(done: int, losses: list[list[float]], seconds: float, updates: int, s
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy", choices=sorted(LEARNERS))
     parser.add_argument("demos", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--updates", type=int, default=16_000)
-    parser.add_argument("--decay", type=int, default=6_000, help="updates at the end in which the rate goes down")
+    parser.add_argument("--updates", type=int, default=6_000)
+    parser.add_argument("--decay", type=int, default=3_500, help="updates at the end in which the rate goes down")
     parser.add_argument("--batch", type=int, default=32, help="frames of one process")
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--processes", type=int, default=2)
