@@ -27,6 +27,7 @@ from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.task import Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 
+from .dense import dense_steps, some_calls
 from .fixed import best_of, fixed
 
 Scores = npt.NDArray[np.float64]
@@ -44,7 +45,7 @@ FEED_FORWARD = "feed_forward"
 def bac(task: Task) -> Found:
     """The schedule of the scheduler and the union."""
     model = task.executor.model
-    calls, run = task.some_calls(DENSE_CALLS), task.executor
+    calls, run = some_calls(task, DENSE_CALLS), task.executor
     found = [dense_statistics(run, run.select(calls, [i])) for i in task.clock.in_time(range(calls.count))]
     similarity, change = (np.mean([one[part] for one in found], axis=0) for part in range(2))
     most = min(model.steps, task.budget // model.blocks + 1)
@@ -162,7 +163,7 @@ def dense_statistics(executor: Executor, calls: Calls) -> tuple[Scores, Scores]:
 def dense_residuals(executor: Executor, calls: Calls) -> list[Tensor]:
     """What each block adds at every step of dense calls: ``[N, K, size]`` a block."""
     kept: list[list[Tensor]] = [[] for _ in executor.axes]
-    for _, residuals in executor.dense_steps(calls):
+    for _, residuals in dense_steps(executor, calls):
         for rows, residual, axis in zip(kept, residuals, executor.axes, strict=True):
             rows.append(residual.movedim(axis, 0).flatten(1))
     return [torch.stack(rows, 1) for rows in kept]

@@ -16,6 +16,8 @@ from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 
+from .dense import some_calls
+
 POPULATION, GENERATIONS = 30, 100
 
 TOURNAMENT, CROSSOVER, MUTATION = 3, 0.8, 0.1
@@ -102,7 +104,7 @@ class Evo(NothingAfter):
 
     def _measure(self, computed: BoolArray) -> Array:
         """Mean error of each plan; infinite where there was no time for it."""
-        calls, errors = self._task.some_calls(MEASURED), np.full(len(computed), np.inf)
+        calls, errors = some_calls(self._task, MEASURED), np.full(len(computed), np.inf)
         for i in self._task.clock.in_time(range(len(computed))):
             errors[i] = self._task.error(_plan(computed[i]), calls)
         return errors

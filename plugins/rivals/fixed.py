@@ -12,6 +12,8 @@ import numpy as np
 from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import PlanArray, dense_plan
 
+from .dense import some_calls
+
 COMPARED = 16
 """Calls on which candidates are compared; fewer if there are fewer."""
 
@@ -61,7 +63,7 @@ def fixed(choose: Callable[[Task], Found]) -> Callable[[Task], Fixed]:
 
 def best_of(task: Task, candidates: Sequence[tuple[PlanArray, Mapping[str, Any]]]) -> Found:
     """The candidate with the lowest error of some of the calls to learn from; the first of equals."""
-    calls = task.some_calls(COMPARED)
+    calls = some_calls(task, COMPARED)
     errors = [task.error(plan, calls) for plan, _ in task.clock.in_time(candidates)]
     best = int(np.argmin(errors))
     return Found(*candidates[best], error=errors[best])

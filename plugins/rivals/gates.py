@@ -24,6 +24,7 @@ import numpy.typing as npt
 from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, uniform_plan
 
+from .dense import some_calls
 from .fixed import COMPARED
 from .slopes import slopes
 
@@ -79,7 +80,7 @@ class Gates(NothingAfter):
         gradient = slopes(task.executor, task.actions, self._cells(self._room(interval)), self._reuse, calls)
         self._step(gradient.astype(np.float64), interval)
         plan = self._cells(task.budget)
-        error = task.error(plan, task.some_calls(COMPARED))
+        error = task.error(plan, some_calls(task, COMPARED))
         if not error >= self.loss:  # also if nothing was measured before
             self.plan, self.loss = plan, error
         self._interval = interval + 1

@@ -35,6 +35,7 @@ from ttscompile.calibration.task import Array, Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
 
+from .dense import dense_steps, some_calls
 from .fixed import COMPARED, best_of, fixed
 
 HALVINGS, DOUBLINGS = 9, 20
@@ -221,7 +222,7 @@ def fit_threshold(
 
 def online(task: Task, proposed: Sequence[tuple[Criterion, float]]) -> Found:
     """Fit every criterion that is proposed, take the best, and fit it again on more calls."""
-    probes, some, more = task.clock.in_time(repeat(None)), task.some_calls(COMPARED), task.some_calls(COUNTED)
+    probes, some, more = task.clock.in_time(repeat(None)), some_calls(task, COMPARED), some_calls(task, COUNTED)
     fitted = [fit_threshold(task, criterion, some, 0.0, start, probes) for criterion, start in proposed]
     kept = [one for one in fitted if one is not None]
     if not kept:
@@ -303,7 +304,7 @@ def teacache(task: Task) -> Found:
 
 def proposal(task: Task) -> Sequence[tuple[Criterion, float]]:
     """The criterion, and a threshold to begin with."""
-    calls = task.some_calls(DENSE_CALLS)
+    calls = some_calls(task, DENSE_CALLS)
     before, after = dense_changes(task.executor, calls)
     # A policy of fewer steps than coefficients has fewer pairs to fit.
     degree = max(0, min(DEGREE, len(np.unique(before)) - 1))
@@ -320,7 +321,7 @@ def dense_changes(executor: Executor, calls: Calls) -> tuple[Array, Array]:
         Two arrays ``[(K - 1) * N]``.
     """
     seen = []
-    for stem, residuals in executor.dense_steps(calls):
+    for stem, residuals in dense_steps(executor, calls):
         seen.append([value.movedim(executor.axes[0], 0).cpu().numpy() for value in (stem, sum(residuals, stem))])
     changes = [[relative_change(b, a) for a, b in zip(*pair, strict=True)] for pair in pairwise(seen)]
     before, after = (np.concatenate([pair[i] for pair in changes]) for i in range(2))

@@ -113,18 +113,6 @@ class Executor:
         with torch.no_grad():
             return torch.stack(list(self.corrected(None)._samples(self._dense, calls)), 1)
 
-    @torch.no_grad()
-    def dense_steps(self, calls: Calls) -> Iterator[tuple[Tensor, list[Tensor]]]:
-        """Step by step, the stream after the stem of dense calls, and what each block adds to it."""
-        state, stems = State(), list[Tensor]()
-
-        def blocks(k: int, stem: Tensor) -> Tensor:
-            stems.append(stem)
-            return self.step(self._dense[:, k], k, stem, calls, state)
-
-        for _ in self.corrected(None).samples(calls, blocks):
-            yield stems.pop(), [state.timestep[b] for b in range(self.model.blocks)]
-
     def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
         """What the pruner says with these constants, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.from_numpy(np.array(value)) for name, value in weights.items()}

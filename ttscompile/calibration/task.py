@@ -78,12 +78,6 @@ class Task:
         """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
         return np.random.default_rng((self.seed, 3, *stage))
 
-    def some_calls(self, count: int) -> Calls:
-        """Some of the calls to learn from, always the same ones, in whole windows; all if there are fewer."""
-        window = self.calls.window
-        chosen = self.draw(0).permutation(self.calls.count // window)[: max(1, count // window)]
-        return self.executor.select(self.calls, (chosen[:, None] * window + np.arange(window)).reshape(-1))
-
     def error(self, plan: PlanArray, calls: Calls) -> float:
         """Mean error of the executed actions of a plan on some calls, normalised; see ``Executor.run``."""
         return float(self.actions.errors(self.executor.run(plan, calls), calls.targets, units=False).mean())

@@ -1,0 +1,35 @@
+"""What several strategies look at before they decide: some calls, and what a dense call adds step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ttscompile.calibration.calls import Calls
+from ttscompile.calibration.execute import Executor, State
+from ttscompile.calibration.task import Task
+from ttscompile.core.lattice import dense_plan
+
+
+def some_calls(task: Task, count: int) -> Calls:
+    """Some of the calls to learn from, always the same ones, in whole windows; all if there are fewer."""
+    window = task.calls.window
+    chosen = task.draw(0).permutation(task.calls.count // window)[: max(1, count // window)]
+    return task.executor.select(task.calls, (chosen[:, None] * window + np.arange(window)).reshape(-1))
+
+
+@torch.no_grad()
+def dense_steps(executor: Executor, calls: Calls) -> Iterator[tuple[Tensor, list[Tensor]]]:
+    """Step by step, the stream after the stem of dense calls, and what each block adds to it."""
+    plan = dense_plan(executor.model.steps, executor.model.blocks)[None]
+    state, stems = State(), list[Tensor]()
+
+    def blocks(k: int, stem: Tensor) -> Tensor:
+        stems.append(stem)
+        return executor.step(plan[:, k], k, stem, calls, state)
+
+    for _ in executor.corrected(None).samples(calls, blocks):
+        yield stems.pop(), [state.timestep[b] for b in range(executor.model.blocks)]
