@@ -25,8 +25,8 @@ _SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleD
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
-_OCTO = "Octo denoises with a small MLP on one readout token, not with a transformer: no residuals worth reusing."
-_HYBRID_VLA = "It denoises inside its language model, in one sequence with the text: it has no action head to compile."
+_OCTO = f"Its checkpoints are JAX, and its transformer takes the time. {_BUILD}: the diffusion head alone."
+_HYBRID_VLA = f"It denoises inside its language model. {_BUILD}: one step over cached keys and values is the module."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
 _NO_LOOP = (
@@ -64,6 +64,21 @@ class Refusal:
 
 POLICIES = (
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
+    Refusal(
+        r"^tedi",
+        "Streaming Diffusion Policy, whose buffer of actions, with a noise level each, goes on from call to call",
+        "A compiled policy denoises each chunk from one noise level, so this one is not compiled.",
+    ),
+    Refusal(
+        r"^karras",
+        "a teacher of Consistency Policy, a U-Net under EDM",
+        f"{_BUILD}: ttscompile.EDMDenoiser(network, sigmas, sigma_data) is the module, edm_table its sampler.",
+    ),
+    Refusal(
+        r"^ctmpp",
+        "a student of Consistency Policy, which evaluates its network once, or a few times",
+        f"{_BUILD}. In one evaluation nothing can be reused; eight bits and frames that are known remain.",
+    ),
     Refusal(
         r"transformer|unet",
         "a diffusion policy with another observation encoder than those that are read",
