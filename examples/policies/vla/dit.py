@@ -46,13 +46,17 @@ class MultiTaskDiT(Learner):
 
     def losses(self, batch: dict[str, Tensor], padding: Tensor, offsets: Tensor, grip: Tensor) -> list[Tensor]:
         """Of the noise that was added, and of both of ``Places``."""
-        one_frame = batch | {"observation.state": batch["observation.state"][:, None]}
-        seen = self.policy.observation_encoder.encode(self.policy._prepare_batch(one_frame))
+        seen = self.policy.observation_encoder.encode(self.policy._prepare_batch(of_one_frame(batch)))
         repeated = {"action": batch["action"], "action_is_pad": padding}
         repeated = {name: value.repeat_interleave(REPEATS, 0) for name, value in repeated.items()}
         conditions = seen.repeat_interleave(REPEATS, 0)
         loss = self.policy.objective.compute_loss(self.policy.noise_predictor, repeated, conditions)
         return [loss, *self.places(seen, list(self._pictures.unbind(1)), offsets, grip)]
+
+
+def of_one_frame(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """A batch ``[B, ...]`` as windows of one frame, which lerobot tells by the axes of the state alone."""
+    return batch | {"observation.state": batch["observation.state"][:, None]}
 
 
 def save_clip(directory: Path) -> None:
