@@ -75,7 +75,7 @@ LEROBOT := build/lerobot
 test-lerobot:
 	test -x $(LEROBOT)/bin/python || $(LEROBOT_PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
-		'lerobot[async,diffusion,multi-task-dit,pusht]==0.6.1' -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
+		'lerobot[async,diffusion,multi-task-dit,pusht]==0.6.1' gymnasium-robotics -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
 		hypothesis pytest pytest-benchmark
 	$(LEROBOT)/bin/python -m pytest tests/plugins tests/capture/test_export.py tests/frontends/test_lerobot.py tests/trajectories
 
