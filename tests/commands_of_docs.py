@@ -26,7 +26,7 @@ NOT_RUN = {
     "lerobot-": "a command of LeRobot: tests/plugins runs it, where lerobot is installed",
     "python -m lerobot_policy_ttscompile": "the same",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
-    "python examples/vla/drive.py": "of a LeRobot policy: tests/examples/test_vla_drive.py runs it",
+    "MUJOCO_GL=osmesa python": "in MuJoCo: tests/examples/test_environments.py has its worlds",
     "ttscompile calibrate compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
     "python examples/benchmark/strategies.py compiled/ -t calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",

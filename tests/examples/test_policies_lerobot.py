@@ -44,6 +44,33 @@ def test_dense_compiled_is_what_lerobot_answered(name: str, once: Once) -> None:
     assert [*original.observations] == [*policy.info.observation], "bench gives the original the same instruction"
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:normaliser of action. the identity")  # of -1 to 1, as the demonstrations are
+@pytest.mark.parametrize("name", ["smolvla", pytest.param("multi_task_dit", marks=pytest.mark.soak)])
+def test_dense_compiled_vla_is_what_lerobot_answered(name: str, once: Once) -> None:
+    trained = POLICIES / "vla" / "trained" / name
+
+    def convert(directory: Path) -> Program:
+        return ttscompile.convert(trained / "policy", directory)
+
+    folder = once.compiled(f"policies-vla-{name}", convert)[0]
+    with np.load(trained / "answers.npz", allow_pickle=False) as file:
+        answers = {key: file[key] for key in file.files}
+    noise, wanted = ttscompile.Noise(answers["noise"], answers.get("steps")), answers["action"]
+    given = {key: array for key, array in answers.items() if key.startswith("observation.")}
+    tokens = {key: array for key, array in given.items() if ".language." in key}
+    frames = {key: array[:, None] for key, array in given.items() if key not in tokens}
+    words = trained / "language-model"
+    policy = ttscompile.load(folder, tokenizer=words if words.exists() else None, plan="dense")
+    in_tokens = policy.predict_action({**frames, **tokens}, noise=noise)["action"]
+    assert wanted.std(axis=0).max(axis=0).min() > 0.1, "other tasks, other actions"
+    np.testing.assert_allclose(in_tokens, wanted, rtol=0, atol=PROMISED)
+    if words.exists():  # a policy of CLIP takes tokens alone
+        policy.reset()
+        in_words = policy.predict_action({**frames, "task": answers["instruction"].tolist()}, noise=noise)["action"]
+        np.testing.assert_array_equal(in_words, in_tokens)
+
+
 def test_encoders_that_are_kept_elsewhere_are_named_to_the_rival_too(tmp_path: Path) -> None:
     policy = POLICIES / "pixels" / "policy"
     spec = load_checkpoint_policy(policy)[1]
