@@ -77,6 +77,8 @@ PUSHED, LIFTED = 0.06, 0.05
 """Metres that a block has to move."""
 REACH = 0.025
 """Metres that an action of 1 asks for."""
+HALF_OPEN = 0.025
+"""Metres that a finger is from the middle where the action is 0."""
 _POINTING_DOWN = (1.0, 0.0, 1.0, 0.0)
 _TO_THE_FINGERS = (0.6015, 0.3717, -0.3717, -0.6015)
 """Of the camera on the gripper, which hangs in front of it and looks down, and back by 27 degrees."""
@@ -220,7 +222,7 @@ class FetchBlocks:
         data = self._data
         data.mocap_pos[0] = data.xpos[self._hand] + displacement
         data.mocap_quat[0] = _POINTING_DOWN
-        data.ctrl[:] = 0.025 * (opening + 1.0)
+        data.ctrl[:] = HALF_OPEN * (opening + 1.0)
         mujoco.mj_step(self._model, data, substeps)
         mujoco.mj_forward(self._model, data)
 
@@ -276,8 +278,8 @@ class FetchBlocks:
         return bool(sign * (now[1] - self._was[1]) > PUSHED)
 
     def rest(self) -> Array:
-        """No displacement."""
-        return np.zeros(4, np.float32)
+        """No displacement, and the fingers stay as they are."""
+        return np.array([0.0, 0.0, 0.0, np.clip(self.opening / HALF_OPEN - 1.0, -1.0, 1.0)], np.float32)
 
     def picture(self) -> npt.NDArray[np.uint8]:
         """From the fixed camera. Without a display set MUJOCO_GL=osmesa or egl."""
