@@ -112,6 +112,12 @@ def test_a_tokenizer_for_a_policy_without_text_is_refused(tmp_path: Path, tokeni
         load_trajectories([data_set(tmp_path, 3)], {"state": OBSERVED["state"]}, 3, {"task": (str(tokenizer),)})
 
 
+def test_a_tokenizer_for_a_policy_of_tokens_alone_is_refused(tmp_path: Path, tokenizer: Path) -> None:
+    """It observes tokens, which a data set has not: the tokenizer is told first, since it does not help."""
+    with pytest.raises(TrajectoryError, match="this policy takes no text.*and record tokens if it observes any"):
+        load_trajectories([data_set(tmp_path, 3)], OBSERVED, 3, {"task": (str(tokenizer),)})
+
+
 def test_a_data_set_without_instructions_is_refused(tmp_path: Path, tokenizer: Path) -> None:
     root = data_set(tmp_path, 3)
     (root / "meta" / "tasks.parquet").unlink()

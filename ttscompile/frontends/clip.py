@@ -55,7 +55,7 @@ class TowerConfig:
     def __post_init__(self) -> None:
         settings = Settings(vars(self), "CLIP's ")
         for field in fields(self):
-            if field.type == "int" and (field.name, vars(self)[field.name]) != ("eos_token_id", 0):  # the first token
+            if field.type == "int" and (field.name, vars(self)[field.name]) != ("eos_token_id", 0):  # no size: 0 is one
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
         settings.choice("hidden_act", *ACTIVATIONS)
         if self.hidden_size % self.num_attention_heads:

@@ -25,7 +25,9 @@ _SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleD
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
-_OCTO = f"Its checkpoints are JAX, and its transformer takes the time. {_BUILD}: the diffusion head alone."
+_OCTO = (
+    "Its checkpoints are JAX. Build its diffusion head alone in PyTorch, for ttscompile.compile_denoiser(module, spec)."
+)
 _HYBRID_VLA = f"It denoises inside its language model. {_BUILD}: one step over cached keys and values is the module."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."

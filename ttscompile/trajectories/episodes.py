@@ -110,7 +110,11 @@ def _read(
     instruction: Instruction | None,
 ) -> list[Episode]:
     sources = {key: parts for key, parts in given.items() if key != TASK}
-    text = {instruction.tokens, instruction.mask} if TASK in given and instruction is not None else set()
+    words = instruction if TASK in given else None
+    if TASK in given and words is None:
+        told = f"{given[TASK][0]}: this policy takes no text that alone would give its tokens. Leave the tokenizer out"
+        raise TrajectoryError(f"{told}, and record tokens if it observes any.")
+    text = {words.tokens, words.mask} if words else set()
     seen = {key: spec for key, spec in observations.items() if key not in text}
     used = {part.partition(":")[0] for key in seen for part in sources.get(key, (key,))} | ({TASK} & set(given))
     other, held, frames = _opened(path, sorted(used))
@@ -124,8 +128,8 @@ def _read(
         held, action_steps = frames_of_calls(held, action_steps), 1
         ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
-    if TASK in given:
-        arrays |= instruction_rows(path, held, instruction, observations, os.fspath(given[TASK][0]))
+    if words:
+        arrays |= instruction_rows(path, held, words, observations, os.fspath(given[TASK][0]))
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}

@@ -14,7 +14,7 @@ from .frames import Array, Frames, few
 
 
 def instruction_rows(
-    path: Path, held: Frames, told: Instruction | None, observations: Mapping[str, ObservationSpec], tokenizer: str
+    path: Path, held: Frames, told: Instruction, observations: Mapping[str, ObservationSpec], tokenizer: str
 ) -> dict[str, Array]:
     """Tokens and mask of every row, from its text.
 
@@ -26,9 +26,6 @@ def instruction_rows(
     Returns:
         By key int64 ``[F, length]`` and bool ``[F, length]``.
     """
-    if told is None:
-        remedy = "Leave the tokenizer out."
-        raise TrajectoryError(f"{tokenizer}: this policy takes no text that alone would give its tokens. {remedy}")
     if TASK not in held.names:
         found = f"{path}: has no array {TASK!r}; it has {few(held.names)}. Expected the text of each row, as LeRobot's"
         raise TrajectoryError(f"{found} data sets have it. Leave the tokenizer out, and record tokens.")
