@@ -25,9 +25,7 @@ _SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleD
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
-_OCTO = (
-    "Its checkpoints are JAX. Build its diffusion head alone in PyTorch, for ttscompile.compile_denoiser(module, spec)."
-)
+_OCTO = "Its checkpoints are JAX. Its diffusion head alone, built in PyTorch, can go to ttscompile.compile_denoiser."
 _HYBRID_VLA = f"It denoises inside its language model. {_BUILD}: one step over cached keys and values is the module."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."

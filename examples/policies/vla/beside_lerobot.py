@@ -74,7 +74,7 @@ def main(run: Path, variants: tuple[str, ...], calls: int) -> None:
     world.close()
     table = Table(title=f"{calls} first calls of episodes, one thread, medians")
     for column in ("variant", "ms a call", "times faster than lerobot", "before the loop, ms", "largest difference"):
-        table.add_column(column, justify="left" if column == "variant" else "right")
+        table.add_column(column, justify="left" if column == "variant" else "right", overflow="fold")
     eager = 1000 * float(np.median(own[WARM_UP:]))
     table.add_row("lerobot", f"{eager:.2f}")
     for text, rows in took.items():

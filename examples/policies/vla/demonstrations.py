@@ -21,7 +21,8 @@ from experts import act
 SCENES, TASKS_OF_A_SCENE = 50, 3
 """Of one folder. All episodes of a scene begin with the same pictures."""
 NOISES = (0.0, 0.1, 0.2)
-"""Of a step of the disturbance; of each three episodes of a scene one has each. What the expert wanted is recorded."""
+"""Deviation of what is added to an action; of each three episodes of a scene one has each. What the expert wanted is
+recorded."""
 AFTER = 4
 """Steps that are recorded after success, so that a policy that is a little off goes on."""
 SEEDS = 1_000_000
@@ -35,7 +36,7 @@ def episode(world: FetchBlocks, scene: int, task: str, noise: float) -> dict[str
         world: the environment.
         scene: seed of hand and blocks.
         task: one of ``TASKS``.
-        noise: of a step of the disturbance, in units of the action.
+        noise: deviation of what is added to an action.
 
     Returns:
         By name an array with a row for each step; none if the expert failed.

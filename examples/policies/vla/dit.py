@@ -17,7 +17,7 @@ from lerobot.policies.multi_task_dit.modeling_multi_task_dit import MultiTaskDiT
 from lerobot.policies.multi_task_dit.processor_multi_task_dit import make_multi_task_dit_pre_post_processors
 from torch import Tensor, nn
 from torch.nn import functional
-from transformers import CLIPConfig, CLIPModel
+from transformers import CLIPConfig, CLIPModel, PreTrainedTokenizerFast
 
 NAME = "clip-blocks"
 """Folder of CLIP's configuration, tokenizer and first weights, beside the policy's own."""
@@ -87,16 +87,15 @@ def save_clip(directory: Path) -> None:
     clip.save_pretrained(directory)
 
 
-def learn_words(text_model: nn.Module, words: object) -> None:
+def learn_words(text_model: nn.Module, words: PreTrainedTokenizerFast) -> None:
     """Teach a text encoder which kind of task, which direction and which colour all seen phrasings are about."""
-    number = [kind for kind in KINDS for _ in COLOURS]
     texts, kinds, colours = [], [], []
-    for at, task in enumerate(TASKS):
+    for task in TASKS:
+        kind, _, colour = task.rpartition(" ")
         for phrasing in range(len(SEEN[task.split()[0]])):
             texts.append(instruction(task, phrasing))
-            kinds.append(KINDS.index(number[at]))
-            colours.append(at % len(COLOURS))
-    assert callable(words)
+            kinds.append(KINDS.index(kind))
+            colours.append(list(COLOURS).index(colour))
     given = words(texts, padding="max_length", max_length=LENGTH, return_tensors="pt")
     told = nn.Linear(TEXT, len(KINDS) + len(COLOURS))
     optimizer = torch.optim.AdamW([*text_model.parameters(), *told.parameters()], 1e-3)
