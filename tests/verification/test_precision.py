@@ -121,6 +121,28 @@ def test_integers_in_another_order_make_another_call(int8: Path, tmp_path: Path)
     assert rung.told.startswith("a dense call with int8 in blocks")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "numbers", "status"), [(0.15, 1, PASSED), (0.15, None, FAILED), (np.nan, 1, FAILED)])
+def test_one_number_may_be_far_off_and_not_all(
+    int8: Path, share: float, numbers: int | None, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a policy has two ways to act, rounding chooses between them."""
+    artifact = load_artifact(int8)
+    golden, runtime = load_golden(artifact), open_runtime(artifact)
+    predict = runtime.predict
+
+    def off(obs: Any, noise: Any, plan: Any) -> Any:
+        sample, report = predict(obs, noise, replace(plan, precision={}))
+        wrong = sample.reshape(-1).copy()
+        wrong[np.argsort(np.abs(wrong))[-(numbers or wrong.size) :]] *= 1 + share  # the largest ones
+        return wrong.reshape(sample.shape), report
+
+    monkeypatch.setattr(runtime, "predict", off)
+    rung = check_precision(artifact, golden, runtime)
+    assert rung is not None and rung.status == status
+    assert rung.unit == "of the sample's norm"
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_rounding_is_half_a_step_wherever_the_columns_are(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -17,18 +17,18 @@ from ..artifact.load import Artifact
 from ..errors import ArtifactError
 from ..runtimes.runtime import Runtime
 from .calls import VALUE, computed, replay
-from .network import largest
 from .rung import FAILED, PASSED, Rung, finite, judged
 
 PRECISION, PLANS_PRECISION = "precision", "precision of plans"
 
 EIGHT_BITS = 0.1
-"""Tolerance of a denoised sample of a dense call, relative to its largest value.
+"""Tolerance of a denoised sample of a dense call: the norm of its error as a share of its own.
 
 The range of 255 steps that a product reads is about 8 standard deviations of what it reads, and the largest of 127 in a
 column of weights about 4. Rounding to the nearest is off by a root of 1/12 of a step, which is 0.9 % of a deviation of
 either and 1.3 % of one of the product. A residual is a chain of four products at most: 2.6 %. Residuals add up, and so
-do their errors, whose share stays. A tolerance of four times that leaves room for what is no normal distribution."""
+do their errors, whose share stays. A tolerance of four times that leaves room for what is no normal distribution. A
+single number may be further off: where a policy has two ways to act, rounding chooses."""
 
 CARRIED = 2.0
 """How much more than a dense call a plan may differ: an error that is made in one step is reused in those after it.
@@ -57,10 +57,11 @@ def check_precision(artifact: Artifact, golden: Golden, runtime: Runtime) -> Run
     for loop in spec.all_loops:
         own, plan = golden.in_loop(loop), computed(artifact, loop, parts)
         runtime.reset()
-        error = max(error, largest(runtime.predict(obs, own.noise, plan)[0], own.sample))
+        share = np.linalg.norm(runtime.predict(obs, own.noise, plan)[0] - own.sample) / np.linalg.norm(own.sample)
+        error = max(error, float(share) if np.isfinite(share) else math.inf)
     told = f"a dense call with {record.told} against the original"
     remedy = "Take plans in fp32 (plan.exact), or convert the checkpoint again."
-    return judged(PRECISION, error, EIGHT_BITS, VALUE, told, remedy)
+    return judged(PRECISION, error, EIGHT_BITS, "of the sample's norm", told, remedy)
 
 
 def check_plans_precision(
