@@ -1,6 +1,6 @@
 """Train a policy of lerobot's from nothing on the demonstrations, on one or several processors; resumes where it was.
 
-    OMP_NUM_THREADS=1 python examples/policies/vla/train.py smolvla DEMOS OUT --updates 6000 --decay 3500
+    OMP_NUM_THREADS=1 python examples/policies/vla/train.py smolvla DEMOS OUT --updates 4200 --decay 1400
 
 The networks, their losses, processors and files are lerobot's. One observation, whose encoding is most of the work,
 serves several noises and times. Beside its loss a network learns in training to say where the blocks are.
@@ -221,6 +221,7 @@ def work(rank: int, settings: Settings) -> None:
         dist.init_process_group("gloo", init_method=address, rank=rank, world_size=settings.processes)
     demonstrations = Demonstrations(settings.demos)
     if rank == 0 and not Path("statistics.pt").exists():
+        torch.manual_seed(settings.seed)
         LEARNERS[settings.policy].prepare()
         torch.save(demonstrations.statistics(), "statistics.pt")
     if settings.processes > 1:
@@ -255,8 +256,8 @@ def main() -> None:
     parser.add_argument("policy", choices=sorted(LEARNERS))
     parser.add_argument("demos", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--updates", type=int, default=6_000)
-    parser.add_argument("--decay", type=int, default=3_500, help="updates at the end in which the rate goes down")
+    parser.add_argument("--updates", type=int, default=4_200)
+    parser.add_argument("--decay", type=int, default=1_400, help="updates at the end in which the rate goes down")
     parser.add_argument("--batch", type=int, default=32, help="frames of one process")
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--processes", type=int, default=2)
