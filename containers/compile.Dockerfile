@@ -13,7 +13,7 @@ COPY plugins/rivals plugins/rivals
 ARG PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 RUN python3 -m venv /opt/ttscompile \
     && /opt/ttscompile/bin/python -m pip install --no-cache-dir $PIP_FLAGS -c constraints.txt \
-       '.[compile,hub,lerobot,recordings]'
+       '.[compile,hub,recordings,tokens]'
 ENV PATH=/opt/ttscompile/bin:/usr/local/bin:/usr/bin:/bin
 USER compiler
 WORKDIR /home/compiler

@@ -16,7 +16,7 @@ class Instruct:
 
     Args:
         spec: of the policy.
-        path: of ``tokenizer.json``, or of the folder that has it.
+        path: of the policy's tokenizer; see ``Tokenizer``.
 
     Raises:
         ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
@@ -48,5 +48,6 @@ class Instruct:
     def _tokens(self, text: str) -> list[int]:
         """Of one text; the last is kept, since an episode has one."""
         if text not in self._made:
-            self._made = {text: self._tokenizer(self._told.line(text))[self._told.skipped :]}
+            skipped = self._told.skipped
+            self._made = {text: self._tokenizer(self._told.line(text), skipped + self._length)[skipped:]}
         return self._made[text]

@@ -17,11 +17,14 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.contestants import original_policy
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.families import LoadOptions
 from ttscompile.ir.program import Program
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 TASK = "push the T onto its place"
 WORLD = 512.0
+WORDS = {"smolvla": "language-model", "multi_task_dit": "clip-blocks"}
+"""Where their tokenizers are."""
 
 
 @pytest.mark.slow
@@ -60,15 +63,23 @@ def test_dense_compiled_vla_is_what_lerobot_answered(name: str, once: Once) -> N
     given = {key: array for key, array in answers.items() if key.startswith("observation.")}
     tokens = {key: array for key, array in given.items() if ".language." in key}
     frames = {key: array[:, None] for key, array in given.items() if key not in tokens}
-    words = trained / "language-model"
-    policy = ttscompile.load(folder, tokenizer=words if words.exists() else None, plan="dense")
+    policy = ttscompile.load(folder, tokenizer=trained / WORDS[name], plan="dense")
     in_tokens = policy.predict_action({**frames, **tokens}, noise=noise)["action"]
     assert wanted.std(axis=0).max(axis=0).min() > 0.1, "other tasks, other actions"
     np.testing.assert_allclose(in_tokens, wanted, rtol=0, atol=PROMISED)
-    if words.exists():  # a policy of CLIP takes tokens alone
-        policy.reset()
-        in_words = policy.predict_action({**frames, "task": answers["instruction"].tolist()}, noise=noise)["action"]
-        np.testing.assert_array_equal(in_words, in_tokens)
+    policy.reset()
+    in_words = policy.predict_action({**frames, "task": answers["instruction"].tolist()}, noise=noise)["action"]
+    np.testing.assert_array_equal(in_words, in_tokens)
+
+
+def test_one_instruction_in_a_policy_whose_tokenizer_is_not_clips_own() -> None:
+    """``tokenizer.json`` says what its tokens are, whatever model the text encoder is of."""
+    trained = POLICIES / "vla" / "trained" / "multi_task_dit"
+    with np.load(trained / "answers.npz", allow_pickle=False) as file:
+        text, rows = str(file["instruction"][5]), file["observation.language.tokens"][5]
+        mask = file["observation.language.attention_mask"][5]
+    module, _ = load_checkpoint_policy(trained / "policy", options=LoadOptions(task=text))
+    assert module.get_submodule("encoder").task_tokens.tolist() == [rows[mask].tolist()]
 
 
 def test_encoders_that_are_kept_elsewhere_are_named_to_the_rival_too(tmp_path: Path) -> None:

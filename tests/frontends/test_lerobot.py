@@ -276,7 +276,8 @@ def test_a_task_that_is_compiled_in_leaves_no_text_encoder(tmp_path: Path) -> No
     baked = with_inputs(network, config, read_processors(directory, config.features), None, task)
     for part in ("encoder.observation_encoder", "denoiser"):
         baked.get_submodule(part).load_state_dict(module.get_submodule(part).state_dict())
-    pieces = transform(baked.eval(), replace(spec, observations={STATE: spec.observations[STATE]})).pieces
+    told = replace(spec, observations={STATE: spec.observations[STATE]}, instruction=None)
+    pieces = transform(baked.eval(), told).pieces
     assert not any("attention" in node.op or "embedding" in node.op for node in pieces.condition.nodes)
     states = observe(spec, streams=3)[STATE]
     with torch.inference_mode(), Counted() as counted:
@@ -348,7 +349,7 @@ def test_encoders_folder(tmp_path: Path) -> None:
         load_checkpoint_policy(directory)
     for folder in (elsewhere, elsewhere / "clip-small"):
         load_checkpoint_policy(directory, options=LoadOptions(encoders=folder))
-    with pytest.raises(CheckpointError, match=r"tokenizer .*has neither tokenizer.json nor.*--encoders"):
+    with pytest.raises(CheckpointError, match=r"tokenizer .* is not on this machine.*--encoders"):
         load_checkpoint_policy(directory, options=LoadOptions(encoders=elsewhere, task="push"))
     (elsewhere / "clip-small").rename(directory / "clip-small")
     load_checkpoint_policy(directory)

@@ -18,6 +18,7 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.runtimes import open_runtime
+from ttscompile.runtimes.instruct import Instruct
 
 from ..families.support import record, stored_program
 from ..runtimes.agreement import call_terms, largest_difference
@@ -162,13 +163,24 @@ def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=3) < bound(call_terms(artifact))
 
 
+def test_a_task_in_words(golden: Golden) -> None:
+    """The robot's own text gives LeRobot's tokens, and a text that is too long keeps CLIP's end token."""
+    told = Instruct(golden.spec, golden.directory.parent / "clip-tiny")
+    mask = golden.numbers["attention_mask"]
+    made = told({"task": str(golden.numbers["task"])})
+    assert np.array_equal(made[MASK], mask)
+    assert np.array_equal(made[TOKENS][mask], golden.numbers["tokens"][mask])
+    cut = told({"task": " ".join(["push"] * 200)})
+    assert cut[MASK].all() and cut[TOKENS][0, -1] == made[TOKENS][mask][-1]
+
+
 def test_a_task_that_is_compiled_in(golden: Golden) -> None:
     """The tokenizer's files beside the policy make LeRobot's tokens; the instruction is no observation any more."""
     module, spec = load_checkpoint_policy(golden.directory, options=LoadOptions(task=str(golden.numbers["task"])))
     encoder: Any = module.get_submodule("encoder")
-    assert torch.equal(encoder.task_tokens, torch.from_numpy(golden.numbers["tokens"]))
-    assert torch.equal(encoder.task_mask, torch.from_numpy(golden.numbers["attention_mask"]))
-    assert set(spec.observations) == {STATE, IMAGE}
+    assert encoder.task_tokens.numpy().tolist() == [golden.numbers["tokens"][golden.numbers["attention_mask"]].tolist()]
+    assert encoder.task_mask.all() and encoder.task_mask.shape == encoder.task_tokens.shape
+    assert set(spec.observations) == {STATE, IMAGE} and spec.instruction is None
     given = {
         key: torch.from_numpy(golden.observation[key]).expand(3, *spec.observations[key].shape)
         for key in spec.observations

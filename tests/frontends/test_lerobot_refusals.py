@@ -215,13 +215,39 @@ def test_cameras_without_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["{}", '{"version": "1.0"}', "[", '{"model": {"type": "BPE"}, "added_tokens": 3}'])
 def test_a_damaged_tokenizer(tmp_path: Path, content: str) -> None:
     """The tokenizers package raises plain ``Exception``."""
-    pytest.importorskip("transformers")
     directory = save_policy(tmp_path)
     (tmp_path / "clip-small" / "tokenizer.json").write_text(content)
-    with pytest.raises(CheckpointError, match="the tokenizer cannot be read, or refuses 'push'"):
+    with pytest.raises(CheckpointError, match=r"tokenizer\.json: no tokenizer that can be read"):
         load_checkpoint_policy(directory, options=LoadOptions(task="push"))
-    (tmp_path / "clip-small" / "vocab.json").write_bytes(b" " * (2**24 + 1))
-    with pytest.raises(CheckpointError, match=r"vocab\.json of the tokenizer has more than"):
+
+
+@pytest.mark.parametrize(
+    ("vocabulary", "merges", "told"),
+    [
+        (" " * (2**26 + 1), "", r"vocab\.json: has more than"),
+        ("{", "", r"vocab\.json: no tokenizer that can be read"),
+        ('{"a": 0}', "", r"vocab\.json: no tokenizer that can be read"),
+        ('{"<|startoftext|>": 0, "<|endoftext|>": 1}', "a b c d", r"vocab\.json: no tokenizer that can be read"),
+    ],
+)
+def test_damaged_files_of_clip(tmp_path: Path, vocabulary: str, merges: str, told: str) -> None:
+    """Its older form: two files."""
+    directory = save_policy(tmp_path)
+    (tmp_path / "clip-small" / "vocab.json").write_text(vocabulary)
+    (tmp_path / "clip-small" / "merges.txt").write_text(merges)
+    with pytest.raises(CheckpointError, match=told):
+        load_checkpoint_policy(directory, options=LoadOptions(task="push"))
+
+
+def test_an_instruction_that_is_placed_otherwise(tmp_path: Path) -> None:
+    """Text would become other tokens than in LeRobot: none is taken, and none is compiled in."""
+    directory = save_policy(tmp_path)
+    path = directory / "policy_preprocessor.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["steps"].insert(2, {"registry_name": "tokenizer_processor", "config": {"padding_side": "left"}})
+    write_json(path, content)
+    assert load_checkpoint_policy(directory)[1].instruction is None
+    with pytest.raises(CheckpointError, match="expected padding_side right"):
         load_checkpoint_policy(directory, options=LoadOptions(task="push"))
 
 

@@ -15,16 +15,19 @@ from .coercion import Errors
 TASK = "task"
 """The key of an instruction's text, as LeRobot has it."""
 
-FILE = "tokenizer.json"
+FILE, _VOCABULARY, _MERGES = "tokenizer.json", "vocab.json", "merges.txt"
 _MOST_BYTES = 64 * 2**20
-"""Of its file; PaliGemma's has 18 MB."""
+"""Of a file; PaliGemma's has 18 MB."""
+
+_WORDS = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
+"""What CLIP takes for a word, as transformers has it; its ``vocab.json`` does not say so."""
 
 
 class Tokenizer:
-    """What ``tokenizer.json`` describes.
+    """What ``tokenizer.json`` describes, or CLIP's tokenizer of ``vocab.json`` and ``merges.txt``.
 
     Args:
-        path: of the file, or of the folder that has it.
+        path: of ``tokenizer.json``, of CLIP's ``vocab.json``, or of the folder that has one of them.
         error: class of the errors.
 
     Raises:
@@ -33,14 +36,16 @@ class Tokenizer:
 
     def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
         own = Path(path)
-        self._path, self._error = own / FILE if own.is_dir() else own, error
+        self._path, self._error = (find_tokenizer(own) or own / FILE) if own.is_dir() else own, error
         self._tokenizer: Any = self._read()
 
     def _read(self) -> Any:
         path = self._path
-        if not path.is_file() or path.stat().st_size > _MOST_BYTES:
-            what = "no such file" if not path.is_file() else f"has more than {_MOST_BYTES:,} bytes"
-            raise self._error(f"{path}: {what}; expected the {FILE} of the policy's language model.")
+        clip = path.name == _VOCABULARY
+        for file in (path, path.with_name(_MERGES)) if clip else (path,):
+            if not file.is_file() or file.stat().st_size > _MOST_BYTES:
+                what = "no such file" if not file.is_file() else f"has more than {_MOST_BYTES:,} bytes"
+                raise self._error(f"{file}: {what}; expected the {FILE} of the policy's language model.")
         try:
             import tokenizers
         except ModuleNotFoundError as missing:
@@ -49,11 +54,10 @@ class Tokenizer:
                 f"{path}: text needs the package tokenizers, which is not installed. {remedy}."
             ) from missing
         try:
-            made = tokenizers.Tokenizer.from_file(str(path))
+            made = _clip(path) if clip else tokenizers.Tokenizer.from_file(str(path))
         except Exception as damaged:  # of damaged files the package raises plain Exception
             raise self._error(f"{path}: no tokenizer that can be read: {damaged!s:.200}. Copy it again.") from damaged
         made.no_padding()
-        made.no_truncation()
         return made
 
     @property
@@ -61,23 +65,43 @@ class Tokenizer:
         """How many tokens there are, added ones counted."""
         return int(self._tokenizer.get_vocab_size())
 
-    def __call__(self, text: str) -> list[int]:
-        """The tokens of a text, all of them, with those that the tokenizer adds."""
+    def __call__(self, text: str, most: int | None = None) -> list[int]:
+        """The tokens of a text, with those that the tokenizer adds; ``most`` of them, cut before an added end."""
         try:
+            self._tokenizer.no_truncation() if most is None else self._tokenizer.enable_truncation(most)
             return list(self._tokenizer.encode(text).ids)
         except Exception as refused:
             raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
 
 
+def _clip(vocabulary: Path) -> Any:
+    """CLIP's tokenizer of the two files that it was published with."""
+    from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, processors
+
+    begin, end = "<|startoftext|>", "<|endoftext|>"
+    merges = str(vocabulary.with_name(_MERGES))
+    made = Tokenizer(models.BPE.from_file(str(vocabulary), merges, unk_token=end, end_of_word_suffix="</w>"))
+    made.normalizer = normalizers.Sequence(
+        [normalizers.NFC(), normalizers.Replace(Regex(r"\s+"), " "), normalizers.Lowercase()]
+    )
+    words = pre_tokenizers.Split(Regex(_WORDS), "removed", invert=True)
+    made.pre_tokenizer = pre_tokenizers.Sequence([words, pre_tokenizers.ByteLevel(add_prefix_space=False)])
+    numbers = [(token, made.token_to_id(token)) for token in (end, begin)]
+    made.post_processor = processors.RobertaProcessing(*numbers, trim_offsets=False, add_prefix_space=False)
+    return made
+
+
 def padded(tokens: Sequence[Sequence[int]], length: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Tokens of n texts as ``[n, length]``, with zeros after them, and which count; cut at the end, as lerobot does."""
+    """Tokens of n texts, ``length`` at most, as ``[n, length]`` with zeros after them, and which count."""
     rows, mask = np.zeros((len(tokens), length), np.int64), np.zeros((len(tokens), length), np.bool_)
-    for i, made in enumerate(each[:length] for each in tokens):
+    for i, made in enumerate(tokens):
         rows[i, : len(made)], mask[i, : len(made)] = made, True
     return rows, mask
 
 
 def find_tokenizer(folder: Path) -> Path | None:
     """The file in a folder, if it has one."""
-    path = folder / FILE
-    return path if path.is_file() else None
+    whole, clip = folder / FILE, folder / _VOCABULARY
+    if whole.is_file():
+        return whole
+    return clip if clip.is_file() and clip.with_name(_MERGES).is_file() else None

@@ -17,7 +17,7 @@ PYTHON = (3, 11)
 PROJECT = "ttscompile"
 ENABLES = {
     "compile": "convert, calibrate, bench -t, inspect -o, pictures, runtime='torch' and 'reference'",
-    "lerobot": "convert --task of LeRobot policies",
+    "tokens": "instructions as text",
     "recordings": "recordings in zarr, HDF5 and LeRobot's format",
     "serve": "serve",
     "hub": "hf:// names, push",

@@ -9,7 +9,7 @@ from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
 from .clip import NAME_FOLDER, find_encoder
 
-_NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
+NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
 
 
 def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) -> list[Path]:
@@ -29,7 +29,7 @@ def language_model_folder(name: str, folders: list[Path], kind: str) -> Path:
 
 
 def task_tokens(
-    text: str, name: str, folder: Path | None, most: int | None, vocabulary: int, remedy: str = _NO_TASK
+    text: str, name: str, folder: Path | None, most: int | None, vocabulary: int, remedy: str = NO_TASK
 ) -> list[int]:
     """The tokens of an instruction, without padding: nothing reads that.
 
@@ -45,7 +45,7 @@ def task_tokens(
             f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put its"
             f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {remedy}".rstrip()
         )
-    tokens = Tokenizer(path, CheckpointError)(text)[:most]
+    tokens = Tokenizer(path, CheckpointError)(text, most)
     if not tokens or max(tokens) >= vocabulary:
         found = f"token {max(tokens)}; the language model has {vocabulary}" if tokens else "no token at all"
         raise CheckpointError(f"{path}: it gives {found}. It belongs to another language model.")

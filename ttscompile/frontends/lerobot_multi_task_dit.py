@@ -9,20 +9,21 @@ Source: ``MultiTaskDiTPolicy.predict_action_chunk`` of huggingface/lerobot 0.6, 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from ..core.spec import PolicySpec, SamplerTable
+from ..core.spec import Instruction, PolicySpec, SamplerTable
 from ..errors import CheckpointError
 from ..samplers.flow import METHODS, flow_matching_table
-from .clip import NAME_FOLDER, TextConfig, VisionConfig, encoder_config, find_encoder
+from .clip import TextConfig, VisionConfig, encoder_config, find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
+from .instruction import NO_TASK, encoder_folders, task_tokens
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
 from .lerobot_policy import (
     MASK,
@@ -42,13 +43,10 @@ from .settings import Settings
 
 _CLIP = "openai/clip-vit-base-patch16"
 _MOST_LETTERS = 200
-_MOST_TOKENIZER_BYTES = 16 * 2**20
-"""Of one file; CLIP's own tokenizer.json has 2 MB."""
-
 _MOST_LAYERS = 512
 """Of all transformers together. Each is made twice, first without memory, which takes time."""
 
-_NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
+_PLACED = "the tokenizer pads before the instruction, or does not cut it; expected padding_side right, truncation true."
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     if options.without_cameras is not None:
         raise CheckpointError(f"{directory}: multi_task_dit needs all its cameras. Leave out without_cameras.")
     processors = read_processors(directory, config.features)
-    folders = [*([] if options.encoders is None else [Path(options.encoders)]), directory, directory.resolve().parent]
+    folders = encoder_folders(options.encoders, directory)
     text = encoder_config(config.text_encoder_name, "text_config", TextConfig, folders)
     seen = bool(config.cameras)
     vision = encoder_config(config.vision_encoder_name, "vision_config", VisionConfig, folders) if seen else None
@@ -154,7 +152,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         **({} if options.task is None else {"task": options.task}),
     }
     language = language_inputs(config.tokens, text.vocab_size) if compiled_in is None else {}
-    return module.eval(), policy_spec(config, processors, _loops(config, options), source, language)
+    spec = policy_spec(config, processors, _loops(config, options), source, language)
+    told = Instruction(TOKENS, MASK, processors.new_line) if language and _in_words(processors) else None
+    return module.eval(), replace(spec, instruction=told)
 
 
 def with_inputs(
@@ -195,56 +195,18 @@ def _flow(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
 def _tokens(
     task: str, config: MultiTaskDiTConfig, processors: Processors, folders: list[Path], text: TextConfig
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Tokens and mask ``[1, L]`` of an instruction, as lerobot's processor makes them."""
-    settings = processors.tokenizer
-    name = str(settings.get("tokenizer_name") or config.text_encoder_name)
-    found = find_encoder(name, folders)
-    if found is None or not any((found / file).is_file() for file in ("tokenizer.json", "vocab.json")):
-        where = "is not on this machine" if found is None else f"has neither tokenizer.json nor vocab.json in {found}"
-        raise CheckpointError(
-            f"the tokenizer {name!r:.200} {where}, and nothing is ever downloaded. Put config.json and"
-            f" tokenizer.json (or vocab.json and merges.txt) of the text encoder into one folder. {NAME_FOLDER}"
-            f" {_NO_TASK}"
-        )
-    files = [file for file in sorted(found.iterdir()) if file.suffix in (".json", ".txt")]
-    large = [file.name for file in files if file.stat().st_size > _MOST_TOKENIZER_BYTES]
-    if large:
-        raise CheckpointError(
-            f"{found}: {', '.join(large[:4])} of the tokenizer has more than {_MOST_TOKENIZER_BYTES:,} bytes; CLIP's"
-            " own has less than 3 MB. It is of another model, or damaged."
-        )
-    try:
-        from transformers import CLIPTokenizer
-    except ModuleNotFoundError as error:
-        raise CheckpointError(
-            "compiling a policy for one task needs the tokenizer of transformers, which is not installed. Install"
-            f" 'ttscompile[lerobot]'. {_NO_TASK}"
-        ) from error
-    try:
-        tokenizer = CLIPTokenizer.from_pretrained(str(found), local_files_only=True)
-        tokenizer.padding_side = settings.get("padding_side", "right")
-        made = tokenizer(
-            [task],
-            max_length=config.tokens,
-            padding=settings.get("padding", "max_length"),
-            truncation=settings.get("truncation", True),
-            return_tensors="pt",
-        )
-        tokens, mask = made["input_ids"].to(torch.int64), made["attention_mask"].to(torch.bool)
-    except Exception as error:  # of damaged files the tokenizers package raises plain Exception
-        raise CheckpointError(
-            f"{found}: the tokenizer cannot be read, or refuses {task!r:.200}: {type(error).__name__}:"
-            f" {error!s:.300}. Copy its files again."
-        ) from error
-    if tokens.shape != mask.shape or tokens.shape[0] != 1 or not 1 <= tokens.shape[-1] <= config.tokens:
-        raise CheckpointError(
-            f"{found}: its tokenizer gives tokens {list(tokens.shape)} and a mask {list(mask.shape)}; expected [1, L]"
-            f" of both, and L = {config.tokens} at most. Shorten the task, or check truncation of {PREPROCESSOR}."
-        )
-    if int(tokens.max()) >= text.vocab_size:
-        most = f"token {int(tokens.max())}; the encoder has {text.vocab_size}"
-        raise CheckpointError(f"{found}: its tokenizer gives {most}. It belongs to another text encoder.")
-    return tokens, mask
+    """Tokens and mask ``[1, n]`` of an instruction, without lerobot's padding: no token before it reads that."""
+    if not _in_words(processors):
+        raise CheckpointError(f"{PREPROCESSOR}: {_PLACED} {NO_TASK}")
+    name = str(processors.tokenizer.get("tokenizer_name") or config.text_encoder_name)
+    tokens = torch.tensor([task_tokens(task, name, find_encoder(name, folders), config.tokens, text.vocab_size)])
+    return tokens, torch.ones_like(tokens, dtype=torch.bool)
+
+
+def _in_words(processors: Processors) -> bool:
+    """Whether the instruction's tokens begin at the first place and are cut at the last, as text becomes them here."""
+    told = processors.tokenizer
+    return told.get("padding_side", "right") == "right" and told.get("truncation", True) is True
 
 
 def _read_weights(config: MultiTaskDiTConfig, options: LoadOptions) -> dict[str, torch.Tensor]:
