@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,6 +34,7 @@ class Schedule:
         self.timeline: Timeline | None = None
         self.due = 0
         self.refusal: str | None = None
+        self._stood = 0.0  # seconds from the observation of the newest chunk to when it begins
         most = (resolved.horizon + resolved.reserve) * resolved.ticks_per_step
         self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(most, 3))
 
@@ -95,8 +97,19 @@ class Schedule:
             self.refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
             if self.refusal is not None:
                 return "refused"
-        self.timeline = spliced
+        self.timeline, self._stood = spliced, 0.0
         return "scheduled"
+
+    def begin(self, tick: int) -> None:
+        """Have the chunk begin at the tick of the episode's first action: until then the robot is where it was seen.
+
+        None of its actions is overdue. Displacements that are left out would be lost for good, and the robot would jump
+        to a place that it should have reached by then. A chunk that would be over is not played.
+        """
+        timeline = self.timeline
+        if self.last is None and timeline is not None and timeline.start < tick < timeline.end:
+            self._stood = self.grid.time(tick) - self.grid.time(timeline.start)
+            self.timeline = replace(timeline, start=tick)
 
     def skip_to(self, tick: int) -> None:
         """Have what follows keep the limits of a guard that clips, where nothing is given out for the ticks before."""
@@ -114,7 +127,7 @@ class Schedule:
     def executed(self) -> float:
         """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
         assert self.timeline is not None
-        return float(self.timeline.observed.max()) + self._resolved.horizon / self._resolved.policy_hz
+        return float(self.timeline.observed.max()) + self._stood + self._resolved.horizon / self._resolved.policy_hz
 
     def need_by(self, time: float) -> None:
         """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""

@@ -134,6 +134,9 @@ class ExecutorState:
             return last[1].copy()
         if last is not None and tick > last[0] + 1:
             schedule.skip_to(tick)
+        if last is None:
+            schedule.begin(tick)
+            self._update_due()
         timeline = schedule.timeline
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:

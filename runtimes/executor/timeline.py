@@ -1,7 +1,8 @@
 """What is played when: actions by control tick, and how a new chunk joins what is scheduled. No clock, no threads.
 
 Time is cut into control ticks. A tick is *consumed* when its action has been given out; a new chunk starts to count at
-the first tick that is not, however long its inference took::
+the first tick that is not, however long its inference took. Only the first of an episode begins at its beginning, with
+the first action that is asked for (``Schedule.begin``)::
 
     tick        10   11   12   13   14   15   16   17
     scheduled    a    a    a    a    a                      chunk a, observed at tick 8

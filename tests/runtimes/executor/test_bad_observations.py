@@ -21,10 +21,10 @@ def test_observations_that_stop_end_in_a_stale_observation() -> None:
     with World(settings=ExecutorSettings(max_hold=2)) as world:
         world.begin()
         made = []
-        with pytest.raises(StaleObservationError, match=r"window is 1 s old, and may be 0\.3 s"):  # noqa: PT012
+        with pytest.raises(StaleObservationError, match=r"window is 1\.1 s old, and may be 0\.3 s"):  # noqa: PT012
             for _ in range(100):
                 made.append(world.tick(observe=False))
-        assert len(made) == TA - 2 + 2  # what was left of the one chunk, and the holds
+        assert len(made) == TA - 1 + 2  # what was left of the one chunk, and the holds
         assert len(world.policy.calls) == 1
 
 

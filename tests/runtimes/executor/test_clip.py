@@ -144,10 +144,13 @@ def test_the_loop_goes_on_within_the_limits_after_a_hold_and_after_it_starved() 
 
 
 def test_what_was_changed_is_counted_when_it_is_given_out() -> None:
-    """The first two actions of each chunk of eight are out of bounds; without a clip no chunk would be played."""
+    """Two actions of a chunk are out of bounds when they are played, three of the first, which begins at its beginning.
+
+    Without a clip no chunk would be played.
+    """
     policy = ScriptedPolicy(FakeClock(), {"dense": 0.02}, reserve=4)
     policy.actions = lambda _: np.where(np.arange(policy.predicted)[:, None] < 4, 7.0, np.full((1, 3), 0.5))
-    for clip, clipped in ((True, 20), (False, 0)):
+    for clip, clipped in ((True, 21), (False, 0)):
         policy.clock, policy.calls = FakeClock(), []
         guard = GuardLimits(low=-1.0, high=1.0, clip=clip)
         with World(settings=ExecutorSettings(guard=guard), policy=policy) as world:
