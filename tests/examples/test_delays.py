@@ -97,15 +97,16 @@ def test_without_latency_chunks_are_executed_as_if_the_world_waited() -> None:
 
 @pytest.mark.parametrize("margin", [0, 3])
 def test_a_latency_skips_the_actions_that_are_overdue_and_nothing_waits_for_it(margin: int) -> None:
-    told, driven, _ = played(setup(1.9, margin), 19)
-    assert told == [None] * 3 + chunk(0, 2, 9) + chunk(1, 2, 9)
+    """None of the first chunk is: the agent stands still until it comes."""
+    told, driven, _ = played(setup(1.9, margin), 21)
+    assert told == [None] * 3 + chunk(0, 0, 9) + chunk(1, 2, 9)
     assert driven.still == 3
     assert driven.age == pytest.approx(5.5, abs=0.5)
 
 
 def test_a_shorter_horizon_replaces_chunks_sooner() -> None:
-    told, _, _ = played(setup(1.9, horizon=4), 15)
-    assert told == [None] * 3 + chunk(0, 2, 5) + chunk(1, 2, 5) + chunk(2, 2, 5)
+    told, _, _ = played(setup(1.9, horizon=4), 17)
+    assert told == [None] * 3 + chunk(0, 0, 5) + chunk(1, 2, 5) + chunk(2, 2, 5)
 
 
 def test_a_latency_between_ticks_counts_up_to_the_next() -> None:
@@ -119,9 +120,9 @@ def test_what_is_too_slow_is_bridged_and_then_the_agent_stands_still() -> None:
     assert set(told) == {None}
     assert driven.age is None
     told, driven, _ = played(setup(11), 40)
-    assert told[:16] == [None] * 12 + chunk(0, 11, 14)
-    assert told[16:19] == [(0, 14)] * 3
-    assert (driven.bridged, driven.still) == (9, 24)
+    assert told[:27] == [None] * 12 + chunk(0, 0, 10) + chunk(1, 11, 14)
+    assert told[27:30] == [(1, 14)] * 3
+    assert (driven.bridged, driven.still) == (6, 20)
 
 
 def test_a_run_can_be_repeated() -> None:
