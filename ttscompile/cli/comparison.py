@@ -12,6 +12,7 @@ from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
 from ttscompile.plots.chunk import plot_calls
+from ttscompile.plots.figure import write_picture
 from ttscompile.plots.frontier import plot_frontier
 
 if TYPE_CHECKING:
@@ -51,8 +52,8 @@ def compare(
 def draw_comparison(found: Comparison, directory: Path, picture: Path) -> str:
     """Draw it, and beside it the calls that are furthest from the original; says so."""
     title = f"{directory.resolve().name}: {found.calls} held-out calls, {_threads(found)}\n{one_line(fingerprint())}"
-    plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], picture, title)
-    plot_calls(found.points[1:] or found.points, calls := picture.with_stem(f"{picture.stem}-calls"))
+    write_picture(plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], title), picture)
+    write_picture(plot_calls(found.points[1:] or found.points), calls := picture.with_stem(f"{picture.stem}-calls"))
     return f"wrote {picture} and {calls}"
 
 

@@ -16,6 +16,7 @@ from ttscompile.cli.summary import print_summary
 from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactError
+from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
 from ttscompile.report import Given
 from ttscompile.report.measure import run_episode
@@ -85,7 +86,7 @@ def inspect(
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)
         kinds = [block.kind for block in artifact.manifest.blocks]
-        plot_plan(_plan(artifact, name, episode), kinds, picture, f"plan {name!r}")
+        write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
         say(console, f"wrote {picture}")
     if as_json:
         print_json(document(artifact))

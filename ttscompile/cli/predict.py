@@ -15,6 +15,7 @@ from ttscompile.cli.output import print_identity, print_json, progress, results,
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
 from ttscompile.errors import ObservationError
 from ttscompile.plots.chunk import plot_chunk
+from ttscompile.plots.figure import write_picture
 from ttscompile.runtimes.load import open_policy
 
 
@@ -99,5 +100,5 @@ def predict(
         say(output, f"{told}: {len(chunk)} steps of {chunk.shape[1]} numbers", *notes)
         print_identity(identity, output)
     if picture is not None:
-        plot_chunk(chunk, executed, picture, told)
+        write_picture(plot_chunk(chunk, executed, told), picture)
         say(progress(), f"wrote {picture}")

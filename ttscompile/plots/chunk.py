@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.spec import FloatArray
 from ..measure.points import MeasuredPoint
-from .figure import new_figure, write_picture
+from .figure import new_figure
 from .frontier import COLOURS
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def plot_chunk(actions: FloatArray, executed: range, path: str | Path, title: str) -> None:
-    """Draw the actions ``[T, Da]``, with the executed steps shaded, and write the picture; see ``write_picture``."""
+
+def plot_chunk(actions: FloatArray, executed: range, title: str) -> Figure:
+    """The actions ``[T, Da]``, with the executed steps shaded."""
     figure = new_figure(8, 4, "the actions")
     axes = figure.subplots()
     axes.axvspan(executed.start - 0.5, executed.stop - 0.5, color="#e8e8e8", label="executed")
@@ -23,11 +26,11 @@ def plot_chunk(actions: FloatArray, executed: range, path: str | Path, title: st
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), ncols=1 + actions.shape[1] // 16)
     axes.set(xlabel="step of the chunk", ylabel="action, in its units")
     axes.set_title(title, fontsize=10, loc="left")
-    write_picture(figure, path)
+    return figure
 
 
-def plot_calls(points: Sequence[MeasuredPoint], path: Path) -> None:
-    """Draw the furthest calls, a row for each of the first eight plans; lines are the original, dots the plan."""
+def plot_calls(points: Sequence[MeasuredPoint]) -> Figure:
+    """The furthest calls, a row for each of the first eight plans; lines are the original, dots the plan."""
     shown = points[:8]
     width = 1 + max(len(call.pictures) for p in shown for call in p.furthest)  # of a call
     across = width * max(len(p.furthest) for p in shown)
@@ -46,4 +49,4 @@ def plot_calls(points: Sequence[MeasuredPoint], path: Path) -> None:
             told = f"{p.series}: {p.name}\nepisode {call.episode}, call {call.call}:\ndistance {call.distance:.2f}"
             axes.set_title(told, fontsize=7, loc="left")
             axes.tick_params(labelsize=6)
-    write_picture(figure, path)
+    return figure

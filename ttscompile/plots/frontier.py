@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import log
-from pathlib import Path
 from textwrap import wrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..measure.points import Point
-from .figure import beside, new_figure, plain_powers, write_picture
+from .figure import beside, new_figure, plain_powers, with_grid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's palette, without the yellow that white paper swallows."""
@@ -23,18 +25,13 @@ _TITLE_WIDTH = 105
 """Characters."""
 
 
-def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Path, title: str) -> None:
-    """Draw the points and write the picture.
+def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: str) -> Figure:
+    """The points, and a line along those that no other beats.
 
     Args:
         points: of all series; those at no distance (the dense policy) are told in the title: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
-        path: see ``write_picture``.
         title: over the picture.
-
-    Raises:
-        OutputError: the picture cannot be written.
-        RuntimeUnavailableError: matplotlib is not installed.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()
@@ -60,9 +57,7 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
     if len(best) > 1:  # of one point there is no line
         line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
         axes.step([p.latency_ms for p in best], [p.error for p in best], where="post", label="frontier", **line)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel("latency of a call, ms (median)")
+    axes.set(xscale="log", xlabel="latency of a call, ms (median)", yscale="log")
     axes.set_ylabel("distance from the original on held-out calls\n(1: about what other noise changes)")
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
@@ -71,10 +66,9 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
     parts = [*title.splitlines(), *([f"not drawn, with no distance: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
-    axes.grid(which="both", color="#dddddd", linewidth=0.5)
-    axes.set_axisbelow(True)
+    with_grid(axes)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    write_picture(figure, path)
+    return figure
 
 
 def _near(p: Point, other: Point) -> bool:

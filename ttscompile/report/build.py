@@ -14,6 +14,8 @@ from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
 from ..measure.units import ms, share
+from ..plots.figure import encoded
+from ..plots.frontier import plot_frontier
 from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
@@ -177,7 +179,7 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     if not any(point.error > 0 for point in points):
         return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
-    png = pictures.frontier_picture(points, best, f"artifact {manifest.short_identity}")
+    png = encoded(plot_frontier(points, best, f"artifact {manifest.short_identity}"))
     alt = "Points: distance from the original against latency of each plan. The table has the figures."
     drawn = Picture(png, "Distance from the original against latency: down and left is better.", alt)
     rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)

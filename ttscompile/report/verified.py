@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from ..plots.figure import encoded
 from ..plots.maps import plot_errors
 from ..verification import Rung, Verification
 from .page import Picture, Section, Table
-from .pictures import drawn, plain
+from .pictures import plain
 
 NOT_RUN = Section("Verification", ("Not run for this page: --verify adds it, ttscompile verify DIR runs it alone.",))
 
@@ -20,7 +21,7 @@ def verified(found: Verification) -> Section:
     shown: tuple[Picture, ...] = ()
     if (errors := found.map) is not None:
         of = errors.errors, errors.steps.tolist(), [plain(kind) for kind in errors.kinds], errors.tolerance
-        png = drawn(lambda path: plot_errors(*of, path, "residuals", errors.cells))
+        png = encoded(plot_errors(*of, "residuals", errors.cells))
         caption = (
             "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
         )
