@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.bench_report import BenchReport
 from ttscompile.cli.choosing import choosable, choose_again
-from ttscompile.cli.comparison import compare, draw_comparison
+from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
 from ttscompile.cli.contestants import Way, contestants, originals
-from ttscompile.cli.loop import Loop
+from ttscompile.cli.loop import in_loop, print_verdicts
 from ttscompile.cli.options import (
     LOOP_OPTIONS,
     artifact_argument,
@@ -29,15 +29,19 @@ from ttscompile.cli.options import (
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, warn_if_busy
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.summary import print_facts
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
 from ttscompile.core.plan import DENSE
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.report.timing import Contestant, Measurement, measure
+from ttscompile.report.timing import Contestant, Measurement, measure, timing_remarks, timing_table
 from ttscompile.runtimes.executor import ExecutorSettings
 from ttscompile.runtimes.open import CPU
 
 THIS = "this artifact"
 MOST_CALLS = 10_000
+
+WORTH = 0.1
+"""Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
 
 SECTIONS = (
     Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
@@ -138,43 +142,77 @@ def bench(
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
     plans = tuple(choosable(artifact)) if chooses and not plans else plans
-    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings))
+    executor = ExecutorSettings(**settings)
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
-        if loop is not None:
-            loop.require(entered)  # told before anything is measured
+        # What does not fit is told before anything is measured.
+        resolved = {} if control_hz is None else in_loop(entered, control_hz, executor)
         if checkpoint is not None:
             entered = [*originals(checkpoint, encoders, threads[0], artifact), *entered]
     default = artifact.manifest.default_plan
-    warn_if_busy(console)
-    if default == DENSE and artifact.manifest.steps > 1:
-        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
+    _warn(directory, artifact, console)
     with console.status("timing") as status:
         measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
-        status.update("judging")
-        judged = None if loop is None else loop.judge(entered, measured)
+    # The longest call has to fit.
+    verdicts = {m.label: resolved[m.label].feasibility(max(m.times_ms) / 1e3) for m in measured if m.label in resolved}
     seed = (artifact.manifest.calibration or {}).get("seed", 0)  # holds out the episodes that its calibration held out
     asked = {"observation": sources, "plans": plans, "calls": calls, "seed": int(seed), **vars(ways[0])}
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
-    limit = None if judged is None else judged.may_take_ms
+    limit = 1e3 * max(min(one.max_latency for one in verdicts.values()), 0.0) if verdicts else None
     chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
-    report = BenchReport(measured, default, calls, by_threads, judged, compared, chosen)
     identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
         of = {"identity": artifact.manifest.identity, "machine": fingerprint()}
         among = [{"path": str(path), "identity": identity} for path, identity in identities.items()]
-        print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **report.to_json()})
+        plans_in_loop = {label: one.to_json() for label, one in verdicts.items()}
+        found = {
+            "calls": calls,
+            "threads": list(by_threads),
+            "best_threads": fewest_threads(by_threads),
+            "contestants": [m.to_json() for m in measured],
+            "loop": {"control_hz": control_hz, "plans": plans_in_loop} if verdicts else None,
+            "comparison": None if compared is None else compared.to_json(),
+            "chosen": chosen,
+        }
+        print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **found})
     else:
         output = results()
-        report.print(output)
+        _print_times(measured, default, calls, by_threads, output)
+        print_verdicts(verdicts, control_hz, output)
+        if compared is not None:
+            print_comparison(compared, output)
+        if chosen is not None:
+            say(output, chosen)
         say(output, one_line(fingerprint()))
         print_identity(artifact.manifest.identity, output)
         say(output, *(f"{path}: identity {abbreviated(identity)}" for path, identity in identities.items()))
     if compared is not None and picture is not None:
         say(console, draw_comparison(compared, directory, picture))
-    if (judged is not None and not judged.keeps_up) or (chooses and chosen is None):
+    if (verdicts and not any(one.feasible for one in verdicts.values())) or (chooses and chosen is None):
         context.exit(1)
+
+
+def _warn(directory: Path, artifact: Artifact, console: Console) -> None:
+    warn_if_busy(console)
+    if artifact.manifest.default_plan == DENSE and artifact.manifest.steps > 1:
+        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
+
+
+def _print_times(
+    measured: Sequence[Measurement], default: str, calls: int, by_threads: Mapping[int, float], output: Console
+) -> None:
+    print_facts(output, timing_table(measured, default, ("prologue", "frames", "pruner")))
+    say(output, timing_remarks(measured, calls))
+    if len(by_threads) > 1:
+        best = fewest_threads(by_threads)
+        say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
+
+
+def fewest_threads(medians: Mapping[int, float]) -> int:
+    """The smallest number of threads that no other one is faster than by more than ``WORTH``; ``medians`` by number."""
+    bound = min(medians.values()) / (1 - WORTH)
+    return min(number for number, median in medians.items() if median <= bound)
 
 
 def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
