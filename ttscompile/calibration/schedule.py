@@ -15,7 +15,7 @@ from ..ir.plan_head import has_head
 from .budget import ERROR, FLOPS, LATENCY, Budget, cells_of, measure_budget
 from .clock import Clock
 from .judge import Score
-from .proposer import Proposal, Proposals, Request
+from .proposer import Proposal, Proposals, Proposer, Request
 from .search import open_search, searched
 from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
 from .strategies import FITTED, strategy_of
@@ -32,7 +32,7 @@ BETTER = 0.9
 """A plan has to bring the distance below this share of the uniform schedule's."""
 
 
-class Schedule:
+class Schedule(Proposer):
     """Plans of whole steps, corrected; or what another strategy finds. See ``Proposer``.
 
     Attributes:
@@ -42,13 +42,14 @@ class Schedule:
     """
 
     def __init__(self, request: Request) -> None:
-        self._request, self._strategy = request, strategy_of(request.strategy)
-        self.told, self.budget, self.intervals, self.stopped = "", Budget(request.goal, 0), 0, ""
+        super().__init__(request)
+        self._strategy = strategy_of(request.strategy)
+        self.budget, self.intervals, self.stopped = Budget(request.goal, 0), 0, ""
         self.skipped: dict[str, str] = {}
 
     def applies(self, artifact: Artifact) -> str | None:
         """See ``Proposer``."""
-        view, goal = view_of(artifact, base_of(artifact)), self._request.goal
+        view, goal = view_of(artifact, base_of(artifact)), self.request.goal
         if view.manifest.steps == 1:
             told = "the policy has one denoising step, which every plan computes: nothing can be reused"
             return f"{told}. Learn which parts may have eight bits: --learn precision."
@@ -57,7 +58,7 @@ class Schedule:
                 f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {self._strategy.name!r}. Give"
                 " this strategy a target_sparsity, a target_flops or a latency_ms."
             )
-        if self._request.correct and self._strategy.fits_correction:
+        if self.request.correct and self._strategy.fits_correction:
             return f"strategy {self._strategy.name!r} fits a correction of its own. Leave correct out."
         try:
             if goal.kind not in (LATENCY, ERROR):
@@ -69,7 +70,7 @@ class Schedule:
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``."""
-        view, request = trials.executor.view, self._request
+        view, request = trials.executor.view, self.request
         self._manifest = view.manifest
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
@@ -114,7 +115,7 @@ class Schedule:
 
     def _budget(self, trials: Trials, view: View, clock: Clock) -> Budget | None:
         """The budget; None where it is found on the calls to learn from."""
-        goal, manifest = self._request.goal, view.manifest
+        goal, manifest = self.request.goal, view.manifest
         if goal.kind == ERROR:
             return None
         if goal.kind != LATENCY:
@@ -144,7 +145,7 @@ class Schedule:
 
     def _refusal(self, score: Score, others: Mapping[str, Score]) -> str | None:
         """Which of the budget's promises a score breaks."""
-        goal, uniform, manifest = self._request.goal, others[UNIFORM], self._manifest
+        goal, uniform, manifest = self.request.goal, others[UNIFORM], self._manifest
         wished = goal.sparsity(self.budget.cells, manifest)
         if not score.distance <= NO_NUMBERS:
             return "gives actions that are not numbers."

@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...artifact.load import Artifact
 from ...artifact.view import view_of
 from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
@@ -35,7 +34,7 @@ from ..arguments import calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
-from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
+from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..search import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
@@ -67,21 +66,17 @@ class Cost(NamedTuple):
         return self.one + (steps - 1) * self.step
 
 
-class Loops:
+class Loops(Proposer):
     """See the module, and ``Proposer``."""
 
     def __init__(self, request: Request) -> None:
-        self._request, self._bound, self._farthest = request, request.bound, request.farthest
-        self.told = ""
+        super().__init__(request)
+        self._bound, self._farthest = request.bound, request.farthest
         self._left_out: list[str] = []
         self._scores: dict[str, Score] = {}
         self._best: Proposal | None = None
         self._fastest = float("inf")  # ms of the best one, by its ``Cost``
         self._nearest: Proposal | None = None  # of those within ``farthest``, where none is within the bound
-
-    def applies(self, artifact: Artifact) -> str | None:
-        """See ``Proposer``."""
-        return None
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``. Of a policy of one step all cells, for what is learned after it."""
@@ -209,7 +204,7 @@ class Loops:
 
     @property
     def _deadline(self) -> float | None:
-        return self._request.deadline_ms
+        return self.request.deadline_ms
 
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""
@@ -256,7 +251,7 @@ class Loops:
         found = []
         for precision in ({}, *([dict.fromkeys(record.kept, record.name)] if record is not None else [])):
             plans = [Plan(loop, uniform_plan(steps, blocks, n), precision=precision) for n in (1, more)]
-            runtime = open_runtime(artifact, "onnxruntime", self._request.threads, None, plans[0])
+            runtime = open_runtime(artifact, "onnxruntime", self.request.threads, None, plans[0])
             noise = trials.noise(view_of(artifact, plans[0]).manifest.spec, [(0, 0, 0, 0)])
             one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
             found.append((one, max(most - one, 0.0) / max(more - 1, 1)))

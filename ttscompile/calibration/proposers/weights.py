@@ -22,7 +22,7 @@ from ...lower.precision import quantize_model
 from ..clock import Clock
 from ..execute import Executor
 from ..kept import holding
-from ..proposer import Proposal, Proposals, Request
+from ..proposer import Proposal, Proposals, Proposer
 from ..sparse_loop import fit_correction
 from ..trials import Trials
 from .student import Student, trainable
@@ -37,17 +37,13 @@ TRAINING = 0.95
 """Share of the time limit after which the weights stay as they are: what follows takes the rest."""
 
 
-class Weights:
+class Weights(Proposer):
     """Trains low-rank changes of the blocks' matrices until the plan answers as the dense policy does."""
-
-    def __init__(self, request: Request) -> None:
-        self._rank, self._updates = request.rank, request.updates
-        self.told = ""
 
     def applies(self, artifact: Artifact) -> str | None:
         """Whether blocks have matrices of their own that are large enough."""
         try:
-            trainable(artifact, self._rank)
+            trainable(artifact, self.request.rank)
         except CalibrationError as error:
             return str(error)
         return None
@@ -57,7 +53,8 @@ class Weights:
         _require_whole_steps(trials, plan)
         cells, calls = np.asarray(plan.cells), trials.calls
         reads = plan.correction is None or plan.correction.reads > 0
-        names = trainable(trials.artifact, self._rank)
+        rank, updates = self.request.rank, self.request.updates
+        names = trainable(trials.artifact, rank)
 
         def corrected(executor: Executor) -> Plan:
             return replace(plan, correction=fit_correction(executor, cells, calls, reads), weights=NAME)
@@ -66,12 +63,11 @@ class Weights:
         if plan.correction is None and first.correction is not None:  # what that alone does is no merit of the weights
             yield Proposal(trials.name, replace(plan, correction=first.correction))
         held = holding(trials, Proposal(NAME, first, weights={NAME: BlockWeights(original, {})}))
-        student = Student(
-            Executor(view_of(held.artifact, first.exact), trials.device), first, self._rank, trials.seed, self._updates
-        )
+        there = Executor(view_of(held.artifact, first.exact), trials.device)
+        student = Student(there, first, rank, trials.seed, updates)
         self._train(student, trials, clock.until(TRAINING))
         self.told = f"{len(names)} matrices of blocks were trained in {student.done} updates"
-        notes, weights = {"rank": self._rank, "matrices": len(names), "updates": student.done}, student.weights()
+        notes, weights = {"rank": rank, "matrices": len(names), "updates": student.done}, student.weights()
         own = BlockWeights(weights, _in_precision(trials.artifact, weights))
         # What the trained weights predict is corrected anew; what they were trained with they only began from.
         yield Proposal(NAME, corrected(student.executor), notes, weights={NAME: own})
@@ -83,10 +79,10 @@ class Weights:
         if done:
             with state.reading():
                 student.restore(state.get("weights"), done)
-        trials.bar.stage("distil", self._updates, done)
+        trials.bar.stage("distil", self.request.updates, done)
         # The rate falls with what training has taken.
         first = float(state.progress.setdefault("training began", clock.elapsed()))
-        for _ in clock.in_time(range(done, self._updates)):
+        for _ in clock.in_time(range(done, self.request.updates)):
             loss = student.update(lesson, (clock.elapsed() - first) / max(clock.limit - first, 1e-9))
             trials.bar.update(student.done, f"loss {loss:.2e}", clock.left())
             if student.done % SAVED == 0:
