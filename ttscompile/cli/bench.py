@@ -178,7 +178,7 @@ def bench(
         print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **found})
     else:
         output = results()
-        _print_times(measured, default, calls, by_threads, output)
+        _print_times(measured, default, by_threads, output)
         print_verdicts(verdicts, control_hz, output)
         if compared is not None:
             print_comparison(compared, output)
@@ -200,10 +200,10 @@ def _warn(directory: Path, artifact: Artifact, console: Console) -> None:
 
 
 def _print_times(
-    measured: Sequence[Measurement], default: str, calls: int, by_threads: Mapping[int, float], output: Console
+    measured: Sequence[Measurement], default: str, by_threads: Mapping[int, float], output: Console
 ) -> None:
     print_facts(output, timing_table(measured, default, ("prologue", "frames", "pruner")))
-    say(output, timing_remarks(measured, calls))
+    say(output, timing_remarks(measured))
     if len(by_threads) > 1:
         best = fewest_threads(by_threads)
         say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..artifact.ceiling import uncalibrated
 from ..artifact.load import Artifact
+from ..artifact.manifest import Manifest
 from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
@@ -21,7 +21,7 @@ from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
 from .measure import Course, run_episode
 from .page import Page, Picture, Section, Table, require_packages
-from .timing import Measurement, measure_plans, timing_remarks, timing_table
+from .timing import Measurement, latency, measure_plans
 from .verified import NOT_RUN
 
 MOST_PICTURES = 6
@@ -78,7 +78,7 @@ def build(
         *(() if course is None else (_episode(course),)),
         _latency(measured, given, manifest.default_plan),
         *[frontier] * (not chosen),
-        _calibration(artifact),
+        _calibration(manifest),
         given.verification,
         facts.limits(artifact),
     )
@@ -155,13 +155,9 @@ def _episode(course: Course) -> Section:
 
 
 def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Section:
-    text = (
-        timing_remarks(measured, given.calls),
-        f"{given.threads} thread{'s' * (given.threads != 1)}; {one_line(fingerprint())}",
-    )
     alt = "Bars: what the calls of each plan spend their time on. The table has the figures."
     drawn = Picture(pictures.latency_picture(measured), "What the calls of each plan spend their time on.", alt)
-    return Section("Latency", text, (timing_table(measured, default),), (drawn,))
+    return replace(latency(measured, default, given.threads), pictures=(drawn,))
 
 
 def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
@@ -198,21 +194,10 @@ def _distance(row: Mapping[str, Any]) -> float:
     return 0.0 if row["name"] == DENSE else max(float(row["distance"]), 0.0)
 
 
-def _calibration(artifact: Artifact) -> Section:
-    if (record := artifact.manifest.calibration) is None:
-        return Section("Calibration", (uncalibrated(artifact.manifest),))
-    scores = facts.scores(record)
-    drawn: tuple[Picture, ...] = ()
-    told = facts.scores(record, ("sparsity", "error", "error_p90"))
+def _calibration(manifest: Manifest) -> Section:
+    made, told = facts.calibration(manifest), facts.scores(manifest.calibration, ("sparsity", "error", "error_p90"))
     if told and all(score["error"] > 0 for score in told.values()):
         caption = "Held-out action error against computed cells: mean (point) and 90th percentile (bar)."
         alt = "Points: held-out action error of each plan against the share of cells it computes."
-        drawn = (Picture(pictures.plans_picture(told), caption, alt),)
-    tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
-    text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
-    return Section(
-        "Calibration",
-        (*((text,) if scores else ()), *facts.remarks(record)),
-        tables,
-        drawn,
-    )
+        made = replace(made, pictures=(Picture(pictures.plans_picture(told), caption, alt),))
+    return made

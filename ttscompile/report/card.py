@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,11 @@ from ..core.spec import WITHOUT
 from ..core.untrusted_json import parse_json
 from ..errors import ReportError
 from ..hub.name import HubName, read_name
-from ..measure.machine import fingerprint, one_line
-from ..measure.units import flops, ms, share
+from ..measure.machine import one_line
+from ..measure.units import share
 from . import facts
 from .page import Section, Table
-from .timing import Measurement
+from .timing import Measurement, latency
 
 BASE, BASE_LICENCE = "base", "base_licence"
 """Entries of ``PolicySpec.source`` that ``convert`` writes of a checkpoint from the hub."""
@@ -118,13 +118,14 @@ def card(
     of = "a policy" if base is None else f"[{base.repository}](https://huggingface.co/{base.repository})"
     lines += [f"This is {of}, compiled by ttscompile: it runs with numpy and onnxruntime alone.", ""]
     lines += ["```python", "import ttscompile", "", f'policy = ttscompile.load("hf://{repository}", threads=1)', "```"]
+    calibrated = facts.calibration(manifest)
     if manifest.spec.instruction is not None:
         lines += ["", _TOKENIZER]
     for section in (
-        _what(manifest, base, licence),
-        _errors(manifest),
+        _what(artifact, base, licence),
+        replace(calibrated, tables=calibrated.tables[:-1]),  # without the record
         _success(success),
-        _speed(measured, manifest),
+        latency(measured, manifest.default_plan),
         _made(manifest, base),
         facts.limits(artifact),
     ):
@@ -132,9 +133,9 @@ def card(
     return "\n".join(lines) + "\n"
 
 
-def _what(manifest: Manifest, base: HubName | None, licence: str | None) -> Section:
-    spec, plan = manifest.spec, facts.plans_of(manifest)[manifest.default_plan]
-    sampler = spec.sampler
+def _what(artifact: Artifact, base: HubName | None, licence: str | None) -> Section:
+    manifest, spec = artifact.manifest, artifact.manifest.spec
+    plan, sampler = facts.plans_of(manifest)[manifest.default_plan], spec.sampler
     first, last = sampler.timesteps[0], sampler.timesteps[-1]
     source = ", ".join(f"{k} {v}" for k, v in spec.source.items() if k not in (BASE, BASE_LICENCE))
     rows = (
@@ -147,20 +148,7 @@ def _what(manifest: Manifest, base: HubName | None, licence: str | None) -> Sect
         ("precision", facts.precision(manifest)),
         ("identity", manifest.identity),
     )
-    return Section("What it is", (), (Table(("", ""), rows),))
-
-
-def _errors(manifest: Manifest) -> Section:
-    record = manifest.calibration
-    if record is None or not facts.scores(record):
-        return Section("Error", ("It was not calibrated: every call is dense, and does what the base does.",))
-    held, of = (record.get(key, {}).get("validation") for key in ("calls", "episodes"))
-    told = f" ({held} calls of {len(of)} episodes)" if held is not None and of is not None else ""
-    text = (
-        f"Of the actions, in their units, on recorded episodes that nothing was learned from{told}, against the dense"
-        " policy with the same noise: the mean over calls, and the 90th percentile."
-    )
-    return Section("Error", (text, *facts.remarks(record)), (facts.score_table(record),))
+    return Section("What it is", (), (Table(("", ""), rows), facts.plan_table(artifact)))
 
 
 def _success(found: Sequence[Success]) -> Section:
@@ -178,22 +166,6 @@ def _success(found: Sequence[Success]) -> Section:
     head = ("task", "plan", "episodes", "success [95 % interval]", "score [95 % interval]")
     text = f"Intervals are of the bootstrap over episodes. The episodes ran on {found[0].machine}."
     return Section("Success", (text,), (Table(head, rows),))
-
-
-def _speed(measured: Sequence[Measurement], manifest: Manifest) -> Section:
-    rows = tuple(
-        (
-            one.plan + " (default)" * (one.plan == manifest.default_plan),
-            ms(one.median_ms),
-            "..".join(map(ms, one.quartiles_ms)),
-            flops(one.flops or 0),
-            share((one.flops or 0) / manifest.flops.dense),
-        )
-        for one in measured
-    )
-    head = ("plan", "ms a call", "quartiles", "FLOPs a call", "of the captured policy")
-    text = f"Medians of calls of one stream on one thread of {one_line(fingerprint())}. Yours is another machine."
-    return Section("Speed", (text,), (Table(head, rows),))
 
 
 def _made(manifest: Manifest, base: HubName | None) -> Section:

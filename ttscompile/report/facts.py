@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..artifact.ceiling import BOUND, FARTHEST, few_steps
+from ..artifact.ceiling import BOUND, FARTHEST, few_steps, uncalibrated
 from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
@@ -224,6 +224,22 @@ def score_table(record: Mapping[str, Any]) -> Table:
     errors = "mean action error", "90th percentile"
     head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
+
+
+def calibration(manifest: Manifest) -> Section:
+    """What calibration measured, what that means, and the rest of the record."""
+    if (record := manifest.calibration) is None:
+        return Section("Calibration", (uncalibrated(manifest),))
+    tables, text = [record_table(record)], [*remarks(record)]
+    if scores(record):
+        held, of = (record.get(key, {}).get("validation") for key in ("calls", "episodes"))
+        told = f" ({held} calls of {len(of)} episodes)" if held is not None and of is not None else ""
+        errors = f"Errors of the actions, in their units, on recorded episodes that nothing was learned from{told}"
+        text.insert(
+            0, f"{errors}, against the dense policy with the same noise: the mean over calls, and the 90th percentile."
+        )
+        tables.insert(0, score_table(record))
+    return Section("Calibration", tuple(text), tuple(tables))
 
 
 def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:
