@@ -28,7 +28,7 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.step_counts import SAFE
 from ttscompile.cli.contestants import Way, contestants, originals
-from ttscompile.cli.frontier import print_frontier
+from ttscompile.cli.summary import print_frontier
 from ttscompile.core.lattice import Source
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.core.spec import BF16, FP16, FP32, INT8

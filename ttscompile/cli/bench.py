@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.choosing import choosable, choose_again
 from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
 from ttscompile.cli.contestants import Way, contestants, originals
-from ttscompile.cli.loop import in_loop, print_verdicts
 from ttscompile.cli.options import (
     LOOP_OPTIONS,
     artifact_argument,
@@ -26,15 +26,17 @@ from ttscompile.cli.options import (
     number_option,
     several_threads_option,
 )
-from ttscompile.cli.output import print_identity, print_json, progress, results, say, warn_if_busy
+from ttscompile.cli.output import print_identity, print_json, progress, results, say, table, warn_if_busy
 from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
 from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.summary import print_facts
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
-from ttscompile.core.plan import DENSE
+from ttscompile.core.plan import DENSE, UNIFORM
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.units import ms
 from ttscompile.report.timing import Contestant, Measurement, measure, timing_remarks, timing_table
-from ttscompile.runtimes.executor import ExecutorSettings
+from ttscompile.runtimes.executor import ExecutorSettings, Feasibility
+from ttscompile.runtimes.executor.settings import Resolved, resolve
 from ttscompile.runtimes.open import CPU
 
 THIS = "this artifact"
@@ -245,3 +247,27 @@ def _by_threads(entered: Sequence[Contestant], measured: Sequence[Measurement], 
         if one.plan == plan and one.policy is not None:
             timed.setdefault(one.threads, m.median_ms)
     return timed
+
+
+def in_loop(entered: Sequence[Contestant], control_hz: float, settings: ExecutorSettings) -> dict[str, Resolved]:
+    """The plans in a control loop, by label; a network alone drives nothing. Raises ExecutorError: one does not fit."""
+    return {
+        one.label: resolve(replace(settings, tiers=(one.plan,)), one.policy.info, control_hz)
+        for one in entered
+        if one.policy is not None
+    }
+
+
+def print_verdicts(verdicts: Mapping[str, Feasibility], control_hz: float | None, output: Console) -> None:
+    """Whether plans keep up, by label, with the arithmetic; nothing if that was not asked."""
+    if control_hz is None:
+        return
+    made = table(f"control loop of {control_hz:g} Hz", "longest ms", "may take ms", "up to Hz", "verdict")
+    for label, one in verdicts.items():
+        allowed, verdict = ms(max(1e3 * one.max_latency, 0), 4), "feasible" if one.feasible else "too slow"
+        made.add_row(label, ms(1e3 * one.latency, 4), allowed, f"{one.max_policy_hz:.3g}", verdict)
+    output.print(made)
+    say(output, *(f"{label}: {one.explain()}" for label, one in verdicts.items()))
+    if any(UNIFORM in label for label in verdicts):
+        say(output, f"{UNIFORM} is for comparisons: evenly spaced steps, not calibrated. Not for a robot.")
+    say(output, "The longest call has to fit. Hz: of the policy, with as many control ticks an action as here.")

@@ -195,17 +195,11 @@ def require_files(path: Path) -> None:
 def one_error(what: str, hint: str = "") -> Iterator[None]:
     """Within the block every error is a ``TrajectoryError``: libraries that decode raise whatever their parts raise.
 
-    It says what went wrong, the error's own words in brackets, and a hint of what to do.
+    But for one of a package that is not installed. It says what went wrong, the error's own words in brackets, and a hint of what to do.
     """
     try:
         yield
-    except TrajectoryError:
+    except (TrajectoryError, ModuleNotFoundError):
         raise
     except Exception as error:
         raise TrajectoryError(f"{what} ({type(error).__name__}: {str(error)[:160]}){hint}.") from error
-
-
-def missing_package(path: Path, package: str, extra: str = "recordings") -> TrajectoryError:
-    """The error of a package that is not installed."""
-    told = f"{path}: reading this takes the package {package!r}, which is not installed"
-    return TrajectoryError(f"{told}. Install 'ttscompile[{extra}]', or {AS_NPZ}")

@@ -15,7 +15,7 @@ import numpy as np
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .frames import Array, Recording, missing_package, one_error, require_files, require_proportion
+from .frames import Array, Recording, one_error, require_files, require_proportion
 from .lerobot_video import video_frames
 
 EPISODE, FRAME, TIME, TASKS = "episode_index", "frame_index", "timestamp", "task_index"
@@ -27,10 +27,8 @@ ROWS, IMAGES = 4096, 8
 
 def lerobot_recording(path: Path) -> Recording:
     """Open a data set. Raises TrajectoryError: not one, or damaged."""
-    try:
-        import pyarrow.parquet as parquet
-    except ModuleNotFoundError as error:
-        raise missing_package(path, "pyarrow") from error
+    import pyarrow.parquet as parquet
+
     require_files(path / "data")
     require_files(path / "meta")
     files = sorted((path / "data").rglob("*.parquet"))

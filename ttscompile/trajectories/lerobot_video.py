@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import Array, missing_package, one_error, require_files
+from .frames import Array, one_error, require_files
 
 CODECS = ("h264", "hevc", "av1", "libdav1d")
 """Decoders of what LeRobot writes. FFmpeg has hundreds, most of them old."""
@@ -40,13 +40,12 @@ def video_frames(
         column: reads tables.
 
     Raises:
-        TrajectoryError: PyAV is not installed; a video is missing or damaged, of another codec, or lacks a frame; a
+        ModuleNotFoundError: PyAV is not installed.
+        TrajectoryError: a video is missing or damaged, of another codec, or lacks a frame; a
             time is not finite.
     """
-    try:
-        import av  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise missing_package(path, "av", "videos") from error
+    import av  # noqa: F401
+
     fps: Any = info.get("fps")
     if type(fps) not in (int, float) or not 0 < fps < 1e6:
         raise TrajectoryError(f"{path}: fps of meta/info.json is {fps!r:.80}; expected frames a second of {name!r}.")
