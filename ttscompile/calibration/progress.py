@@ -26,7 +26,7 @@ class Bar:
             TextColumn("{task.fields[left]}"),
         )
         self._progress = progress.Progress(*columns, console=Console(stderr=True), disable=not shown)
-        self._task = self._progress.add_task("", total=None, note="", left="")
+        self._task, self._what = self._progress.add_task("", total=None, note="", left=""), ""
 
     def __enter__(self) -> Bar:
         self._progress.start()
@@ -47,6 +47,13 @@ class Bar:
         if not (self._progress.disable or self._progress.console.is_terminal):  # a log has no bar
             self._progress.console.print(f"{what}: {total - done} to do", markup=False, soft_wrap=True)
         self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")
+
+    def tell(self, what: str, done: int, total: int) -> None:
+        """Say what is being done, how many parts are done, and of how many; see ``Progress``."""
+        if what != self._what:
+            self._what = what
+            self.stage(what, total, done)
+        self._progress.update(self._task, completed=done, total=total)
 
     def update(self, done: int, note: str, seconds_left: float) -> None:
         """Say how far it is."""

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.cli.output import counted_parts, manifest_of, only_results_on_stdout, progress, say, table
+from ttscompile.calibration.progress import Bar
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress, say, table
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
@@ -40,8 +41,8 @@ def compare(
         raise RuntimeUnavailableError(
             f"-t needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
-    with only_results_on_stdout(), counted_parts() as tell:
-        found = measure(directory, trajectories, others, progress=tell, **how)
+    with only_results_on_stdout(), Bar(shown=True) as bar:
+        found = measure(directory, trajectories, others, progress=bar.tell, **how)
     pairs = zip((directory, *others), artifacts.values(), strict=True)
     if changed := [path for path, one in pairs if manifest_of(path).identity != one.manifest.identity]:
         raise ArtifactChangedError(f"{changed[0]}: it was replaced meanwhile. Try again.")

@@ -195,7 +195,8 @@ def require_files(path: Path) -> None:
 def one_error(what: str, hint: str = "") -> Iterator[None]:
     """Within the block every error is a ``TrajectoryError``: libraries that decode raise whatever their parts raise.
 
-    But for one of a package that is not installed. It says what went wrong, the error's own words in brackets, and a hint of what to do.
+    It says what went wrong, the error's own words in brackets, and a hint of what to do. A package that is not
+    installed is told by ``sandbox``.
     """
     try:
         yield
