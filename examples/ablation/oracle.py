@@ -16,10 +16,10 @@ from foresight import Oracle, oracle
 
 from ttscompile.calibration.progress import Bar
 from ttscompile.cli.output import print_json, results_console, run, say, table
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 
 
-@click.command(cls=FilesCommand, context_settings={"show_default": True})
+@click.command(cls=SectionedCommand, context_settings={"show_default": True})
 @click.argument("directory", type=click.Path(exists=True, path_type=Path))
 @trajectories_options()
 @click.option("--computed-steps", default=3, help="Of a call.")

@@ -27,8 +27,7 @@ from ttscompile.cli.options import (
     several_threads_option,
 )
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table, warn_if_busy
-from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
-from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.sections import Section, SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_facts
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
 from ttscompile.core.plan import DENSE, UNIFORM

@@ -22,12 +22,12 @@ from ttscompile.cli.options import (
     threads_option,
 )
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
-from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.sections import SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_written
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, NumberOption
 
 
-@click.command(cls=FilesCommand)
+@click.command(cls=SectionedCommand)
 @artifact_argument
 @trajectories_options()
 @names_option(

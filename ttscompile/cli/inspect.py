@@ -12,8 +12,7 @@ from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
-from ttscompile.cli.recordings import Sources, trajectories_options
-from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.sections import Section, SectionedCommand, Sources, trajectories_options
 from ttscompile.cli.summary import print_summary
 from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
@@ -22,10 +21,10 @@ from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
 from ttscompile.report import Given, build, render, verified
 from ttscompile.report import Section as OfPage
+from ttscompile.report.build import NOT_RUN
 from ttscompile.report.measure import run_episode
 from ttscompile.report.page import require_packages
 from ttscompile.report.summary import document
-from ttscompile.report.verified import NOT_RUN
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode, load_trajectories
