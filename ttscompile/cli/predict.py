@@ -1,4 +1,7 @@
-"""``ttscompile predict``: the chunk of actions that an artifact answers to one observation."""
+"""``ttscompile predict``: the chunk of actions that an artifact answers to one observation.
+
+That is given in the words of a command line: pictures, a state, or an archive of arrays.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""``ttscompile serve``: an artifact answers programs in other processes, those of one robot or of many."""
+"""``ttscompile serve``: an artifact answers programs in other processes, those of one robot or of many.
+
+Its options say where it listens, for whom, and until when.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an artifact is, as tables: for ``convert``, ``calibrate`` and ``inspect``."""
+"""What an artifact is, as tables: for ``convert``, ``calibrate`` and ``inspect``; and what a ``build`` tried."""
 
 from __future__ import annotations
 

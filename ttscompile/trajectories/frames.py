@@ -153,10 +153,13 @@ def require_proportion(path: Path, total: int, size: int) -> None:
         )
 
 
-def block_rows(shape: Sequence[int], itemsize: int, chunk: int) -> int:
-    """How many rows of an array ``[F, ...]`` are read at once: about ``BLOCK_BYTES``, and whole chunks of rows."""
-    whole = BLOCK_BYTES // max(1, math.prod(shape[1:]) * itemsize * chunk)
-    return max(1, whole) * chunk
+def blocks(array: Any) -> Iterator[Array]:
+    """The rows of an array ``[F, ...]`` of zarr or h5py: about ``BLOCK_BYTES`` at once, and whole chunks of rows."""
+    chunk = max(1, array.chunks[0]) if array.chunks else 1
+    whole = BLOCK_BYTES // max(1, math.prod(array.shape[1:]) * array.dtype.itemsize * chunk)
+    step = max(1, whole) * chunk
+    for start in range(0, max(1, array.shape[0]), step):
+        yield np.asarray(array[start : start + step])
 
 
 def bytes_of(path: Path) -> int:

@@ -24,7 +24,7 @@ from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.artifact.view import View, view_of
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.proposers import student
+from ttscompile.calibration.proposers import weights as student
 from ttscompile.calibration.proposers.weights import NAME, SAVED, Weights
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.sparse_loop import fit_correction

@@ -1,4 +1,4 @@
-"""Download what an artifact or a checkpoint is made of, and nothing else that a repository has.
+"""Download what an artifact or a checkpoint is made of, and nothing else that a repository has; and upload an artifact.
 
 The library downloads into its cache, checks sizes, and gives the folder of one commit. A second time, and where there
 is no network, that folder is all that is read. Nothing of a repository is executed, here or later: an artifact is
@@ -8,7 +8,7 @@ checked by ``load`` as any other, and a checkpoint read by ``convert`` as any ot
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 from ..core.paths import HUB
 from ..core.untrusted_json import parse_json
 from ..errors import HubError, RuntimeUnavailableError, TtscompileError
-from .name import HubName, plain, read_name
+from .name import HubName, plain, read_name, require_repository
 
 MANIFEST = "manifest.json"
 CARD = "README.md"
@@ -218,3 +218,37 @@ def told(text: str) -> Iterator[None]:
         kind, first = type(last).__name__, f"{last}".strip().split("\n")[0].rstrip(".")
         remedy = "Is the name right, is there a network, and for a private repository a login (hf auth login)?"
         raise HubError(f"{text:.200}: {kind}: {first:.300}. {remedy}") from error
+
+
+_MADE_BY_THE_HUB = frozenset({".gitattributes", CARD})
+
+
+def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, private: bool = False) -> str:
+    """Commit these files and the card; the repository is made if it is not there.
+
+    Args:
+        private: whether the repository is nobody else's to see; one that is there already must be private then.
+
+    Returns:
+        ``hf://org/name@commit``.
+
+    Raises:
+        HubError: the repository holds something else than an artifact, is public although ``private`` was asked for, or
+            cannot be written.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
+    """
+    require_repository(repository, repository)
+    hub = library()
+    with told(repository):
+        api = hub.HfApi()
+        api.create_repo(repository, private=private, exist_ok=True)
+        if private and not api.repo_info(repository).private:
+            raise HubError(f"{repository}: expected a private repository; it is public already. Give another.")
+        there = set(api.list_repo_files(repository)) - _MADE_BY_THE_HUB
+        if there and MANIFEST not in there:
+            found = ", ".join(sorted(there)[:3])
+            raise HubError(f"{repository}: expected an empty repository or an artifact; it has {found}. Give another.")
+        files = [hub.CommitOperationAdd(name, str(folder / name)) for name in names]
+        operations = [*files, hub.CommitOperationAdd(CARD, card.encode())]
+        made = api.create_commit(repository, operations, commit_message="Upload an artifact of ttscompile")
+        return HubName(repository).at(str(made.oid))
