@@ -1,10 +1,11 @@
 """Weights of its own for a plan that computes very few steps: the last resort, where no correction helps.
 
-The original's stay in the artifact, and all other plans compute with them. Residual blocks get low-rank changes, trained
-until a sparse loop gives the dense policy's answers. The schedule and its correction stay as they are, and so does step
-0. What the loop carries to the next computed step is known, therefore, before training begins; from there on the loop
-is differentiated. Low-rank changes: LoRA (arXiv 2106.09685); a policy of few steps that is trained to answer as one of
-many: progressive distillation (arXiv 2202.00512), here for one schedule, from recorded observations alone.
+The original's stay in the artifact, and all other plans compute with them. Residual blocks get low-rank changes, which
+are trained until a sparse loop gives the dense policy's answers. The schedule and its correction stay as they are, and
+so does step 0. What the loop carries to the next computed step is known, therefore, before training begins; from there
+on the loop is differentiated. Low-rank changes: LoRA (arXiv 2106.09685); a policy of few steps that is trained to
+answer as one of many: progressive distillation (arXiv 2202.00512), here for one schedule, from recorded observations
+alone.
 """
 
 from __future__ import annotations
