@@ -12,7 +12,7 @@ from ..core.plan import UNIFORM, Plan
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..ir.plan_head import has_head
-from .budget import ERROR, FLOPS, LATENCY, Budget, cells_of, measure_budget
+from .budget import ERROR, FLOPS, LATENCY, Goal, cells_of, measure_budget
 from .clock import Clock
 from .judge import Score
 from .proposer import Proposal, Proposals, Proposer, Request
@@ -44,7 +44,7 @@ class Schedule(Proposer):
     def __init__(self, request: Request) -> None:
         super().__init__(request)
         self._strategy = strategy_of(request.strategy)
-        self.budget, self.intervals, self.stopped = Budget(request.goal, 0), 0, ""
+        self.budget, self.intervals, self.stopped = request.goal, 0, ""
         self.skipped: dict[str, str] = {}
 
     def applies(self, artifact: Artifact) -> str | None:
@@ -113,20 +113,20 @@ class Schedule(Proposer):
             proposal = Proposal(name, made, {"steps": one.notes["steps"]}, beside=True)
             yield replace(proposal, refusal=_no_safer) if name == SAFE else proposal
 
-    def _budget(self, trials: Trials, view: View, clock: Clock) -> Budget | None:
+    def _budget(self, trials: Trials, view: View, clock: Clock) -> Goal | None:
         """The budget; None where it is found on the calls to learn from."""
         goal, manifest = self.request.goal, view.manifest
         if goal.kind == ERROR:
             return None
         if goal.kind != LATENCY:
-            return Budget(goal, cells_of(goal, manifest, self._may_prune(view)))
+            return replace(goal, cells=cells_of(goal, manifest, self._may_prune(view)))
         known = trials.state.progress.get("latency")
         if known is None:
             budget = measure_budget(trials.artifact, trials.base, goal, self._may_prune(view))
             known = {"cells": budget.cells, "measured": budget.measured}
             trials.state.progress.update(latency=known, seconds=clock.elapsed())
             trials.state.save()
-        budget = Budget(goal, known["cells"], known["measured"])
+        budget = replace(goal, cells=known["cells"], measured=known["measured"])
         self._strategy.require_reach(manifest.steps, len(manifest.blocks), budget.cells)
         return budget
 
@@ -146,7 +146,7 @@ class Schedule(Proposer):
     def _refusal(self, score: Score, others: Mapping[str, Score]) -> str | None:
         """Which of the budget's promises a score breaks."""
         goal, uniform, manifest = self.request.goal, others[UNIFORM], self._manifest
-        wished = goal.sparsity(self.budget.cells, manifest)
+        wished = self.budget.sparsity(manifest)
         if not score.distance <= NO_NUMBERS:
             return "gives actions that are not numbers."
         if score.sparsity < wished - 1e-9:

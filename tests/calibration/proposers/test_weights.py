@@ -35,7 +35,7 @@ from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.report import facts
-from ttscompile.report.card import card
+from ttscompile.report.push import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
