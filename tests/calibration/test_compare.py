@@ -144,7 +144,7 @@ def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Pa
 
 
 def _point(name: str, latency: float, error: float) -> MeasuredPoint:
-    return MeasuredPoint("s", name, error, (0.0, 9.0), error, error, latency, (latency, latency), 0.5, 1.0)
+    return MeasuredPoint("s", name, error, latency, (0.0, 9.0), error, error, (latency, latency), 0.5, 1.0)
 
 
 def test_the_frontier_is_what_nothing_beats() -> None:
@@ -156,7 +156,7 @@ def test_the_frontier_is_what_nothing_beats() -> None:
 
 def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp_path: Path) -> None:
     path = tmp_path / "f.png"
-    arguments: tuple[Any, ...] = [p.point for p in frontier.points], [p.point for p in frontier.efficient()]
+    arguments: tuple[Any, ...] = frontier.points, frontier.efficient()
     write_picture(plot_frontier(*arguments, "title"), path)
     with Image.open(path) as picture:
         colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}

@@ -53,7 +53,7 @@ def compare(
 def draw_comparison(found: Comparison, directory: Path, picture: Path) -> str:
     """Draw it, and beside it the calls that are furthest from the original; says so."""
     title = f"{directory.resolve().name}: {found.calls} held-out calls, {_threads(found)}\n{one_line(fingerprint())}"
-    write_picture(plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], title), picture)
+    write_picture(plot_frontier(found.points, found.efficient(), title), picture)
     write_picture(plot_calls(found.points[1:] or found.points), calls := picture.with_stem(f"{picture.stem}-calls"))
     return f"wrote {picture} and {calls}"
 

@@ -35,12 +35,12 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()
-    shown = [point for point in points if point.error > 0]
+    shown = [point for point in points if point.distance > 0]
     for i, series in enumerate(dict.fromkeys(point.series for point in shown)):
         own = sorted((p for p in shown if p.series == series), key=lambda p: p.latency_ms)
         axes.plot(
             [p.latency_ms for p in own],
-            [p.error for p in own],
+            [p.distance for p in own],
             marker=MARKERS[i % len(MARKERS)],
             linestyle="none" if len({p.name.strip("0123456789.") for p in own}) > 1 else "-",
             linewidth=1,
@@ -52,17 +52,17 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     for i, p in enumerate(told):
         above = 4 + 8 * sum(_near(p, other) for other in told[:i])
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
-        axes.annotate(p.name, (p.latency_ms, p.error), fontsize=8, **beside(place, p.name, above))
-    best = [point for point in efficient if point.error > 0]
+        axes.annotate(p.name, (p.latency_ms, p.distance), fontsize=8, **beside(place, p.name, above))
+    best = [point for point in efficient if point.distance > 0]
     if len(best) > 1:  # of one point there is no line
         line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
-        axes.step([p.latency_ms for p in best], [p.error for p in best], where="post", label="frontier", **line)
+        axes.step([p.latency_ms for p in best], [p.distance for p in best], where="post", label="frontier", **line)
     axes.set(xscale="log", xlabel="latency of a call, ms (median)", yscale="log")
     axes.set_ylabel("distance from the original on held-out calls\n(1: about what other noise changes)")
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
-    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.error == 0)
+    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.distance <= 0)
     parts = [*title.splitlines(), *([f"not drawn, with no distance: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
@@ -72,4 +72,4 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
 
 
 def _near(p: Point, other: Point) -> bool:
-    return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.error / other.error)) < 0.2
+    return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.distance / other.distance)) < 0.2

@@ -167,7 +167,7 @@ def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Sec
 def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     manifest = artifact.manifest
     if tried := (manifest.calibration or {}).get("frontier", ()):
-        points = tuple(Point(_nearness(row), row["name"], _distance(row), row["milliseconds"]) for row in tried)
+        points = tuple(map(_tried, tried))
         text = "The plans that the build chose among, as it judged and timed them on the machine where it ran."
     else:
         judged = facts.scores(manifest.calibration, ("distance",))
@@ -176,26 +176,23 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
             Point("this artifact", p.plan, max(float(judged[p.plan]["distance"]), 0.0), p.median_ms) for p in known
         )
         text = "Distances from the calibration record, latencies measured now. ttscompile bench -t measures both."
-    if not any(point.error > 0 for point in points):
+    if not any(point.distance > 0 for point in points):
         return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
     png = encoded(plot_frontier(points, best, f"artifact {manifest.short_identity}"))
     alt = "Points: distance from the original against latency of each plan. The table has the figures."
     drawn = Picture(png, "Distance from the original against latency: down and left is better.", alt)
-    rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
+    rows = tuple((p.series, p.name, f"{p.distance:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "distance", "ms a call", "on the frontier")
     return Section("Comparison", (text,), (Table(head, rows),), (drawn,))
 
 
-def _nearness(row: Mapping[str, Any]) -> str:
+def _tried(row: Mapping[str, Any]) -> Point:
+    """A plan that a build tried; the distance of the original is 0 but for rounding."""
     if row["name"] == DENSE:
-        return "the original"
-    return "may be taken" if row["near"] else "too far"
-
-
-def _distance(row: Mapping[str, Any]) -> float:
-    """The distance of a plan that a build tried; of the original it is 0 but for rounding."""
-    return 0.0 if row["name"] == DENSE else max(float(row["distance"]), 0.0)
+        return Point("the original", DENSE, 0.0, row["milliseconds"])
+    nearness = "may be taken" if row["near"] else "too far"
+    return Point(nearness, row["name"], max(float(row["distance"]), 0.0), row["milliseconds"])
 
 
 def _calibration(manifest: Manifest) -> Section:

@@ -186,7 +186,8 @@ class Loops(Proposer):
         again = self._best is not None and self._best.name == proposal.name  # nearer now
         if near(score.distance, score.interval, self._bound) and (again or cost < self._fastest):
             self._best, self._fastest = alone, cost
-        if near(score.distance, score.interval, self._farthest) and self._is_nearest(proposal.name):
+        nearest = None if self._nearest is None else self._scores[self._nearest.name].distance
+        if near(score.distance, score.interval, self._farthest) and (nearest is None or score.distance <= nearest):
             self._nearest = alone
 
     def _reached(self, loop: str, count: int, wanted: float) -> bool:
@@ -212,9 +213,6 @@ class Loops(Proposer):
             slow = least > self._deadline
             return f"takes {least:.3g} ms and {self._deadline:.3g} are allowed" if slow else None
         return f"takes {least:.3g} ms at least, and the best {fastest:.3g}" if least > CLEARLY * fastest else None
-
-    def _is_nearest(self, name: str) -> bool:
-        return self._nearest is None or self._scores[name].distance <= self._scores[self._nearest.name].distance
 
     def _refusal(self, name: str, score: Score, kept: Mapping[str, Score]) -> str | None:
         """Why a plan is too far from the original for all purposes, or no nearer than another of as many steps."""
