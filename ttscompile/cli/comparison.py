@@ -12,9 +12,8 @@ from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress,
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
-from ttscompile.plots.chunk import plot_calls
 from ttscompile.plots.figure import write_picture
-from ttscompile.plots.frontier import plot_frontier
+from ttscompile.plots.frontier import plot_calls, plot_frontier
 
 if TYPE_CHECKING:
     from rich.console import Console

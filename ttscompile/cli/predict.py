@@ -19,8 +19,8 @@ from ttscompile.cli.output import print_identity, print_json, progress, results,
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ObservationError, RuntimeUnavailableError
-from ttscompile.plots.chunk import plot_chunk
 from ttscompile.plots.figure import write_picture
+from ttscompile.plots.frontier import plot_chunk
 from ttscompile.runtimes.load import open_policy
 from ttscompile.trajectories.episodes import read_npz
 
