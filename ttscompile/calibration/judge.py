@@ -208,7 +208,9 @@ class _Answers:
             yield self._of(in_order)
             yield self._of(apart, after_another=True)
         else:
-            yield self._of(in_order if _goes_on(plan) else apart)
+            # Whether what a call of it answers depends on the calls before.
+            goes_on = plan.tokens is not None or plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
+            yield self._of(in_order if goes_on else apart)
 
     def _call_elsewhere(self, some: Sequence[tuple[int, int]], draw: np.random.Generator) -> None:
         """A call of another episode before each of these calls, by number and draw of noise."""
@@ -254,12 +256,6 @@ class _Answers:
         return found
 
 
-def _goes_on(plan: Plan) -> bool:
-    """Whether what a call of it answers depends on the calls before."""
-    reads = plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
-    return reads or plan.tokens is not None
-
-
 def _scored(
     trials: Trials, plan: Plan, sample: Sample, made: FloatArray, reports: Sequence[tuple[CallReport, int]]
 ) -> Score:
@@ -272,7 +268,8 @@ def _scored(
     gaps = np.array([h[sample.episodes == one].mean() for one in numbers])
     low, high = np.quantile(_resampled(gaps, float(apart.mean())), (0.025, 0.975))
     error = error_p90 = None
-    if _paired(trials, plan):
+    original = trials.executor.view.artifact.manifest.spec.sampler
+    if plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original):
         scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
         wrong = np.abs(x - y).reshape(*x.shape[:2], -1, spec.chunk.action_dim) / scale
         each = wrong.mean((2, 3)).clip(max=LARGEST)
@@ -302,9 +299,3 @@ def _resampled(gaps: Numbers, apart: float) -> Numbers:
     drawn = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLED, len(gaps)))
     share = gaps[drawn].mean(1) / max(apart, 1e-12)
     return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
-
-
-def _paired(trials: Trials, plan: Plan) -> bool:
-    """Whether the noise of the plan's calls means the same as in the original."""
-    original = trials.executor.view.artifact.manifest.spec.sampler
-    return plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original)

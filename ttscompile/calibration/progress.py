@@ -26,7 +26,7 @@ class Bar:
             TextColumn("{task.fields[left]}"),
         )
         self._progress = progress.Progress(*columns, console=Console(stderr=True), disable=not shown)
-        self._task, self._what = self._progress.add_task("", total=None, note="", left=""), ""
+        self._task = self._progress.add_task("", total=None, note="", left="")
 
     def __enter__(self) -> Bar:
         self._progress.start()
@@ -50,8 +50,7 @@ class Bar:
 
     def tell(self, what: str, done: int, total: int) -> None:
         """Say what is being done, how many parts are done, and of how many; see ``Progress``."""
-        if what != self._what:
-            self._what = what
+        if what != self._progress.tasks[self._task].description:
             self.stage(what, total, done)
         self._progress.update(self._task, completed=done, total=total)
 

@@ -11,9 +11,9 @@ import ttscompile
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.options import artifact_argument, json_option
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
+from ttscompile.cli.output import only_results_on_stdout, progress, say
 from ttscompile.cli.sections import Section, SectionedCommand, Sources, trajectories_options
-from ttscompile.cli.summary import print_summary
+from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
@@ -24,7 +24,6 @@ from ttscompile.report import Section as OfPage
 from ttscompile.report.build import NOT_RUN
 from ttscompile.report.measure import run_episode
 from ttscompile.report.page import require_packages
-from ttscompile.report.summary import document
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode, load_trajectories
@@ -92,10 +91,7 @@ def inspect(
         kinds = [block.kind for block in artifact.manifest.blocks]
         write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
         say(console, f"wrote {picture}")
-    if as_json:
-        print_json(document(artifact))
-    else:
-        print_summary(artifact, results())
+    print_artifact(artifact, as_json)
     if not passed:
         say(console, "failed: the artifact does not hold what it promises; the page says where.")
         context.exit(1)

@@ -106,7 +106,8 @@ class SectionedCommand(click.Command):
                 taking = ""
                 expanded.append(arg)
         rest = super().parse_args(ctx, expanded)
-        given = {one.name: one for one in self.params if _is_given(ctx, one)}
+        named = {one.name: one for one in self.params if one.name is not None}
+        given = {n: p for n, p in named.items() if ctx.get_parameter_source(n) is ParameterSource.COMMANDLINE}
         for section in self.sections:
             if section.needs and not given.keys() & set(section.needs):
                 for option in [given[name] for name in section.options if name in given]:
@@ -124,10 +125,6 @@ class SectionedCommand(click.Command):
         for section in (general, *self.sections):
             with formatter.section(section.title):
                 formatter.write_dl([record for name, record in shown if name in section.options])
-
-
-def _is_given(ctx: click.Context, one: click.Parameter) -> bool:
-    return one.name is not None and ctx.get_parameter_source(one.name) is ParameterSource.COMMANDLINE
 
 
 def _word(option: click.Parameter) -> str:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.padding import Padding
 
 from ttscompile.artifact.ceiling import uncalibrated
-from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.load import Artifact
 from ttscompile.cli.output import print_identity, print_json, results, say, table
 from ttscompile.core.plan import DENSE
 from ttscompile.measure.machine import fingerprint, one_line
@@ -18,9 +18,8 @@ from ttscompile.report.facts import chosen, remarks
 from ttscompile.report.summary import document
 
 
-def print_written(directory: Path, as_json: bool) -> None:
-    """What the artifact in a directory is now: as tables, or as one JSON document."""
-    artifact = load_artifact(directory)
+def print_artifact(artifact: Artifact, as_json: bool) -> None:
+    """What an artifact is: as tables, or as one JSON document."""
     if as_json:
         print_json(document(artifact))
     else:

@@ -71,13 +71,12 @@ def fetch_artifact(text: str, anew: bool = False) -> Fetched:
         RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     name, hub = read_name(text), library()
-    inside = f"{name.inside}/" if name.inside else ""
     with told(text):
-        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, inside + MANIFEST])
+        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, name.folder + MANIFEST])
         manifest = folder / name.inside / MANIFEST
         if not manifest.is_file():
             raise HubError(f"{text}: there is no {MANIFEST} in it, so it is no artifact.")
-        chosen = [inside + each for each in _listed(manifest, text)]
+        chosen = [name.folder + each for each in _listed(manifest, text)]
         return _fetched(hub, name, text, folder.name, chosen, anew)
 
 
@@ -111,20 +110,18 @@ def _whole(name: HubName, kept: list[str]) -> bool:
 
     One ``.ckpt`` does not: the repository may have others, which nobody downloaded.
     """
-    inside = f"{name.inside}/" if name.inside else ""
-    return any({inside + each for each in (*policy, *_PROCESSORS)} <= set(kept) for policy in _POLICIES)
+    return any({name.folder + each for each in (*policy, *_PROCESSORS)} <= set(kept) for policy in _POLICIES)
 
 
 def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
-    inside = f"{name.inside}/" if name.inside else ""
-    below = [each.removeprefix(inside) for each in files if each.startswith(inside)]
+    below = [each.removeprefix(name.folder) for each in files if each.startswith(name.folder)]
     if any(policy <= set(below) for policy in _POLICIES):
-        return [inside + each for each in below if _OF_LEROBOT.fullmatch(each)]
-    found = [inside + each for each in below if each.endswith(_CHECKPOINT)]
+        return [name.folder + each for each in below if _OF_LEROBOT.fullmatch(each)]
+    found = [name.folder + each for each in below if each.endswith(_CHECKPOINT)]
     if len(found) == 1:
         return found
     if found:
-        example = next((each.removeprefix(inside) for each in found if plain(each)), f"PATH{_CHECKPOINT}")
+        example = next((each.removeprefix(name.folder) for each in found if plain(each)), f"PATH{_CHECKPOINT}")
         raise HubError(f"{text}: it has {len(found)} checkpoints. Say which: {name.at('REVISION')}/{example}")
     has = ", ".join(each for each in files[:4] if plain(each)) or "nothing"
     expected = f"expected {_CONFIG} and {_WEIGHTS} of LeRobot, or one file {_CHECKPOINT} of Diffusion Policy"

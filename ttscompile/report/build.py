@@ -20,7 +20,7 @@ from ..plots.maps import plot_errors
 from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
-from ..verification import Rung, Verification
+from ..verification import Verification
 from .measure import Course, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .pictures import plain
@@ -206,7 +206,9 @@ def _calibration(manifest: Manifest) -> Section:
 
 def verified(found: Verification) -> Section:
     """A row a rung, what to do about the first that failed, and where residuals differ."""
-    rows = tuple((r.name, r.status, figure(r.figure), figure(r.tolerance), r.unit, _told(r)) for r in found.rungs)
+    told = [f"{r.told}." + (f" First at {r.place}." if r.place else "") for r in found.rungs]
+    figures = ((r.name, r.status, figure(r.figure), figure(r.tolerance), r.unit) for r in found.rungs)
+    rows = tuple((*each, words) for each, words in zip(figures, told, strict=True))
     head = ("rung", "verdict", "error", "allowed", "of what", "found")
     text = f"All rungs hold; {found.seconds:.1f} s. Neither the checkpoint nor torch was needed."
     if (failure := found.first_failure) is not None:
@@ -220,10 +222,6 @@ def verified(found: Verification) -> Section:
         )
         shown = (Picture(png, caption),)
     return Section("Verification", (text,), (Table(head, rows),), shown)
-
-
-def _told(rung: Rung) -> str:
-    return f"{rung.told}." + (f" First at {rung.place}." if rung.place else "")
 
 
 def figure(number: float | None) -> str:

@@ -53,11 +53,12 @@ def policy(artifact: Artifact) -> Section:
         f"{needs.read} of {needs.cells} residuals a stream, {needs.bytes_read / 1e6:.1f} MB, for its plans;"
         f" {needs.bytes_most / 1e6:.1f} MB for plans that you give"
     )
+    before = ", from the chunk of the call before"
     rows = [
         *((f"observation {key!r}", _observation(one)) for key, one in spec.observations.items()),
         ("action", action),
         *((f"loop {name!r}", told_sampler(table)) for name, table in spec.all_loops.items()),
-        *starts(manifest),
+        *((f"loop {n!r}", f"the last {one.steps} steps of {one.loop!r}{before}") for n, one in manifest.starts.items()),
         ("precision", precision(manifest)),
         *tokens(manifest),
         ("rollout cache", kept),
@@ -72,12 +73,6 @@ def policy(artifact: Artifact) -> Section:
 def _observation(one: ObservationSpec) -> str:
     inside = "as it is" if one.normalizer is None else "normalised inside"
     return f"{one.dtype}{list(one.shape)} a stream, {inside}" + ", from pictures of any size" * (one.fit is not None)
-
-
-def starts(manifest: Manifest) -> list[tuple[str, str]]:
-    """The loops that begin with the chunk of the call before."""
-    told = "the last {} steps of {!r}, from the chunk of the call before"
-    return [(f"loop {name!r}", told.format(one.steps, one.loop)) for name, one in manifest.starts.items()]
 
 
 def told_sampler(table: SamplerTable) -> str:

@@ -124,7 +124,7 @@ class Loops(Proposer):
 
     def _wanted(self, loop: str) -> float:
         """How near a plan of a loop has to be for the search to end there."""
-        if loop != ORIGINAL or self._best is None or self._deadline is not None:
+        if loop != ORIGINAL or self._best is None or self.request.deadline_ms is not None:
             return self._bound
         found = self._scores[self._best.name].distance
         return SAFER * found if found > self._bound / 2 else self._bound
@@ -193,7 +193,7 @@ class Loops(Proposer):
     def _reached(self, loop: str, count: int, wanted: float) -> bool:
         """Whether a plan of so many steps is as near as is wanted; with a deadline as many are tried as keep it."""
         score = self._scores[_name(loop, count)]
-        return near(score.distance, score.interval, wanted) and self._deadline is None
+        return near(score.distance, score.interval, wanted) and self.request.deadline_ms is None
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
         limit, now = trials.clock.limit, trials.clock.elapsed()
@@ -203,15 +203,11 @@ class Loops(Proposer):
         fewest, most = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
         return replace(own, limits=(fewest, own.state.progress.setdefault(f"most of {loop}", most)))
 
-    @property
-    def _deadline(self) -> float | None:
-        return self.request.deadline_ms
-
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""
-        if self._deadline is not None:
-            slow = least > self._deadline
-            return f"takes {least:.3g} ms and {self._deadline:.3g} are allowed" if slow else None
+        if self.request.deadline_ms is not None:
+            slow = least > self.request.deadline_ms
+            return f"takes {least:.3g} ms and {self.request.deadline_ms:.3g} are allowed" if slow else None
         return f"takes {least:.3g} ms at least, and the best {fastest:.3g}" if least > CLEARLY * fastest else None
 
     def _refusal(self, name: str, score: Score, kept: Mapping[str, Score]) -> str | None:
