@@ -101,8 +101,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
         in_time = "" if request.deadline_ms is None else f" that keeps {request.deadline_ms:.3g} ms"
         kept.trials.bar.warn(
             f"no plan{in_time} is within {request.bound:g} of the original: the default is"
-            f" {scores[chosen].distance:.2g} away, and {scores[chosen].interval[1]:.2g} at worst. Such plans lost several"
-            " points of success where they were driven. Evaluate it, record more episodes, or allow more time."
+            f" {scores[chosen].distance:.2g} away, and {scores[chosen].interval[1]:.2g} at worst. Such plans lost"
+            " several points of success where they were driven. Evaluate it, record more episodes, or allow more time."
         )
     plans = {DENSE: kept.plans[DENSE], **plans}
     return Frontier(tuple(tried), plans, {named[name]: scores[name] for name in named})

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
-from ..core.lattice import PlanArray, uniform_plan
+from ..core.lattice import uniform_plan
 from ..core.plan import UNIFORM, Plan
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
@@ -87,7 +87,8 @@ class Schedule(Proposer):
             found = task.corrected(found)
         while True:
             self.budget, kept = budget, False
-            baseline = replace(plan, cells=uniform_of(steps, blocks, budget.cells))
+            # The last cells of the budget are rounded up to a whole step, in the baseline's favour.
+            baseline = replace(plan, cells=uniform_plan(steps, blocks, -(-budget.cells // blocks)))
             yield Proposal(UNIFORM, baseline, beside=True)
             made = replace(plan, cells=found.schedule, correction=found.correction)
             kept = yield Proposal(SCHEDULE, made, found.notes, margin=float("inf"), refusal=self._refusal)
@@ -186,8 +187,3 @@ def _no_safer(score: Score, others: Mapping[str, Score]) -> str | None:
     if score.distance < others[SCHEDULE].distance:
         return None
     return f"{score.distance:.4g} from the original, no safer than {SCHEDULE}: its search was cut short"
-
-
-def uniform_of(steps: int, blocks: int, cells: int) -> PlanArray:
-    """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
-    return uniform_plan(steps, blocks, -(-cells // blocks))

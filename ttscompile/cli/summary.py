@@ -14,7 +14,6 @@ from ttscompile.core.plan import DENSE
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms
 from ttscompile.report import Table, facts, usage
-from ttscompile.report.facts import chosen, remarks
 from ttscompile.report.summary import document
 
 
@@ -82,7 +81,7 @@ def print_frontier(artifact: Artifact, directory: Path, output: Console, threads
         "Times faster: than the same policy with every step computed, compiled too. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
         f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
-        *(chosen(record) if record.get("other_noise") else remarks(record)),
+        *(facts.chosen(record) if record.get("other_noise") else facts.remarks(record)),
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
         "    policy.reset()  # a new episode",
