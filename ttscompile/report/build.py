@@ -217,9 +217,7 @@ def verified(found: Verification) -> Section:
     if (errors := found.map) is not None:
         of = errors.errors, errors.steps.tolist(), [plain(kind) for kind in errors.kinds], errors.tolerance
         png = encoded(plot_errors(*of, "residuals", errors.cells))
-        caption = (
-            "Relative error of every block's residual at the steps that were looked at: steps across, blocks down."
-        )
+        caption = "Relative error of each block's residual at the steps that were looked at: steps across, blocks down."
         shown = (Picture(png, caption),)
     return Section("Verification", (text,), (Table(head, rows),), shown)
 

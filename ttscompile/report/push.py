@@ -124,14 +124,18 @@ def card(
     of = "a policy" if base is None else f"[{base.repository}](https://huggingface.co/{base.repository})"
     lines += [f"This is {of}, compiled by ttscompile: it runs with numpy and onnxruntime alone.", ""]
     lines += ["```python", "import ttscompile", "", f'policy = ttscompile.load("hf://{repository}", threads=1)', "```"]
-    calibrated = facts.calibration(manifest)
+    calibrated, timed = facts.calibration(manifest), latency(measured, manifest.default_plan)
+    if manifest.calibration is None:
+        calibrated = Section(
+            "Calibration", ("It was not calibrated: every call is dense, and does what the base does.",)
+        )
     if manifest.spec.instruction is not None:
         lines += ["", _TOKENIZER]
     for section in (
         _what(artifact, base, licence),
         replace(calibrated, tables=calibrated.tables[:-1]),  # without the record
         _success(success),
-        latency(measured, manifest.default_plan),
+        replace(timed, text=(*timed.text, "Yours is another machine.")),
         _made(manifest, base),
         facts.limits(artifact),
     ):
