@@ -216,9 +216,8 @@ def verified(found: Verification) -> Section:
     shown: tuple[Picture, ...] = ()
     if (errors := found.map) is not None:
         of = errors.errors, errors.steps.tolist(), [plain(kind) for kind in errors.kinds], errors.tolerance
-        png = encoded(plot_errors(*of, "residuals", errors.cells))
         caption = "Relative error of each block's residual at the steps that were looked at: steps across, blocks down."
-        shown = (Picture(png, caption),)
+        shown = (Picture(encoded(plot_errors(*of, "residuals", errors.cells)), caption),)
     return Section("Verification", (text,), (Table(head, rows),), shown)
 
 

@@ -126,9 +126,8 @@ def card(
     lines += ["```python", "import ttscompile", "", f'policy = ttscompile.load("hf://{repository}", threads=1)', "```"]
     calibrated, timed = facts.calibration(manifest), latency(measured, manifest.default_plan)
     if manifest.calibration is None:
-        calibrated = Section(
-            "Calibration", ("It was not calibrated: every call is dense, and does what the base does.",)
-        )
+        told_dense = "It was not calibrated: every call is dense, and does what the base does."
+        calibrated = replace(calibrated, text=(told_dense,))
     if manifest.spec.instruction is not None:
         lines += ["", _TOKENIZER]
     for section in (
