@@ -63,10 +63,6 @@ Explain = Callable[[str, tuple[str, ...]], None]
 """Called with the name of each stage and what it did, one note a line."""
 
 
-def _silent(stage: str, notes: tuple[str, ...]) -> None:
-    """Explain nothing."""
-
-
 def convert(
     checkpoint: str | os.PathLike[str],
     directory: str | os.PathLike[str],
@@ -84,7 +80,7 @@ def convert(
     precision: str = FP32,
     keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
-    explain: Explain = _silent,
+    explain: Explain = lambda stage, notes: None,
 ) -> Program:
     """Compile a trained policy and write the artifact; its plan is dense until it is calibrated.
 
@@ -153,7 +149,7 @@ def compile_denoiser(
     precision: str = FP32,
     keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
-    explain: Explain = _silent,
+    explain: Explain = lambda stage, notes: None,
 ) -> Program:
     """Compile any denoiser that ``torch.export`` can capture.
 
@@ -268,7 +264,7 @@ def _lower_pieces(program: Program, models: Models, keep_fp32: Collection[str], 
     return LoweredPieces(INT8, own, weights, asked)
 
 
-def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = _silent) -> Program:
+def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = lambda stage, notes: None) -> Program:
     """Everything up to lowering: capture, analysis and passes. Weights share memory with the module's parameters."""
     graph, weights = capture(module, spec)
     megabytes = sum(w.nbytes for w in weights.values()) / 1e6

@@ -42,15 +42,14 @@ from ttscompile.calibration.calls import (
 )
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.pruner.paper import UPDATES, Paper
-from ttscompile.calibration.schedule import uniform_of
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Search, Task
 from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
-from ttscompile.core.lattice import PlanArray, Source, dense_plan
+from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
+from ttscompile.rivals.paper import UPDATES, Paper
 from ttscompile.runtimes.plans import pruner_plan
 
 WITH_OTHER_NOISE = 64
@@ -338,7 +337,7 @@ def main(
     ]
     task = Task.of(executor, sets[0], budget, seed)
     judge = Judge(executor, task.actions, sets[1], other_noise(executor, sets[1], seed))
-    even = uniform_of(executor.model.steps, executor.model.blocks, budget)
+    even = uniform_plan(executor.model.steps, executor.model.blocks, -(-budget // executor.model.blocks))
     rows = [judge.row("even steps", "TIMESTEP", even, None, 0.0)]
     if "refreshed" in ways:
         rows += refreshed(task, judge, even)

@@ -14,11 +14,12 @@ from pathlib import Path
 import click
 from foresight import Oracle, oracle
 
-from ttscompile.cli.output import counted_parts, print_json, results_console, run, say, table
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.calibration.progress import Bar
+from ttscompile.cli.output import print_json, results_console, run, say, table
+from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 
 
-@click.command(cls=FilesCommand, context_settings={"show_default": True})
+@click.command(cls=SectionedCommand, context_settings={"show_default": True})
 @click.argument("directory", type=click.Path(exists=True, path_type=Path))
 @trajectories_options()
 @click.option("--computed-steps", default=3, help="Of a call.")
@@ -40,8 +41,8 @@ def main(
 ) -> None:
     """Measure it for the policy of the artifact in DIRECTORY."""
     sizes = {"schedules": schedules, "calls": calls, "draws": draws, "seed": seed}
-    with counted_parts() as tell:
-        found = oracle(directory, trajectories, computed_steps, observation=sources, **sizes, progress=tell)
+    with Bar(shown=True) as bar:
+        found = oracle(directory, trajectories, computed_steps, observation=sources, **sizes, progress=bar.tell)
     if as_json:
         print_json(found.to_json())
     else:

@@ -39,7 +39,7 @@ def main(
     measured = measure(entered, calls, 0, in_a_row=in_a_row)
     output = results()
     print_facts(output, timing_table(measured, artifact.manifest.default_plan, ("prologue", "pruner")))
-    say(output, timing_remarks(measured, calls), f"The last of {in_a_row} calls in a row: its caches are warm.")
+    say(output, timing_remarks(measured), f"The last of {in_a_row} calls in a row: its caches are warm.")
 
 
 if __name__ == "__main__":

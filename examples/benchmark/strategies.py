@@ -28,7 +28,7 @@ from ttscompile.cli.options import (
     threads_option,
 )
 from ttscompile.cli.output import print_json, progress, results, run, say
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 from ttscompile.cli.types import PATH, PICTURE, TEXT, Number
 from ttscompile.measure.machine import fingerprint, one_line
 
@@ -56,7 +56,7 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     return found
 
 
-@click.command(cls=FilesCommand)
+@click.command(cls=SectionedCommand)
 @artifact_argument
 @trajectories_options()
 @names_option("--strategies", NAMES, default="tts,bac,interval", help="Have each of these find plans.")

@@ -28,11 +28,12 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.step_counts import SAFE
 from ttscompile.cli.contestants import Way, contestants, originals
-from ttscompile.cli.frontier import print_frontier
+from ttscompile.cli.summary import print_frontier
 from ttscompile.core.lattice import Source
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.core.spec import BF16, FP16, FP32, INT8
 from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
 from ttscompile.report.timing import measure
 
@@ -248,7 +249,7 @@ def main(
     picture, animation = directory / "plan.png", directory / "episode.gif"
     cells = built.plan(plan).cells
     if cells is not None:
-        plot_plan(cells, [block.kind for block in built.manifest.blocks], picture)
+        write_picture(plot_plan(cells, [block.kind for block in built.manifest.blocks]), picture)
         console.print(f"which blocks one call computes: {picture}")
     pair = [evaluations[0].rollout.episodes[0], evaluations[1 + best].rollout.episodes[0]]
     save_animation(animation, PushT, pair, [ORIGINAL, plan])

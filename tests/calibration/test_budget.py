@@ -12,7 +12,7 @@ import pytest
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import budget as budgets
 from ttscompile.calibration import pipeline, schedule
-from ttscompile.calibration.budget import Budget, Goal, cells_of, goal_of, measure_budget
+from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
@@ -102,7 +102,7 @@ def test_a_target_of_flops_is_kept_and_recorded(artifact: Path, recording: Path)
     assert one_more < 0.5  # another whole step would not fit
 
 
-def measured(directory: Path, goal: Goal, pruned: bool) -> Budget:
+def measured(directory: Path, goal: Goal, pruned: bool) -> Goal:
     artifact = load_artifact(directory)
     return measure_budget(artifact, artifact.plans["dense"], goal, pruned)
 

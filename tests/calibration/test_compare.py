@@ -26,6 +26,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import CalibrationError, OutputError
 from ttscompile.measure.points import Comparison, MeasuredPoint
+from ttscompile.plots.figure import write_picture
 from ttscompile.plots.frontier import plot_frontier
 
 from . import policies
@@ -143,7 +144,7 @@ def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Pa
 
 
 def _point(name: str, latency: float, error: float) -> MeasuredPoint:
-    return MeasuredPoint("s", name, error, (0.0, 9.0), error, error, latency, (latency, latency), 0.5, 1.0)
+    return MeasuredPoint("s", name, error, latency, (0.0, 9.0), error, error, (latency, latency), 0.5, 1.0)
 
 
 def test_the_frontier_is_what_nothing_beats() -> None:
@@ -155,13 +156,13 @@ def test_the_frontier_is_what_nothing_beats() -> None:
 
 def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp_path: Path) -> None:
     path = tmp_path / "f.png"
-    arguments: tuple[Any, ...] = [p.point for p in frontier.points], [p.point for p in frontier.efficient()]
-    plot_frontier(*arguments, path, "title")
+    arguments: tuple[Any, ...] = frontier.points, frontier.efficient()
+    write_picture(plot_frontier(*arguments, "title"), path)
     with Image.open(path) as picture:
         colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
     assert {(0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)} <= colours
     with pytest.raises(OutputError, match="folder that exists"):
-        plot_frontier(*arguments, tmp_path / "none" / "f.png", "title")
+        write_picture(plot_frontier(*arguments, "title"), tmp_path / "none" / "f.png")
 
 
 def test_bench_prints_the_same_as_a_table_and_as_json(

@@ -121,7 +121,7 @@ def test_precision_is_learned_and_nothing_is_reused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As ``build`` does it: eight bits where they are near enough. The record says why no schedule was looked for."""
-    monkeypatch.setattr("ttscompile.calibration.proposers.precision.MARGIN", allowed)
+    monkeypatch.setattr("ttscompile.calibration.proposers.precision.Precision.margin", allowed)
     directory = tmp_path / "artifact"
     copy(made, directory)
     result = calibrate(directory, [recorded], learn=("loops", "precision"), max_distance=allowed, progress=False)

@@ -17,7 +17,7 @@ from tests.plans import store_schedules
 from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli import main
-from ttscompile.cli.choosing import choosable, choose_again
+from ttscompile.cli.bench import choosable, choose_again
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
 from ttscompile.measure.points import fastest

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from tests.plans import store_schedules
 from ttscompile.cli import main
-from ttscompile.cli.bench_report import fewest_threads
+from ttscompile.cli.bench import fewest_threads
 from ttscompile.core.lattice import uniform_plan
 
 pytestmark = pytest.mark.slow

@@ -19,7 +19,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor
 from ttscompile.doctor import machine as doctor_machine
 from ttscompile.doctor import packages as doctor_packages
-from ttscompile.doctor.artifact import artifact_findings
+from ttscompile.doctor.target import artifact_findings
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +195,7 @@ def test_int8_without_integer_dot_products_is_a_warning(calibrated: Path, monkey
 
 
 def test_too_little_memory_is_a_problem(calibrated: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ttscompile.doctor import artifact as doctor_artifact
+    from ttscompile.doctor import target as doctor_artifact
 
     monkeypatch.setattr(doctor_artifact, "available_bytes", lambda: 1000)
     assert found("memory", artifact_findings(calibrated)).level is Level.PROBLEM

@@ -13,7 +13,7 @@ import ttscompile
 from tests.frontends.lerobot_tiny import DS, save_policy
 from ttscompile import driver
 from ttscompile.cli import main
-from ttscompile.doctor.checkpoint import target_findings
+from ttscompile.doctor.target import target_findings
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.cli import main
-from ttscompile.cli.choosing import choosable, choose_again
+from ttscompile.cli.bench import choosable, choose_again
 from ttscompile.cli.contestants import Way, contestants
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.report.timing import Measurement

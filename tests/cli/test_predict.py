@@ -16,7 +16,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile import ObservationSpec
 from ttscompile.cli import main
-from ttscompile.cli.observed import observed
+from ttscompile.cli.predict import observed
 from ttscompile.errors import ObservationError
 
 FRONT, WRIST, STATE = "observation.images.front", "observation.images.wrist", "observation.state"

@@ -15,7 +15,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import Instruction
 from ttscompile.errors import ReportError
-from ttscompile.report.card import card
+from ttscompile.report.push import card
 
 
 @pytest.mark.slow

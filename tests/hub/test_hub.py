@@ -25,7 +25,7 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.hub import fetch_artifact, fetch_checkpoint
 from ttscompile.hub.name import HubName, read_name
-from ttscompile.report.card import card
+from ttscompile.report.push import card
 
 from .served import Hub, serving
 

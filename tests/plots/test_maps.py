@@ -13,7 +13,8 @@ from PIL import Image
 from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
 from ttscompile.measure.points import Point
-from ttscompile.plots import frontier
+from ttscompile.plots.figure import write_picture
+from ttscompile.plots.frontier import plot_frontier
 from ttscompile.plots.maps import COLOURS, plot_plan
 
 
@@ -28,7 +29,7 @@ def test_colours_cover_the_picture_as_the_plan_says(tmp_path: Path) -> None:
     plan[0] = Source.COMPUTE  # 10 cells
     plan[5:15, 2] = Source.FORWARD  # 10 cells
     plan[5:15, 4:8] = Source.ROLLOUT  # 40 cells, which leaves 140
-    plot_plan(plan, ["feed_forward"] * 10, tmp_path / "plan.png", "a plan")
+    write_picture(plot_plan(plan, ["feed_forward"] * 10, "a plan"), tmp_path / "plan.png")
     counts = {source: pixels_of(source, tmp_path / "plan.png") for source in Source}
     cell = counts[Source.TIMESTEP] / 140
     assert cell > 50, "a cell of the picture is too small to be seen"
@@ -40,29 +41,26 @@ def test_colours_cover_the_picture_as_the_plan_says(tmp_path: Path) -> None:
 def test_the_same_plan_is_the_same_file(tmp_path: Path) -> None:
     plan = np.zeros((4, 2), np.int8)
     for name in ("a.png", "b.png"):
-        plot_plan(plan, ["self_attention", "x"], tmp_path / name)
+        write_picture(plot_plan(plan, ["self_attention", "x"]), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 @pytest.mark.parametrize("plan", [np.zeros((4, 3), np.int8), np.full((4, 2), 4, np.int8), np.zeros((1, 4, 2), np.int8)])
-def test_what_is_no_plan_of_these_blocks_is_refused(plan: np.ndarray, tmp_path: Path) -> None:
+def test_what_is_no_plan_of_these_blocks_is_refused(plan: np.ndarray) -> None:
     with pytest.raises(IllegalPlanError, match=r"expected \[K, 2\]"):
-        plot_plan(plan, ["self_attention", "feed_forward"], tmp_path / "plan.png")
-    assert list(tmp_path.iterdir()) == []
+        plot_plan(plan, ["self_attention", "feed_forward"])
 
 
-def frontier_of(points: list[Point], monkeypatch: pytest.MonkeyPatch) -> Figure:
+def frontier_of(points: list[Point]) -> Figure:
     """The figure of a frontier, laid out."""
-    drawn: list[Figure] = []
-    monkeypatch.setattr(frontier, "write_picture", lambda figure, path: drawn.append(figure))
-    frontier.plot_frontier(points, sorted(points, key=lambda p: p.latency_ms), Path(), "title")
-    drawn[0].canvas.draw()
-    return drawn[0]
+    figure = plot_frontier(points, sorted(points, key=lambda p: p.latency_ms), "title")
+    figure.canvas.draw()
+    return figure
 
 
-def test_logarithmic_axes_have_plain_numbers_and_names_stay_inside(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logarithmic_axes_have_plain_numbers_and_names_stay_inside() -> None:
     points = [Point("s", "quick", 2.0, 0.5), Point("s", "a long name of a plan", 0.03, 130.0)]
-    figure = frontier_of(points, monkeypatch)
+    figure = frontier_of(points)
     (axes,) = figure.axes
     labels = [t for axis in (axes.xaxis, axes.yaxis) for t in axis.get_ticklabels(which="both") if t.get_text()]
     assert {"0.1", "1", "100"} <= {t.get_text() for t in labels}
@@ -73,7 +71,7 @@ def test_logarithmic_axes_have_plain_numbers_and_names_stay_inside(monkeypatch: 
     assert all(frame.x0 < t.get_window_extent().x0 and t.get_window_extent().x1 < frame.x1 for t in axes.texts)
 
 
-def test_the_frontier_of_one_point_is_no_line_and_the_dense_plan_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    figure = frontier_of([Point("s", "quick", 2.0, 5.0), Point("s", "dense", 0.0, 99.0)], monkeypatch)
+def test_the_frontier_of_one_point_is_no_line_and_the_dense_plan_is_told() -> None:
+    figure = frontier_of([Point("s", "quick", 2.0, 5.0), Point("s", "dense", 0.0, 99.0)])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["s"]
     assert "dense of s, 99 ms" in figure.axes[0].get_title(loc="left")

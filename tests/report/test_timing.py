@@ -16,7 +16,7 @@ from ttscompile.artifact.write import update_plans
 from ttscompile.cli.contestants import Way, contestants
 from ttscompile.core.lattice import dense_plan
 from ttscompile.core.plan import Plan
-from ttscompile.doctor.artifact import artifact_findings
+from ttscompile.doctor.target import artifact_findings
 from ttscompile.ir.program import Program
 from ttscompile.report.timing import measure_plans
 from ttscompile.runtimes.random_calls import random_call

@@ -11,8 +11,7 @@ import pytest
 
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.core.finding import Finding, Level
-from ttscompile.trajectories.fits import examine_recordings
-from ttscompile.trajectories.ranges import Placed
+from ttscompile.trajectories.fits import Placed, examine_recordings
 
 from ..calibration import policies
 

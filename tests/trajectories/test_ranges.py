@@ -11,7 +11,7 @@ import pytest
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode
-from ttscompile.trajectories.ranges import check_ranges
+from ttscompile.trajectories.fits import check_ranges
 
 from ..calibration import policies
 

@@ -37,7 +37,7 @@ WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0
 
 @dataclass(frozen=True)
 class Goal:
-    """What was asked for.
+    """What was asked for, and what it comes to.
 
     Attributes:
         kind: ``target_sparsity``: share of the cells to reuse. ``target_flops``: share of the FLOPs of a dense call of
@@ -45,40 +45,27 @@ class Goal:
             machine. ``max_action_error``: on held-out episodes, in the units of the actions.
         value: the figure that was asked for, in the unit of its kind.
         threads: how many threads the timed calls have; for ``latency_ms`` alone.
+        cells: that a plan may compute, step 0 included; 0 before that is known.
+        measured: how it was found out, where it was measured; JSON.
     """
 
     kind: str
     value: float
     threads: int = 1
-
-    def record(self) -> dict[str, Any]:
-        """As JSON, for the record and the settings of a state."""
-        return {self.kind: self.value, **({"threads": self.threads} if self.kind == LATENCY else {})}
-
-    def sparsity(self, cells: int, manifest: Manifest) -> float:
-        """Share of the cells that a plan has to reuse, given how many it may compute."""
-        return self.value if self.kind == SPARSITY else 1 - cells / (manifest.steps * len(manifest.blocks))
-
-    def __str__(self) -> str:
-        return f"{self.kind.replace('_', ' ')} {self.value:g}"
-
-
-@dataclass(frozen=True)
-class Budget:
-    """A goal, and what it comes to.
-
-    Attributes:
-        cells: that a plan may compute, step 0 included.
-        measured: how it was found out, where it was measured; JSON.
-    """
-
-    goal: Goal
-    cells: int
+    cells: int = 0
     measured: Mapping[str, Any] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
-        """As JSON, for the record."""
-        return {**self.goal.record(), "cells": self.cells, **self.measured}
+        """As JSON, for the record and the settings of a state."""
+        found = {self.kind: self.value, **({"threads": self.threads} if self.kind == LATENCY else {})}
+        return {**found, "cells": self.cells, **self.measured} if self.cells else found
+
+    def sparsity(self, manifest: Manifest) -> float:
+        """Share of the cells that a plan has to reuse."""
+        return self.value if self.kind == SPARSITY else 1 - self.cells / (manifest.steps * len(manifest.blocks))
+
+    def __str__(self) -> str:
+        return f"{self.kind.replace('_', ' ')} {self.value:g}"
 
 
 def goal_of(
@@ -151,8 +138,8 @@ def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
     return cells
 
 
-def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> Budget:
-    """The largest number of computed cells, in whole steps, whose calls fit.
+def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> Goal:
+    """The goal with the largest number of computed cells, in whole steps, whose calls fit.
 
     Bisection over the number of steps; each candidate is the median of some calls on one stream. Where the pruner may
     run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``; ``base`` is a plan of the
@@ -193,9 +180,8 @@ def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> 
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if fits(middle) else (low, middle)
-    return Budget(
-        goal, low * blocks, {"measured_ms": {str(full): round(measured[full], 3) for full in sorted(measured)}}
-    )
+    measured_ms = {str(full): round(measured[full], 3) for full in sorted(measured)}
+    return replace(goal, cells=low * blocks, measured={"measured_ms": measured_ms})
 
 
 def median_ms(call: Callable[[], object]) -> float:

@@ -17,7 +17,7 @@ from ..errors import CalibrationError
 from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode, load_trajectories
-from ..trajectories.ranges import check_ranges
+from ..trajectories.fits import check_ranges
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]

@@ -98,18 +98,14 @@ def choose(kept: Kept, request: Request) -> Frontier:
         for name in sorted(entered, key=lambda one: times[one].median)
     ]
     if chosen not in close:
-        kept.trials.bar.warn(_remark(scores[chosen], request))
+        in_time = "" if request.deadline_ms is None else f" that keeps {request.deadline_ms:.3g} ms"
+        kept.trials.bar.warn(
+            f"no plan{in_time} is within {request.bound:g} of the original: the default is"
+            f" {scores[chosen].distance:.2g} away, and {scores[chosen].interval[1]:.2g} at worst. Such plans lost"
+            " several points of success where they were driven. Evaluate it, record more episodes, or allow more time."
+        )
     plans = {DENSE: kept.plans[DENSE], **plans}
     return Frontier(tuple(tried), plans, {named[name]: scores[name] for name in named})
-
-
-def _remark(score: Score, request: Request) -> str:
-    in_time = "" if request.deadline_ms is None else f" that keeps {request.deadline_ms:.3g} ms"
-    return (
-        f"no plan{in_time} is within {request.bound:g} of the original: the default is {score.distance:.2g} away, and"
-        f" {score.interval[1]:.2g} at worst. Such plans lost several points of success where they were driven. Evaluate"
-        " it, record more episodes, or allow more time."
-    )
 
 
 def _chosen(

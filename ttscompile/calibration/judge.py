@@ -196,31 +196,21 @@ class _Answers:
 
     def all(self) -> Iterator[FloatArray]:
         """Denoised samples ``[N, R, T, D]``; twice for a plan that begins with the chunk of the call before."""
-        if self._plan.otherwise is not None:
-            if any(first == last for _, first, last in self._sample.stretches):
+        sample, plan = self._sample, self._plan
+        in_order = [(number, first, last) for number, (_, first, last) in enumerate(sample.stretches.tolist())]
+        apart = [(stretch, row, row) for stretch, row in sample.calls.tolist()]
+        if plan.otherwise is not None:
+            if any(first == last for _, first, last in in_order):
                 told = (
                     "a plan that begins with the chunk of the call before is judged on episodes of two calls at least"
                 )
                 raise CalibrationError(f"{told}; one that was recorded has one call. Record longer ones.")
-            yield self._in_order()
-            yield self._apart(after_another=True)
+            yield self._of(in_order)
+            yield self._of(apart, after_another=True)
         else:
-            yield self._in_order() if _goes_on(self._plan) else self._apart()
-
-    def _empty(self) -> FloatArray:
-        return np.empty((len(self._sample.calls), self._sample.draws, *self._spec.sample), np.float32)
-
-    def _apart(self, after_another: bool = False) -> FloatArray:
-        """Every call the first of an episode, or after one of another, drawn at random: as if the world had changed."""
-        sample, made, draw = self._sample, self._empty(), np.random.default_rng((self._trials.seed, 6))
-        asked = [(n, r) for n in range(len(sample.calls)) for r in range(sample.draws)]
-        for some in _batches(asked, self._streams):
-            self._runtime.reset()
-            if after_another:
-                self._call_elsewhere(some, draw)
-            found = self._call([(*sample.calls[n].tolist(), r) for n, r in some], scored=range(len(some)))
-            made[tuple(np.array(some).T)] = found
-        return made
+            # Whether what a call of it answers depends on the calls before.
+            goes_on = plan.tokens is not None or plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
+            yield self._of(in_order if goes_on else apart)
 
     def _call_elsewhere(self, some: Sequence[tuple[int, int]], draw: np.random.Generator) -> None:
         """A call of another episode before each of these calls, by number and draw of noise."""
@@ -232,23 +222,28 @@ class _Answers:
         keys = [(2, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
         self._runtime.predict(trials.observation(others), trials.noise(self._spec, keys), self._plan)
 
-    def _in_order(self) -> FloatArray:
-        """All calls of each stretch, one after the other; those of several stretches together."""
-        sample, made = self._sample, self._empty()
+    def _of(self, parts: Sequence[tuple[int, int, int]], after_another: bool = False) -> FloatArray:
+        """All calls of parts of stretches, from a row to another, one after the other; those of several parts together.
+
+        A part's first call is the first of an episode, or comes after one of another, drawn at random: as if the world
+        had changed.
+        """
+        sample, draws = self._sample, np.random.default_rng((self._trials.seed, 6))
+        made = np.empty((len(sample.calls), sample.draws, *self._spec.sample), np.float32)
         numbers = {(stretch, row): n for n, (stretch, row) in enumerate(sample.calls.tolist())}
-        asked = [(stretch, draw) for stretch in range(len(sample.stretches)) for draw in range(sample.draws)]
-        for some in _batches(asked, self._streams):
+        asked = [(*part, draw) for part in parts for draw in range(sample.draws)]
+        for some in (asked[i : i + self._streams] for i in range(0, len(asked), self._streams)):
             self._runtime.reset()
-            ends = sample.stretches[[stretch for stretch, _ in some], 1:].tolist()
-            for step in range(max(last - first for first, last in ends) + 1):
-                # A stretch that is over goes on with its last call, for nobody.
-                rows = [min(first + step, last) for first, last in ends]
-                going = [i for i, (first, last) in enumerate(ends) if first + step <= last]
-                wanted = [i for i in going if (some[i][0], rows[i]) in numbers]
-                calls = [(stretch, row, draw) for (stretch, draw), row in zip(some, rows, strict=True)]
+            if after_another:
+                self._call_elsewhere([(numbers[stretch, row], draw) for stretch, row, _, draw in some], draws)
+            for step in range(max(last - first for _, first, last, _ in some) + 1):
+                # A part that is over goes on with its last call, for nobody.
+                calls = [(stretch, min(first + step, last), draw) for stretch, first, last, draw in some]
+                going = [i for i, (_, first, last, _) in enumerate(some) if first + step <= last]
+                wanted = [i for i in going if calls[i][:2] in numbers]
                 found = self._call(calls, wanted)
                 for i in wanted:
-                    made[numbers[some[i][0], rows[i]], some[i][1]] = found[i]
+                    made[numbers[calls[i][:2]], calls[i][2]] = found[i]
         return made
 
     def _call(self, calls: Sequence[tuple[int, int, int]], scored: Sequence[int]) -> FloatArray:
@@ -259,16 +254,6 @@ class _Answers:
         found, report = self._runtime.predict(obs, noise, self._plan)
         self.reports += [(report, i) for i in scored]
         return found
-
-
-def _batches(asked: Sequence[tuple[int, int]], size: int) -> Iterator[Sequence[tuple[int, int]]]:
-    return (asked[i : i + size] for i in range(0, len(asked), size))
-
-
-def _goes_on(plan: Plan) -> bool:
-    """Whether what a call of it answers depends on the calls before."""
-    reads = plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
-    return reads or plan.tokens is not None
 
 
 def _scored(
@@ -283,7 +268,8 @@ def _scored(
     gaps = np.array([h[sample.episodes == one].mean() for one in numbers])
     low, high = np.quantile(_resampled(gaps, float(apart.mean())), (0.025, 0.975))
     error = error_p90 = None
-    if _paired(trials, plan):
+    original = trials.executor.view.artifact.manifest.spec.sampler
+    if plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original):
         scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
         wrong = np.abs(x - y).reshape(*x.shape[:2], -1, spec.chunk.action_dim) / scale
         each = wrong.mean((2, 3)).clip(max=LARGEST)
@@ -313,9 +299,3 @@ def _resampled(gaps: Numbers, apart: float) -> Numbers:
     drawn = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLED, len(gaps)))
     share = gaps[drawn].mean(1) / max(apart, 1e-12)
     return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
-
-
-def _paired(trials: Trials, plan: Plan) -> bool:
-    """Whether the noise of the plan's calls means the same as in the original."""
-    original = trials.executor.view.artifact.manifest.spec.sampler
-    return plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original)

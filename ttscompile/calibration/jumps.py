@@ -30,14 +30,7 @@ def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> t
     """A network, trained on all calls, and what it would have added to each; see ``on_other_episodes``.
 
     Args:
-        known: what it reads, ``[n, I]``.
-        missing: what should be added, ``[n, D T]``.
-        episodes: of each call, ``[n]``.
         seed: of the weights that training begins with, and of the order of the calls.
-
-    Returns:
-        Its layers, each with the row that is added last, and ``[n, D T]``. None where that leaves over more than is
-        missing, or there are fewer episodes than ``FOLDS``.
     """
     return on_other_episodes(partial(_trained, seed=seed), known, missing, episodes)
 

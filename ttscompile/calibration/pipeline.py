@@ -214,7 +214,7 @@ def calibrate(
             learned=tuple(row.name for row in rows),
             strategy=strategy,
             seed=seed,
-            target_sparsity=goal.sparsity(schedule.budget.cells, view.manifest),
+            target_sparsity=schedule.budget.sparsity(view.manifest),
             default_plan=kept.default,
             plans=kept.scores,
             other_noise=other_noise(trials),

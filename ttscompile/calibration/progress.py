@@ -48,6 +48,12 @@ class Bar:
             self._progress.console.print(f"{what}: {total - done} to do", markup=False, soft_wrap=True)
         self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")
 
+    def tell(self, what: str, done: int, total: int) -> None:
+        """Say what is being done, how many parts are done, and of how many; see ``Progress``."""
+        if what != self._progress.tasks[self._task].description:
+            self.stage(what, total, done)
+        self._progress.update(self._task, completed=done, total=total)
+
     def update(self, done: int, note: str, seconds_left: float) -> None:
         """Say how far it is."""
         left = f"at most {max(seconds_left, 0) / 60:.1f} min left"

@@ -7,9 +7,10 @@ Members as those of the algorithms of NNCF: whether it applies, what it does, an
 from __future__ import annotations
 
 import pkgutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy.typing as npt
 
@@ -107,18 +108,27 @@ Proposals: TypeAlias = Generator[Proposal, bool, None]
 """Each is sent whether the proposal before was kept."""
 
 
-class Proposer(Protocol):
+class Proposer(ABC):
     """Something that learns. Made of a ``Request``.
 
     Attributes:
+        request: what was asked for.
         told: one sentence on what became of it, for people; read after ``propose`` is exhausted or left.
+        margin: its own ``Proposal.margin``, or what was asked for in place of that.
     """
 
-    told: str
+    margin = 0.0
+
+    def __init__(self, request: Request) -> None:
+        self.request, self.told = request, ""
+        if request.margin is not None:
+            self.margin = request.margin
 
     def applies(self, artifact: Artifact) -> str | None:
         """Why it can do nothing for this policy; None if it can. Asked before any work."""
+        return None
 
+    @abstractmethod
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """Propose plans made from a plan, the best so far, the most wished for first.
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
-from ..core.lattice import PlanArray, uniform_plan
+from ..core.lattice import uniform_plan
 from ..core.plan import UNIFORM, Plan
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..ir.plan_head import has_head
-from .budget import ERROR, FLOPS, LATENCY, Budget, cells_of, measure_budget
+from .budget import ERROR, FLOPS, LATENCY, Goal, cells_of, measure_budget
 from .clock import Clock
 from .judge import Score
-from .proposer import Proposal, Proposals, Request
+from .proposer import Proposal, Proposals, Proposer, Request
 from .search import open_search, searched
 from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
 from .strategies import FITTED, strategy_of
@@ -32,7 +32,7 @@ BETTER = 0.9
 """A plan has to bring the distance below this share of the uniform schedule's."""
 
 
-class Schedule:
+class Schedule(Proposer):
     """Plans of whole steps, corrected; or what another strategy finds. See ``Proposer``.
 
     Attributes:
@@ -42,13 +42,14 @@ class Schedule:
     """
 
     def __init__(self, request: Request) -> None:
-        self._request, self._strategy = request, strategy_of(request.strategy)
-        self.told, self.budget, self.intervals, self.stopped = "", Budget(request.goal, 0), 0, ""
+        super().__init__(request)
+        self._strategy = strategy_of(request.strategy)
+        self.budget, self.intervals, self.stopped = request.goal, 0, ""
         self.skipped: dict[str, str] = {}
 
     def applies(self, artifact: Artifact) -> str | None:
         """See ``Proposer``."""
-        view, goal = view_of(artifact, base_of(artifact)), self._request.goal
+        view, goal = view_of(artifact, base_of(artifact)), self.request.goal
         if view.manifest.steps == 1:
             told = "the policy has one denoising step, which every plan computes: nothing can be reused"
             return f"{told}. Learn which parts may have eight bits: --learn precision."
@@ -57,7 +58,7 @@ class Schedule:
                 f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {self._strategy.name!r}. Give"
                 " this strategy a target_sparsity, a target_flops or a latency_ms."
             )
-        if self._request.correct and self._strategy.fits_correction:
+        if self.request.correct and self._strategy.fits_correction:
             return f"strategy {self._strategy.name!r} fits a correction of its own. Leave correct out."
         try:
             if goal.kind not in (LATENCY, ERROR):
@@ -69,7 +70,7 @@ class Schedule:
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``."""
-        view, request = trials.executor.view, self._request
+        view, request = trials.executor.view, self.request
         self._manifest = view.manifest
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
@@ -86,7 +87,8 @@ class Schedule:
             found = task.corrected(found)
         while True:
             self.budget, kept = budget, False
-            baseline = replace(plan, cells=uniform_of(steps, blocks, budget.cells))
+            # The last cells of the budget are rounded up to a whole step, in the baseline's favour.
+            baseline = replace(plan, cells=uniform_plan(steps, blocks, -(-budget.cells // blocks)))
             yield Proposal(UNIFORM, baseline, beside=True)
             made = replace(plan, cells=found.schedule, correction=found.correction)
             kept = yield Proposal(SCHEDULE, made, found.notes, margin=float("inf"), refusal=self._refusal)
@@ -112,20 +114,20 @@ class Schedule:
             proposal = Proposal(name, made, {"steps": one.notes["steps"]}, beside=True)
             yield replace(proposal, refusal=_no_safer) if name == SAFE else proposal
 
-    def _budget(self, trials: Trials, view: View, clock: Clock) -> Budget | None:
+    def _budget(self, trials: Trials, view: View, clock: Clock) -> Goal | None:
         """The budget; None where it is found on the calls to learn from."""
-        goal, manifest = self._request.goal, view.manifest
+        goal, manifest = self.request.goal, view.manifest
         if goal.kind == ERROR:
             return None
         if goal.kind != LATENCY:
-            return Budget(goal, cells_of(goal, manifest, self._may_prune(view)))
+            return replace(goal, cells=cells_of(goal, manifest, self._may_prune(view)))
         known = trials.state.progress.get("latency")
         if known is None:
             budget = measure_budget(trials.artifact, trials.base, goal, self._may_prune(view))
             known = {"cells": budget.cells, "measured": budget.measured}
             trials.state.progress.update(latency=known, seconds=clock.elapsed())
             trials.state.save()
-        budget = Budget(goal, known["cells"], known["measured"])
+        budget = replace(goal, cells=known["cells"], measured=known["measured"])
         self._strategy.require_reach(manifest.steps, len(manifest.blocks), budget.cells)
         return budget
 
@@ -144,8 +146,8 @@ class Schedule:
 
     def _refusal(self, score: Score, others: Mapping[str, Score]) -> str | None:
         """Which of the budget's promises a score breaks."""
-        goal, uniform, manifest = self._request.goal, others[UNIFORM], self._manifest
-        wished = goal.sparsity(self.budget.cells, manifest)
+        goal, uniform, manifest = self.request.goal, others[UNIFORM], self._manifest
+        wished = self.budget.sparsity(manifest)
         if not score.distance <= NO_NUMBERS:
             return "gives actions that are not numbers."
         if score.sparsity < wished - 1e-9:
@@ -185,8 +187,3 @@ def _no_safer(score: Score, others: Mapping[str, Score]) -> str | None:
     if score.distance < others[SCHEDULE].distance:
         return None
     return f"{score.distance:.4g} from the original, no safer than {SCHEDULE}: its search was cut short"
-
-
-def uniform_of(steps: int, blocks: int, cells: int) -> PlanArray:
-    """The baseline: whole steps, evenly spaced; the last cells of the budget are rounded up to one, in its favour."""
-    return uniform_plan(steps, blocks, -(-cells // blocks))

@@ -69,11 +69,6 @@ class Place:
         return torch.cat([batch.sample for batch in self.judged])
 
     @property
-    def fitted_samples(self) -> Tensor:
-        """Those of the calls that corrections are fitted on, ``[N, T, D]``."""
-        return torch.cat([batch.sample for batch in self.fitted])
-
-    @property
     def held(self) -> list[Tensor]:
         """The samples and residuals of it; places share those that nothing changed between them."""
         return [tensor for batch in (*self.fitted, *self.judged) for tensor in batch.held]
@@ -283,4 +278,8 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
     """
     loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
     ends = loop.ends(plan) if may_jump(executor.view.manifest.spec.sample) else (loop.end(plan),)
-    return loop.correction(min(ends, key=lambda place: float((place.fitted_samples - calls.targets).abs().mean())))
+
+    def missing(place: Place) -> float:
+        return float((torch.cat([batch.sample for batch in place.fitted]) - calls.targets).abs().mean())
+
+    return loop.correction(min(ends, key=missing))

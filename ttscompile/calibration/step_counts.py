@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from ..errors import CalibrationFailedError
-from .budget import Budget, Goal
+from .budget import Goal
 from .clock import Clock
 from .progress import Bar
 from .spacing import CROWDING, spacings
@@ -81,8 +82,8 @@ class SpacedSchedules:
             return Errors(float(normalised), float(units))
 
 
-def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: int) -> Budget:
-    """The fewest whole steps with which a crowded schedule is as good as was asked for.
+def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: int) -> Goal:
+    """The goal with the fewest whole steps with which a crowded schedule is as good as was asked for.
 
     Judged on calls to learn from that its correction was not fitted on: the held-out episodes stay out of it. The goal
     is of kind ``max_action_error``.
@@ -115,7 +116,9 @@ def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: in
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if enough(middle) else (middle, high)
-    return Budget(goal, high * blocks, {"errors": {str(full): error for full, error in sorted(tried.items())}})
+    return replace(
+        goal, cells=high * blocks, measured={"errors": {str(n): error for n, error in sorted(tried.items())}}
+    )
 
 
 def named_plans(

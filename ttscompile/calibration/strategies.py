@@ -1,4 +1,4 @@
-"""The strategies by name: this project's own, the paper's, and those of others."""
+"""The strategies by name: this project's own, and those that others have published, the paper's among them."""
 
 from __future__ import annotations
 
@@ -7,23 +7,15 @@ import pkgutil
 from ..errors import CalibrationError
 from .strategy import Strategy
 
-OWN = (
+STRATEGIES: tuple[Strategy, ...] = (
     Strategy(
         "tts",
         "whole steps with a correction, the same for every observation; this project's own",
         "calibration.tts:Tts",
         fits_correction=True,
     ),
-    Strategy(
-        "tts-paper",
-        "test-time sparsity as published, arXiv 2605.13316: gates trained for each observation",
-        "calibration.pruner.paper:Paper",
-        uses_pruner=True,
-        consecutive=True,
-    ),
+    *pkgutil.resolve_name("ttscompile.rivals:RIVALS"),
 )
-
-STRATEGIES: tuple[Strategy, ...] = (*OWN, *pkgutil.resolve_name("ttscompile.rivals:RIVALS"))
 """In the order in which they are listed; the first one is the default."""
 
 NAMES = tuple(one.name for one in STRATEGIES)

@@ -200,6 +200,11 @@ class Trials:
         return self._calls[window]
 
     @property
+    def changed_name(self) -> str:
+        """Of the best plan so far with another field: its own, or ``full`` in place of ``dense``, which stays."""
+        return FULL if self.name == DENSE else self.name
+
+    @property
     def used(self) -> int:
         """How many calls were learned from."""
         return sum(calls.count for calls in self._calls.values())

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
 
+from ttscompile.artifact.ceiling import BOUND, FARTHEST
+from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.cli.bench_report import BenchReport
-from ttscompile.cli.choosing import choosable, choose_again
-from ttscompile.cli.comparison import compare, draw_comparison
+from ttscompile.calibration.proposer import near
+from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
 from ttscompile.cli.contestants import Way, contestants, originals
-from ttscompile.cli.loop import Loop
 from ttscompile.cli.options import (
     LOOP_OPTIONS,
     artifact_argument,
@@ -26,18 +28,28 @@ from ttscompile.cli.options import (
     number_option,
     several_threads_option,
 )
-from ttscompile.cli.output import print_identity, print_json, progress, results, say, warn_if_busy
-from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
-from ttscompile.cli.sections import Section, SectionedCommand
+from ttscompile.cli.output import print_identity, print_json, progress, results, say, table, warn_if_busy
+from ttscompile.cli.sections import Section, SectionedCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.summary import print_facts
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
-from ttscompile.core.plan import DENSE
+from ttscompile.core.plan import DENSE, UNIFORM
+from ttscompile.core.spec import FP32
+from ttscompile.errors import ArtifactError
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.report.timing import Contestant, Measurement, measure
-from ttscompile.runtimes.executor import ExecutorSettings
+from ttscompile.measure.points import best_plan
+from ttscompile.measure.timer import Times
+from ttscompile.measure.units import ms
+from ttscompile.report.facts import scores
+from ttscompile.report.timing import Contestant, Measurement, measure, timing_remarks, timing_table
+from ttscompile.runtimes.executor import ExecutorSettings, Feasibility
+from ttscompile.runtimes.executor.settings import Resolved, resolve
 from ttscompile.runtimes.open import CPU
 
 THIS = "this artifact"
 MOST_CALLS = 10_000
+
+WORTH = 0.1
+"""Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
 
 SECTIONS = (
     Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
@@ -138,43 +150,77 @@ def bench(
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
     plans = tuple(choosable(artifact)) if chooses and not plans else plans
-    loop = None if control_hz is None else Loop(control_hz, ExecutorSettings(**settings))
+    executor = ExecutorSettings(**settings)
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
-        if loop is not None:
-            loop.require(entered)  # told before anything is measured
+        # What does not fit is told before anything is measured.
+        resolved = {} if control_hz is None else in_loop(entered, control_hz, executor)
         if checkpoint is not None:
             entered = [*originals(checkpoint, encoders, threads[0], artifact), *entered]
     default = artifact.manifest.default_plan
-    warn_if_busy(console)
-    if default == DENSE and artifact.manifest.steps > 1:
-        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
+    _warn(directory, artifact, console)
     with console.status("timing") as status:
         measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
-        status.update("judging")
-        judged = None if loop is None else loop.judge(entered, measured)
+    # The longest call has to fit.
+    verdicts = {m.label: resolved[m.label].feasibility(max(m.times_ms) / 1e3) for m in measured if m.label in resolved}
     seed = (artifact.manifest.calibration or {}).get("seed", 0)  # holds out the episodes that its calibration held out
     asked = {"observation": sources, "plans": plans, "calls": calls, "seed": int(seed), **vars(ways[0])}
     compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
-    limit = None if judged is None else judged.may_take_ms
+    limit = 1e3 * max(min(one.max_latency for one in verdicts.values()), 0.0) if verdicts else None
     chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
-    report = BenchReport(measured, default, calls, by_threads, judged, compared, chosen)
     identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
         of = {"identity": artifact.manifest.identity, "machine": fingerprint()}
         among = [{"path": str(path), "identity": identity} for path, identity in identities.items()]
-        print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **report.to_json()})
+        plans_in_loop = {label: one.to_json() for label, one in verdicts.items()}
+        found = {
+            "calls": calls,
+            "threads": list(by_threads),
+            "best_threads": fewest_threads(by_threads),
+            "contestants": [m.to_json() for m in measured],
+            "loop": {"control_hz": control_hz, "plans": plans_in_loop} if verdicts else None,
+            "comparison": None if compared is None else compared.to_json(),
+            "chosen": chosen,
+        }
+        print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **found})
     else:
         output = results()
-        report.print(output)
+        _print_times(measured, default, by_threads, output)
+        print_verdicts(verdicts, control_hz, output)
+        if compared is not None:
+            print_comparison(compared, output)
+        if chosen is not None:
+            say(output, chosen)
         say(output, one_line(fingerprint()))
         print_identity(artifact.manifest.identity, output)
         say(output, *(f"{path}: identity {abbreviated(identity)}" for path, identity in identities.items()))
     if compared is not None and picture is not None:
         say(console, draw_comparison(compared, directory, picture))
-    if (judged is not None and not judged.keeps_up) or (chooses and chosen is None):
+    if (verdicts and not any(one.feasible for one in verdicts.values())) or (chooses and chosen is None):
         context.exit(1)
+
+
+def _warn(directory: Path, artifact: Artifact, console: Console) -> None:
+    warn_if_busy(console)
+    if artifact.manifest.default_plan == DENSE and artifact.manifest.steps > 1:
+        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
+
+
+def _print_times(
+    measured: Sequence[Measurement], default: str, by_threads: Mapping[int, float], output: Console
+) -> None:
+    print_facts(output, timing_table(measured, default, ("prologue", "frames", "pruner")))
+    say(output, timing_remarks(measured))
+    if len(by_threads) > 1:
+        best = fewest_threads(by_threads)
+        say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
+
+
+def fewest_threads(medians: Mapping[int, float]) -> int:
+    """The smallest number of threads that no other one is faster than by more than ``WORTH``; ``medians`` by number."""
+    bound = min(medians.values()) / (1 - WORTH)
+    return min(number for number, median in medians.items() if median <= bound)
 
 
 def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
@@ -207,3 +253,87 @@ def _by_threads(entered: Sequence[Contestant], measured: Sequence[Measurement], 
         if one.plan == plan and one.policy is not None:
             timed.setdefault(one.threads, m.median_ms)
     return timed
+
+
+def in_loop(entered: Sequence[Contestant], control_hz: float, settings: ExecutorSettings) -> dict[str, Resolved]:
+    """The plans in a control loop, by label; a network alone drives nothing. Raises ExecutorError: one does not fit."""
+    return {
+        one.label: resolve(replace(settings, tiers=(one.plan,)), one.policy.info, control_hz)
+        for one in entered
+        if one.policy is not None
+    }
+
+
+def print_verdicts(verdicts: Mapping[str, Feasibility], control_hz: float | None, output: Console) -> None:
+    """Whether plans keep up, by label, with the arithmetic; nothing if that was not asked."""
+    if control_hz is None:
+        return
+    made = table(f"control loop of {control_hz:g} Hz", "longest ms", "may take ms", "up to Hz", "verdict")
+    for label, one in verdicts.items():
+        allowed, verdict = ms(max(1e3 * one.max_latency, 0), 4), "feasible" if one.feasible else "too slow"
+        made.add_row(label, ms(1e3 * one.latency, 4), allowed, f"{one.max_policy_hz:.3g}", verdict)
+    output.print(made)
+    say(output, *(f"{label}: {one.explain()}" for label, one in verdicts.items()))
+    if any(UNIFORM in label for label in verdicts):
+        say(output, f"{UNIFORM} is for comparisons: evenly spaced steps, not calibrated. Not for a robot.")
+    say(output, "The longest call has to fit. Hz: of the policy, with as many control ticks an action as here.")
+
+
+IN_FP32 = f"@{FP32}"
+
+
+def choosable(artifact: Artifact, bound: float = FARTHEST) -> dict[str, float]:
+    """How far plans are from the original that were judged to be within a bound, by name.
+
+    Plans of fewer bits are among them in fp32, too, in which they are no further away.
+
+    Raises:
+        ArtifactError: none is within ``FARTHEST``.
+    """
+    found: dict[str, float] = {}
+    for name, score in scores(artifact.manifest.calibration, ("distance", "interval")).items():
+        within = name in artifact.plans and near(score["distance"], score["interval"], bound)
+        if within and name not in (DENSE, UNIFORM):
+            found[name] = score["distance"]
+            if artifact.plans[name].precision and artifact.plans[name].tokens is None:
+                found[name + IN_FP32] = score["distance"]
+    if bound == FARTHEST and not found:
+        problem = f"{artifact.path}: there is nothing to choose among: no plan was judged to be within {FARTHEST:g}"
+        raise ArtifactError(f"{problem}. Run 'ttscompile build', or 'ttscompile calibrate', first.")
+    return found
+
+
+def choose_again(
+    directory: Path, artifact: Artifact, measured: Sequence[Measurement], deadline_ms: float | None, threads: int
+) -> str | None:
+    """Make the plan the default that the rule of ``build`` chooses by these times, and keep them in the record.
+
+    Args:
+        measured: of plans that are ``choosable``, and of others, on this machine.
+        deadline_ms: that the longest call may take; None for that of the build, if it had one.
+        threads: that these calls had.
+
+    Returns:
+        What was chosen, for people; None where no plan keeps the deadline, and nothing was changed.
+    """
+    record, far, close = dict(artifact.manifest.calibration or {}), choosable(artifact), choosable(artifact, BOUND)
+    deadline = record.get("budget", {}).get("latency_ms") if deadline_ms is None else deadline_ms
+    times: dict[str, Times] = {}
+    for one in measured:
+        if one.plan in far:  # of another artifact, or with more threads, it is timed later
+            times.setdefault(one.plan, Times(one.times_ms))
+    chosen = best_plan(times, far, close.keys() & times.keys(), deadline)
+    if chosen is None:
+        return None
+    name, before = chosen.removesuffix(IN_FP32), artifact.manifest.default_plan
+    told = ", ".join(f"{each} {ms(one.median)} ms" for each, one in times.items())
+    here = f"{fingerprint()['processor']}, {threads} thread{'s' * (threads > 1)}: {told}"
+    record |= {"default_plan": name, "chosen_on": here}
+    precision: dict[str, str] | None = None
+    if chosen != name:
+        precision, words = {}, replace(artifact.plans[name], precision={}).in_words()
+        tried = record.get("frontier", ())
+        record["frontier"] = [{**row, "told": words} if row["name"] == name else row for row in tried]
+    choose_default(directory, name, record, precision, artifact)
+    changed = "is" if name == before else f"was {before!r}, and is"
+    return f"The default {changed} {name!r}{', in fp32' * (chosen != name)}. {told}."

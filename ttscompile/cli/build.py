@@ -10,11 +10,10 @@ import click
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
-from ttscompile.cli.frontier import print_frontier
 from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, warn_if_busy
-from ttscompile.cli.recordings import Sources, require_recordings, trajectories_options
-from ttscompile.cli.sections import LEROBOT, SectionedCommand
+from ttscompile.cli.sections import LEROBOT, SectionedCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.summary import print_frontier
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.errors import CheckpointError

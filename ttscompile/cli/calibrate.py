@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 import ttscompile
+from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.proposer import NAMES as LEARNED
 from ttscompile.calibration.proposer import PROPOSERS
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
@@ -22,12 +23,12 @@ from ttscompile.cli.options import (
     threads_option,
 )
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
-from ttscompile.cli.recordings import FilesCommand, Sources, require_recordings, trajectories_options
-from ttscompile.cli.summary import print_written
+from ttscompile.cli.sections import SectionedCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, NumberOption
 
 
-@click.command(cls=FilesCommand)
+@click.command(cls=SectionedCommand)
 @artifact_argument
 @trajectories_options()
 @names_option(
@@ -111,6 +112,6 @@ def calibrate(
         result = ttscompile.calibrate(
             directory, trajectories=list(trajectories), observation=sources, **budget_and_search
         )
-    print_written(directory, as_json)
+    print_artifact(load_artifact(directory), as_json)
     if result.doubtful:
         raise click.exceptions.Exit(Status.FAILED)

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.cli.output import counted_parts, manifest_of, only_results_on_stdout, progress, say, table
+from ttscompile.calibration.progress import Bar
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress, say, table
 from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
-from ttscompile.plots.chunk import plot_calls
-from ttscompile.plots.frontier import plot_frontier
+from ttscompile.plots.figure import write_picture
+from ttscompile.plots.frontier import plot_calls, plot_frontier
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,8 +40,8 @@ def compare(
         raise RuntimeUnavailableError(
             f"-t needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
         ) from error
-    with only_results_on_stdout(), counted_parts() as tell:
-        found = measure(directory, trajectories, others, progress=tell, **how)
+    with only_results_on_stdout(), Bar(shown=True) as bar:
+        found = measure(directory, trajectories, others, progress=bar.tell, **how)
     pairs = zip((directory, *others), artifacts.values(), strict=True)
     if changed := [path for path, one in pairs if manifest_of(path).identity != one.manifest.identity]:
         raise ArtifactChangedError(f"{changed[0]}: it was replaced meanwhile. Try again.")
@@ -51,8 +52,8 @@ def compare(
 def draw_comparison(found: Comparison, directory: Path, picture: Path) -> str:
     """Draw it, and beside it the calls that are furthest from the original; says so."""
     title = f"{directory.resolve().name}: {found.calls} held-out calls, {_threads(found)}\n{one_line(fingerprint())}"
-    plot_frontier([p.point for p in found.points], [p.point for p in found.efficient()], picture, title)
-    plot_calls(found.points[1:] or found.points, calls := picture.with_stem(f"{picture.stem}-calls"))
+    write_picture(plot_frontier(found.points, found.efficient(), title), picture)
+    write_picture(plot_calls(found.points[1:] or found.points), calls := picture.with_stem(f"{picture.stem}-calls"))
     return f"wrote {picture} and {calls}"
 
 

@@ -9,12 +9,12 @@ import click
 
 from ttscompile.cli.options import json_option
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json
-from ttscompile.cli.recordings import FilesCommand, require_recordings, trajectories_options
+from ttscompile.cli.sections import SectionedCommand, require_recordings, trajectories_options
 from ttscompile.cli.types import PathOrHub
 from ttscompile.doctor import diagnosis as examination
 
 
-@click.command(cls=FilesCommand)
+@click.command(cls=SectionedCommand)
 @click.argument("target", required=False, type=PathOrHub(exists=True))
 @trajectories_options(required=False, what="See whether these recorded episodes fit TARGET.")
 @json_option

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import click
 
+import ttscompile
+from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.options import artifact_argument, json_option
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say
-from ttscompile.cli.page import checked, require_page, write_page
-from ttscompile.cli.recordings import Sources, trajectories_options
-from ttscompile.cli.sections import Section, SectionedCommand
-from ttscompile.cli.summary import print_summary
+from ttscompile.cli.output import only_results_on_stdout, progress, say
+from ttscompile.cli.sections import Section, SectionedCommand, Sources, trajectories_options
+from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
+from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
-from ttscompile.report import Given
+from ttscompile.report import Given, build, render, verified
+from ttscompile.report import Section as OfPage
+from ttscompile.report.build import NOT_RUN
 from ttscompile.report.measure import run_episode
-from ttscompile.report.summary import document
-from ttscompile.report.verified import NOT_RUN
+from ttscompile.report.page import require_packages
 from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode, load_trajectories
 
 SCHEDULE = "schedule"
@@ -85,12 +89,9 @@ def inspect(
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)
         kinds = [block.kind for block in artifact.manifest.blocks]
-        plot_plan(_plan(artifact, name, episode), kinds, picture, f"plan {name!r}")
+        write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
         say(console, f"wrote {picture}")
-    if as_json:
-        print_json(document(artifact))
-    else:
-        print_summary(artifact, results())
+    print_artifact(artifact, as_json)
     if not passed:
         say(console, "failed: the artifact does not hold what it promises; the page says where.")
         context.exit(1)
@@ -123,3 +124,68 @@ def _plan(artifact: Artifact, name: str, episode: Episode | None) -> PlanArray:
     course = run_episode(open_policy(artifact, seed=0), episode, name)  # of this artifact, whatever is there by now
     plan: PlanArray = course.plans[-1]
     return plan
+
+
+def require_page(path: Path) -> None:
+    """See, before minutes of work, whether a page can be made there.
+
+    Raises:
+        OutputError: there is no such folder, or the name is of no page.
+        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
+    """
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"{path}: the page cannot be written: no such folder. Give one that exists.")
+    if path.suffix not in (".html", ".htm"):
+        raise OutputError(f"{path}: the page is HTML. Give a name that ends in .html.")
+    require_packages()
+
+
+def write_page(
+    path: Path, artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None]
+) -> str:
+    """Write the page; it replaces another one only when it is whole.
+
+    Args:
+        path: see ``require_page``.
+        artifact: loaded.
+        policy: the same, with a seed; its calls are timed now.
+        given: what the page shows beside the artifact.
+        progress: told what is under way.
+
+    Returns:
+        What was written, for people.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    page = render(build(artifact, policy, given, progress))
+    try:
+        replace_file(path, page.encode())
+    except OSError as error:
+        raise OutputError(f"{path}: the page cannot be written: {error}. Give a folder that exists.") from error
+    return f"wrote {path}, {len(page) / 1e6:.2f} MB"
+
+
+def checked(
+    directory: Path,
+    identity: str,
+    trajectories: Sequence[Path],
+    sources: Sources,
+    progress: Callable[[str], None],
+) -> tuple[bool, OfPage]:
+    """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
+
+    Raises:
+        ArtifactChangedError: another one is there by now.
+    """
+    try:
+        found = ttscompile.verify(
+            directory, trajectories, sources=sources, progress=lambda it: progress(f"verifying: {it}")
+        )
+        if found.identity not in (None, identity):
+            raise ArtifactChangedError(f"{directory}: was replaced meanwhile. Inspect it again.")
+        return found.passed, verified(found)
+    except ArtifactChangedError:
+        raise
+    except ArtifactError as error:  # it has nothing to check against, and so fails nothing
+        return True, OfPage("Verification", (f"Could not be run: {error}",))

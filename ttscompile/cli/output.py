@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from typing import Any
 import click
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest, require_artifact_path
@@ -98,22 +97,6 @@ def table(*columns: str, rows: Iterable[Iterable[str]] = ()) -> Table:
     for row in rows:
         made.add_row(*row)
     return made
-
-
-@contextmanager
-def counted_parts() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on standard error that is told what is being done, how many parts are done, and of how many."""
-    columns = (TextColumn("{task.description:<28}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
-    told = progress()
-    with Progress(*columns, console=told, disable=not told.is_terminal) as bar:
-        task = bar.add_task("loading", total=None)
-
-        def tell(what: str, done: int, total: int) -> None:
-            if not told.is_terminal and what != bar.tasks[task].description:  # a log has no bar
-                say(told, what)
-            bar.update(task, description=what, completed=done, total=total)
-
-        yield tell
 
 
 def manifest_of(path: Path) -> Manifest:

@@ -1,15 +1,68 @@
-"""Options of a command in parts: each has a heading in the help, and some are of use beside another option alone."""
+"""Options of a command in parts, each with a heading in the help; and those of commands that read recorded episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
-from ttscompile.cli.recordings import FilesCommand
+from ttscompile.cli.options import Decorator, together
+from ttscompile.cli.types import PATH, TEXT
+from ttscompile.core.paths import require_path
+from ttscompile.errors import TrajectoryError
+
+Sources = dict[str, tuple[str, ...]]
+"""By key of the observation, the arrays of a recording that it is made of; of ``task``, the tokenizer's folder."""
+
+
+def _sources(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> Sources:
+    found: Sources = {}
+    for value in values:
+        key, equals, names = value.partition("=")
+        parts = tuple(name.strip() for name in names.split(","))
+        if not (equals and key and all(parts)):
+            raise click.BadParameter(f"{value!r}: expected KEY=NAME,NAME:N, for instance obs=keypoint,state:2.")
+        if key in found:
+            raise click.BadParameter(f"{key!r} is given twice.")
+        found[key] = parts
+    return found
+
+
+def require_recordings(paths: Iterable[Path]) -> None:
+    """Raise TrajectoryError unless all of these exist: to be told before torch is imported, which takes seconds."""
+    for path in paths:
+        require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
+
+
+def trajectories_options(required: bool = True, what: str = "Learn from these recorded episodes.") -> Decorator:
+    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
+    return together(
+        click.option(
+            "-t",
+            "--trajectories",
+            required=required,
+            multiple=True,
+            type=PATH,
+            metavar="FILE...",
+            help=f"{what} They are .npz files, zarr replay buffers of Diffusion Policy, HDF5 files of robomimic, or"
+            " LeRobot data sets; every word up to the next option is one.",
+        ),
+        click.option(
+            "--observation",
+            "sources",
+            type=TEXT,
+            multiple=True,
+            callback=_sources,
+            metavar="KEY=NAME,NAME:N",
+            help="Make a key of the observation of these arrays, joined in this order, where a recording of frames has"
+            " other names. NAME:N takes the first N numbers of an array. task=DIR makes tokens of recorded"
+            " instructions, with the tokenizer.json of this folder.",
+        ),
+    )
 
 
 @dataclass(frozen=True)
@@ -29,17 +82,32 @@ LEROBOT = Section("Policies of LeRobot", ("task", "encoders", "without_cameras",
 """Of commands that read a checkpoint."""
 
 
-class SectionedCommand(FilesCommand):
-    """Shows the options of each section under its title, and refuses those whose section was not asked for."""
+class SectionedCommand(click.Command):
+    """Shows the options of each section under its title, and refuses those whose section was not asked for.
+
+    Options whose metavar ends in ``...`` take every word up to the next option, which click's own cannot.
+    """
 
     def __init__(self, *args: Any, sections: Sequence[Section] = (), **settings: Any) -> None:
         super().__init__(*args, **settings)
         self.sections = tuple(sections)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """As click does; then see that every option is of use."""
-        rest = super().parse_args(ctx, args)
-        given = {one.name: one for one in self.params if _is_given(ctx, one)}
+        """As click does, with such an option repeated before every word; then see that every option is of use."""
+        expanded: list[str] = []
+        taking = ""
+        many = {word for one in self.params if (one.metavar or "").endswith("...") for word in one.opts}
+        for arg in args:
+            if arg in many:
+                taking = arg
+            elif taking and not arg.startswith("-"):
+                expanded += [taking, arg]
+            else:
+                taking = ""
+                expanded.append(arg)
+        rest = super().parse_args(ctx, expanded)
+        named = {one.name: one for one in self.params if one.name is not None}
+        given = {n: p for n, p in named.items() if ctx.get_parameter_source(n) is ParameterSource.COMMANDLINE}
         for section in self.sections:
             if section.needs and not given.keys() & set(section.needs):
                 for option in [given[name] for name in section.options if name in given]:
@@ -57,10 +125,6 @@ class SectionedCommand(FilesCommand):
         for section in (general, *self.sections):
             with formatter.section(section.title):
                 formatter.write_dl([record for name, record in shown if name in section.options])
-
-
-def _is_given(ctx: click.Context, one: click.Parameter) -> bool:
-    return one.name is not None and ctx.get_parameter_source(one.name) is ParameterSource.COMMANDLINE
 
 
 def _word(option: click.Parameter) -> str:

@@ -1,4 +1,4 @@
-"""What an artifact is, as tables: for ``convert``, ``calibrate`` and ``inspect``."""
+"""What an artifact is, as tables: for ``convert``, ``calibrate`` and ``inspect``; and what a ``build`` tried."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from rich.console import Console
 from rich.padding import Padding
 
 from ttscompile.artifact.ceiling import uncalibrated
-from ttscompile.artifact.load import Artifact, load_artifact
-from ttscompile.cli.output import print_json, results, table
+from ttscompile.artifact.load import Artifact
+from ttscompile.cli.output import print_identity, print_json, results, say, table
+from ttscompile.core.plan import DENSE
+from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.units import ms
 from ttscompile.report import Table, facts, usage
 from ttscompile.report.summary import document
 
 
-def print_written(directory: Path, as_json: bool) -> None:
-    """What the artifact in a directory is now: as tables, or as one JSON document."""
-    artifact = load_artifact(directory)
+def print_artifact(artifact: Artifact, as_json: bool) -> None:
+    """What an artifact is: as tables, or as one JSON document."""
     if as_json:
         print_json(document(artifact))
     else:
@@ -53,3 +55,38 @@ def print_facts(console: Console, made: Table) -> None:
         for column, words in zip(shown.columns, made.text, strict=True):
             column.justify = "left" if words else "right"
         console.print(shown)
+
+
+def print_frontier(artifact: Artifact, directory: Path, output: Console, threads: int) -> None:
+    """The plans that were tried, the verdict on the default, and how to go on."""
+    record, default = artifact.manifest.calibration or {}, artifact.manifest.default_plan
+    rows = record["frontier"]
+    dense = next(row for row in rows if row["name"] == DENSE)
+    made = table("plan", "what it does", "ms a call", "longest", "times faster", "distance", "95 %", "")
+    for row in rows:
+        made.add_row(
+            f"{row['name']} (default)" if row["name"] == default else row["name"],
+            row["told"],
+            ms(row["milliseconds"], 4),
+            ms(row["worst"], 4),
+            f"{dense['milliseconds'] / row['milliseconds']:.1f} x",
+            f"{row['distance']:.3f}",
+            "..".join(f"{one:.3f}" for one in row["interval"]),
+            "" if row["near"] else "too far",
+        )
+    made.columns[1].justify = "left"
+    output.print(made)
+    say(
+        output,
+        "Times faster: than the same policy with every step computed, compiled too. Distance: between the actions and"
+        " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
+        f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
+        *(facts.chosen(record) if record.get("other_noise") else facts.remarks(record)),
+        "",
+        f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
+        "    policy.reset()  # a new episode",
+        "    actions = policy.predict_action(observation)['action']",
+        "",
+        one_line(fingerprint()),
+    )
+    print_identity(artifact.manifest.identity, output)

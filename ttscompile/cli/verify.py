@@ -11,12 +11,12 @@ import ttscompile
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.report.verified import figure
+from ttscompile.report.build import figure
 
 
-@click.command(cls=FilesCommand)
+@click.command(cls=SectionedCommand)
 @artifact_argument
 @trajectories_options(required=False, what="Check what the plans do on these recorded episodes, too.")
 @json_option

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from ..core.finding import Finding, Level
-from .checkpoint import target_findings
 from .machine import machine_findings
 from .packages import package_findings
+from .target import target_findings
 
 MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PROBLEM"}
 

@@ -4,7 +4,6 @@ Its cache keeps what was downloaded and serves it without a network; its login a
 (``HF_TOKEN``, ``HF_HOME``, ``HF_ENDPOINT``, ``HF_HUB_OFFLINE``) hold.
 """
 
-from .fetch import Fetched, fetch_artifact, fetch_checkpoint
-from .upload import upload
+from .repository import Fetched, fetch_artifact, fetch_checkpoint, upload
 
 __all__ = ["Fetched", "fetch_artifact", "fetch_checkpoint", "upload"]

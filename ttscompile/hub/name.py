@@ -31,6 +31,11 @@ class HubName:
     revision: str | None = None
     inside: str = ""
 
+    @property
+    def folder(self) -> str:
+        """What the names of files in it begin with."""
+        return f"{self.inside}/" if self.inside else ""
+
     def at(self, commit: str) -> str:
         """The same name, of one commit."""
         return f"{HUB}{self.repository}@{commit}" + (f"/{self.inside}" if self.inside else "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,13 +19,13 @@ class Point:
     Attributes:
         series: strategy, or artifact.
         name: of the plan in its series; a sparsity of a strategy.
-        error: how far its actions are from those of the original, on whatever scale.
+        distance: of its actions from the original's (``calibration.judge``).
         latency_ms: median wall time of a call on one stream.
     """
 
     series: str
     name: str
-    error: float
+    distance: float
     latency_ms: float
 
 
@@ -48,16 +48,14 @@ class FarCall:
 
 
 @dataclass(frozen=True)
-class MeasuredPoint:
+class MeasuredPoint(Point):
     """One plan on the held-out calls of a comparison.
 
     Attributes:
-        distance: of its actions from the original's (``calibration.judge``).
-        interval: 95 % interval of that, over episodes.
+        interval: 95 % interval of the distance, over episodes.
         error: mean absolute difference of the executed actions from the original's with the same noise, in their units;
             None of another sampler or start, which takes other noise.
         error_p90: 90th percentile of that over the calls.
-        latency_ms: median wall time of a call on one stream.
         quartiles_ms: first and third quartile of the latency.
         sparsity: share of the cells that are reused, mean over the calls.
         flops: of a call, mean.
@@ -66,13 +64,9 @@ class MeasuredPoint:
         furthest: the calls with the largest distance, the largest first.
     """
 
-    series: str
-    name: str
-    distance: float
     interval: tuple[float, float]
     error: float | None
     error_p90: float | None
-    latency_ms: float
     quartiles_ms: tuple[float, float]
     sparsity: float
     flops: float
@@ -80,20 +74,15 @@ class MeasuredPoint:
     errors: tuple[float, ...] = ()
     furthest: tuple[FarCall, ...] = field(default=(), compare=False)
 
-    @property
-    def point(self) -> Point:
-        """Its distance against its latency, to be drawn; none is below 0."""
-        return Point(self.series, self.name, max(self.distance, 0.0), self.latency_ms)
-
 
 AnyPoint = TypeVar("AnyPoint", bound=Point)
 
 
 def efficient(points: Sequence[AnyPoint]) -> tuple[AnyPoint, ...]:
-    """Points that no other beats in error and latency both, fastest first."""
+    """Points that no other beats in distance and latency both, fastest first."""
     best: list[AnyPoint] = []
-    for point in sorted(points, key=lambda p: (p.latency_ms, p.error)):
-        if not best or point.error < best[-1].error:
+    for point in sorted(points, key=lambda p: (p.latency_ms, p.distance)):
+        if not best or point.distance < best[-1].distance:
             best.append(point)
     return tuple(best)
 
@@ -149,10 +138,10 @@ class Comparison:
     warnings: tuple[str, ...]
 
     def efficient(self) -> tuple[MeasuredPoint, ...]:
-        """Points that no other beats in distance and latency both, fastest first."""
-        points = [(one, one.point) for one in self.points]
-        best = efficient([point for _, point in points])
-        return tuple(one for kept in best for one, point in points if point is kept)
+        """Points that no other beats in distance and latency both, fastest first; no distance counts as below 0."""
+        best = efficient([replace(one, distance=max(one.distance, 0.0)) for one in self.points])
+        known = {(one.series, one.name): one for one in self.points}
+        return tuple(known[one.series, one.name] for one in best)
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""

@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import OutputError, RuntimeUnavailableError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
@@ -49,6 +50,12 @@ def new_figure(width: float, height: float, told: str = "the figures") -> Figure
     return figure
 
 
+def with_grid(axes: Axes) -> None:
+    """Draw a faint grid behind what is drawn."""
+    axes.grid(which="both", color="#dddddd", linewidth=0.5)
+    axes.set_axisbelow(True)
+
+
 def plain_powers(axis: Axis) -> None:
     """Write 40 and 0.6 rather than 4 x 10^1 and 6e-01 on a logarithmic axis."""
     from matplotlib.ticker import LogFormatter
@@ -81,8 +88,15 @@ def require_picture_name(path: Path) -> None:
         raise _refused(path, "something else than a file is there")
 
 
+def encoded(figure: Figure, suffix: str = ".png") -> bytes:
+    """A picture as a file has it; of the same figures the same bytes, without matplotlib's version and the date."""
+    content = BytesIO()
+    figure.savefig(content, format=suffix[1:], dpi=150, metadata=FORMATS[suffix])
+    return content.getvalue()
+
+
 def write_picture(figure: Figure, path: str | Path) -> None:
-    """Write a picture; of the same figures the same bytes: matplotlib would put its version or the date into them.
+    """Write a picture, see ``encoded``.
 
     Args:
         figure: drawn.
@@ -91,13 +105,12 @@ def write_picture(figure: Figure, path: str | Path) -> None:
     Raises:
         OutputError: it cannot be written; a file that was there is as it was.
     """
-    place, content = Path(path), BytesIO()
+    place = Path(path)
     require_picture_name(place)
-    suffix = place.suffix.lower()
-    figure.savefig(content, format=suffix[1:], dpi=150, metadata=FORMATS[suffix])
+    content = encoded(figure, place.suffix.lower())
     partial = place.with_name(f".{secrets.token_hex(8)}.partial")  # a name as long as the picture's might be too long
     try:
-        partial.write_bytes(content.getvalue())
+        partial.write_bytes(content)
         partial.replace(place)
     except OSError as error:
         raise _refused(place, str(error.strerror)) from error

@@ -1,15 +1,20 @@
-"""The picture of a comparison: latency across, distance from the original up, a line for each series."""
+"""The pictures of a comparison: latency across, distance from the original up; and chunks of actions as curves."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import log
-from pathlib import Path
 from textwrap import wrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..measure.points import Point
-from .figure import beside, new_figure, plain_powers, write_picture
+import numpy as np
+
+from ..core.spec import FloatArray
+from ..measure.points import MeasuredPoint, Point
+from .figure import beside, new_figure, plain_powers, with_grid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Okabe and Ito's palette, without the yellow that white paper swallows."""
@@ -23,27 +28,22 @@ _TITLE_WIDTH = 105
 """Characters."""
 
 
-def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Path, title: str) -> None:
-    """Draw the points and write the picture.
+def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: str) -> Figure:
+    """The points, and a line along those that no other beats.
 
     Args:
         points: of all series; those at no distance (the dense policy) are told in the title: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
-        path: see ``write_picture``.
         title: over the picture.
-
-    Raises:
-        OutputError: the picture cannot be written.
-        RuntimeUnavailableError: matplotlib is not installed.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()
-    shown = [point for point in points if point.error > 0]
+    shown = [point for point in points if point.distance > 0]
     for i, series in enumerate(dict.fromkeys(point.series for point in shown)):
         own = sorted((p for p in shown if p.series == series), key=lambda p: p.latency_ms)
         axes.plot(
             [p.latency_ms for p in own],
-            [p.error for p in own],
+            [p.distance for p in own],
             marker=MARKERS[i % len(MARKERS)],
             linestyle="none" if len({p.name.strip("0123456789.") for p in own}) > 1 else "-",
             linewidth=1,
@@ -55,27 +55,60 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], path: Pat
     for i, p in enumerate(told):
         above = 4 + 8 * sum(_near(p, other) for other in told[:i])
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
-        axes.annotate(p.name, (p.latency_ms, p.error), fontsize=8, **beside(place, p.name, above))
-    best = [point for point in efficient if point.error > 0]
+        axes.annotate(p.name, (p.latency_ms, p.distance), fontsize=8, **beside(place, p.name, above))
+    best = [point for point in efficient if point.distance > 0]
     if len(best) > 1:  # of one point there is no line
         line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
-        axes.step([p.latency_ms for p in best], [p.error for p in best], where="post", label="frontier", **line)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel("latency of a call, ms (median)")
+        axes.step([p.latency_ms for p in best], [p.distance for p in best], where="post", label="frontier", **line)
+    axes.set(xscale="log", xlabel="latency of a call, ms (median)", yscale="log")
     axes.set_ylabel("distance from the original on held-out calls\n(1: about what other noise changes)")
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
-    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.error == 0)
+    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.distance <= 0)
     parts = [*title.splitlines(), *([f"not drawn, with no distance: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
-    axes.grid(which="both", color="#dddddd", linewidth=0.5)
-    axes.set_axisbelow(True)
+    with_grid(axes)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    write_picture(figure, path)
+    return figure
 
 
 def _near(p: Point, other: Point) -> bool:
-    return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.error / other.error)) < 0.2
+    return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.distance / other.distance)) < 0.2
+
+
+def plot_chunk(actions: FloatArray, executed: range, title: str) -> Figure:
+    """The actions ``[T, Da]``, with the executed steps shaded."""
+    figure = new_figure(8, 4, "the actions")
+    axes = figure.subplots()
+    axes.axvspan(executed.start - 0.5, executed.stop - 0.5, color="#e8e8e8", label="executed")
+    for number, curve in enumerate(actions.T):
+        axes.plot(range(len(curve)), curve, marker=".", linewidth=1.2, label=f"{number}")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), ncols=1 + actions.shape[1] // 16)
+    axes.set(xlabel="step of the chunk", ylabel="action, in its units")
+    axes.set_title(title, fontsize=10, loc="left")
+    return figure
+
+
+def plot_calls(points: Sequence[MeasuredPoint]) -> Figure:
+    """The furthest calls, a row for each of the first eight plans; lines are the original, dots the plan."""
+    shown = points[:8]
+    width = 1 + max(len(call.pictures) for p in shown for call in p.furthest)  # of a call
+    across = width * max(len(p.furthest) for p in shown)
+    figure = new_figure(2.2 * across, 2.4 * len(shown), "the calls")
+    for row, p in enumerate(shown):
+        for column, call in enumerate(p.furthest):
+            place = row * across + column * width + 1
+            for number, picture in enumerate(call.pictures.values()):
+                camera = figure.add_subplot(len(shown), across, place + number)
+                camera.imshow(np.moveaxis(picture, 0, -1).clip(0, 1), cmap="gray")
+                camera.set_axis_off()
+            axes = figure.add_subplot(len(shown), across, place + width - 1)
+            for number, (theirs, own) in enumerate(zip(*np.swapaxes(call.actions, 1, 2), strict=True)):
+                axes.plot(theirs, color=COLOURS[number % len(COLOURS)], linewidth=1)
+                axes.plot(own, color=COLOURS[number % len(COLOURS)], marker=".", linestyle="none")
+            told = f"{p.series}: {p.name}\nepisode {call.episode}, call {call.call}:\ndistance {call.distance:.2f}"
+            axes.set_title(told, fontsize=7, loc="left")
+            axes.tick_params(labelsize=6)
+    return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy.typing as npt
 
 from ..core.lattice import PlanArray, Source, sparsity
 from ..errors import IllegalPlanError
-from .figure import STEPS_AXIS, new_figure, write_picture
+from .figure import STEPS_AXIS, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,19 +25,16 @@ _LEAST, _MOST = -8.0, 0.0
 _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
 
 
-def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: str = "") -> None:
-    """Draw one plan and write the picture.
+def plot_plan(plan: PlanArray, kinds: Sequence[str], title: str = "") -> Figure:
+    """One plan.
 
     Args:
         plan: int8 ``[K, blocks]`` of ``Source``.
         kinds: kind of each block, in order of execution.
-        path: see ``write_picture``.
         title: over the picture; the sparsity is added to it.
 
     Raises:
         IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
-        RuntimeUnavailableError: matplotlib is not installed.
-        OutputError: the picture cannot be written.
     """
     if plan.ndim != 2 or plan.shape[1] != len(kinds) or not np.isin(plan, list(Source)).all():
         raise IllegalPlanError(
@@ -61,7 +57,7 @@ def plot_plan(plan: PlanArray, kinds: Sequence[str], path: str | Path, title: st
     names = {s: f"{s.name.lower()} {np.count_nonzero(plan == s)}" for s in Source}
     patches = [Patch(facecolor=COLOURS[s], edgecolor="#444444", linewidth=0.5, label=names[s]) for s in Source]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    write_picture(figure, path)
+    return figure
 
 
 def plot_errors(
@@ -69,26 +65,18 @@ def plot_errors(
     steps: Sequence[int],
     kinds: Sequence[str],
     tolerance: float,
-    path: str | Path,
     title: str = "",
     cells: npt.NDArray[np.bool_] | None = None,
-    plan: str | None = None,
-) -> None:
-    """Draw relative errors of residuals, and write the picture.
+) -> Figure:
+    """Relative errors of residuals.
 
     Args:
         errors: ``[A, blocks]``.
         steps: number of each of the A steps.
         kinds: kind of each block, in order of execution.
         tolerance: errors above it are framed.
-        path: see ``write_picture``.
         title: over the picture.
         cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
-        plan: its name.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib is not installed.
-        OutputError: the picture cannot be written.
     """
     count, blocks = errors.shape
     figure, axes = _map(6.5 + 0.03 * count, 2.2 + 0.17 * blocks, kinds, "the errors")
@@ -101,13 +89,11 @@ def plot_errors(
     if len(marked):
         axes.scatter(marked[:, 0], marked[:, 1], s=12, marker="x", color="#f0e442", linewidths=0.9)
     told = f"{len(above)} of {errors.size} residuals differ by more than {tolerance:g} (framed)"
-    if plan is not None:
-        told += f"; {len(marked)} cells of plan {plan!r} are not those stored (crossed)"
     axes.set_title(f"{title}\n{told}" if title else told, fontsize=9, loc="left")
     ticks = np.unique(np.linspace(0, count - 1, min(count, 11)).round().astype(int))
     axes.set_xticks(ticks, [str(steps[i]) for i in ticks])
     figure.colorbar(image, ax=axes, label="relative error of the residual, power of ten")
-    write_picture(figure, path)
+    return figure
 
 
 def _map(width: float, height: float, kinds: Sequence[str], told: str) -> tuple[Figure, Axes]:
@@ -116,6 +102,5 @@ def _map(width: float, height: float, kinds: Sequence[str], told: str) -> tuple[
     axes = figure.add_subplot()
     names = [f"{_ABBREVIATIONS.get(kind, kind[:12])} {b}" for b, kind in enumerate(kinds)]
     axes.set_yticks(range(len(kinds)), names, fontsize=7)
-    axes.set_xlabel(STEPS_AXIS)
-    axes.set_ylabel("residual block")
+    axes.set(xlabel=STEPS_AXIS, ylabel="residual block")
     return figure, axes

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..artifact.ceiling import uncalibrated
 from ..artifact.load import Artifact
+from ..artifact.manifest import Manifest
 from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
 from ..measure.points import Point, efficient
 from ..measure.units import ms, share
+from ..plots.figure import encoded
+from ..plots.frontier import plot_frontier
+from ..plots.maps import plot_errors
 from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
+from ..verification import Verification
 from .measure import Course, run_episode
 from .page import Page, Picture, Section, Table, require_packages
-from .timing import Measurement, measure_plans, timing_remarks, timing_table
-from .verified import NOT_RUN
+from .pictures import plain
+from .timing import Measurement, latency, measure_plans
+
+NOT_RUN = Section("Verification", ("Not run for this page: --verify adds it, ttscompile verify DIR runs it alone.",))
 
 MOST_PICTURES = 6
 """Schedules that are drawn; an artifact may hold many."""
@@ -76,7 +82,7 @@ def build(
         *(() if course is None else (_episode(course),)),
         _latency(measured, given, manifest.default_plan),
         *[frontier] * (not chosen),
-        _calibration(artifact),
+        _calibration(manifest),
         given.verification,
         facts.limits(artifact),
     )
@@ -153,19 +159,15 @@ def _episode(course: Course) -> Section:
 
 
 def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Section:
-    text = (
-        timing_remarks(measured, given.calls),
-        f"{given.threads} thread{'s' * (given.threads != 1)}; {one_line(fingerprint())}",
-    )
     alt = "Bars: what the calls of each plan spend their time on. The table has the figures."
     drawn = Picture(pictures.latency_picture(measured), "What the calls of each plan spend their time on.", alt)
-    return Section("Latency", text, (timing_table(measured, default),), (drawn,))
+    return replace(latency(measured, default, given.threads), pictures=(drawn,))
 
 
 def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
     manifest = artifact.manifest
     if tried := (manifest.calibration or {}).get("frontier", ()):
-        points = tuple(Point(_nearness(row), row["name"], _distance(row), row["milliseconds"]) for row in tried)
+        points = tuple(map(_tried, tried))
         text = "The plans that the build chose among, as it judged and timed them on the machine where it ran."
     else:
         judged = facts.scores(manifest.calibration, ("distance",))
@@ -174,43 +176,51 @@ def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:
             Point("this artifact", p.plan, max(float(judged[p.plan]["distance"]), 0.0), p.median_ms) for p in known
         )
         text = "Distances from the calibration record, latencies measured now. ttscompile bench -t measures both."
-    if not any(point.error > 0 for point in points):
+    if not any(point.distance > 0 for point in points):
         return Section("Comparison", ("There is no distance to hold against a latency: calibrate the artifact first.",))
     best = efficient(points)
-    png = pictures.frontier_picture(points, best, f"artifact {manifest.short_identity}")
+    png = encoded(plot_frontier(points, best, f"artifact {manifest.short_identity}"))
     alt = "Points: distance from the original against latency of each plan. The table has the figures."
     drawn = Picture(png, "Distance from the original against latency: down and left is better.", alt)
-    rows = tuple((p.series, p.name, f"{p.error:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
+    rows = tuple((p.series, p.name, f"{p.distance:.4g}", ms(p.latency_ms), "yes" if p in best else "") for p in points)
     head = ("", "plan", "distance", "ms a call", "on the frontier")
     return Section("Comparison", (text,), (Table(head, rows),), (drawn,))
 
 
-def _nearness(row: Mapping[str, Any]) -> str:
+def _tried(row: Mapping[str, Any]) -> Point:
+    """A plan that a build tried; the distance of the original is 0 but for rounding."""
     if row["name"] == DENSE:
-        return "the original"
-    return "may be taken" if row["near"] else "too far"
+        return Point("the original", DENSE, 0.0, row["milliseconds"])
+    nearness = "may be taken" if row["near"] else "too far"
+    return Point(nearness, row["name"], max(float(row["distance"]), 0.0), row["milliseconds"])
 
 
-def _distance(row: Mapping[str, Any]) -> float:
-    """The distance of a plan that a build tried; of the original it is 0 but for rounding."""
-    return 0.0 if row["name"] == DENSE else max(float(row["distance"]), 0.0)
-
-
-def _calibration(artifact: Artifact) -> Section:
-    if (record := artifact.manifest.calibration) is None:
-        return Section("Calibration", (uncalibrated(artifact.manifest),))
-    scores = facts.scores(record)
-    drawn: tuple[Picture, ...] = ()
-    told = facts.scores(record, ("sparsity", "error", "error_p90"))
+def _calibration(manifest: Manifest) -> Section:
+    made, told = facts.calibration(manifest), facts.scores(manifest.calibration, ("sparsity", "error", "error_p90"))
     if told and all(score["error"] > 0 for score in told.values()):
         caption = "Held-out action error against computed cells: mean (point) and 90th percentile (bar)."
         alt = "Points: held-out action error of each plan against the share of cells it computes."
-        drawn = (Picture(pictures.plans_picture(told), caption, alt),)
-    tables = (facts.score_table(record), facts.record_table(record)) if scores else (facts.record_table(record),)
-    text = "Errors on episodes that nothing was learned from, against the dense policy with the same noise."
-    return Section(
-        "Calibration",
-        (*((text,) if scores else ()), *facts.remarks(record)),
-        tables,
-        drawn,
-    )
+        made = replace(made, pictures=(Picture(pictures.plans_picture(told), caption, alt),))
+    return made
+
+
+def verified(found: Verification) -> Section:
+    """A row a rung, what to do about the first that failed, and where residuals differ."""
+    told = [f"{r.told}." + (f" First at {r.place}." if r.place else "") for r in found.rungs]
+    figures = ((r.name, r.status, figure(r.figure), figure(r.tolerance), r.unit) for r in found.rungs)
+    rows = tuple((*each, words) for each, words in zip(figures, told, strict=True))
+    head = ("rung", "verdict", "error", "allowed", "of what", "found")
+    text = f"All rungs hold; {found.seconds:.1f} s. Neither the checkpoint nor torch was needed."
+    if (failure := found.first_failure) is not None:
+        text = f"FAILED at {failure.name}. {failure.remedy} What fails above it may only follow from it."
+    shown: tuple[Picture, ...] = ()
+    if (errors := found.map) is not None:
+        of = errors.errors, errors.steps.tolist(), [plain(kind) for kind in errors.kinds], errors.tolerance
+        caption = "Relative error of each block's residual at the steps that were looked at: steps across, blocks down."
+        shown = (Picture(encoded(plot_errors(*of, "residuals", errors.cells)), caption),)
+    return Section("Verification", (text,), (Table(head, rows),), shown)
+
+
+def figure(number: float | None) -> str:
+    """An error or a tolerance for people; empty if there is none."""
+    return "" if number is None else f"{number:.2g}"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from ..artifact.ceiling import BOUND, FARTHEST, few_steps
+from ..artifact.ceiling import BOUND, FARTHEST, few_steps, uncalibrated
 from ..artifact.load import Artifact
 from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
@@ -53,11 +53,12 @@ def policy(artifact: Artifact) -> Section:
         f"{needs.read} of {needs.cells} residuals a stream, {needs.bytes_read / 1e6:.1f} MB, for its plans;"
         f" {needs.bytes_most / 1e6:.1f} MB for plans that you give"
     )
+    before = ", from the chunk of the call before"
     rows = [
         *((f"observation {key!r}", _observation(one)) for key, one in spec.observations.items()),
         ("action", action),
         *((f"loop {name!r}", told_sampler(table)) for name, table in spec.all_loops.items()),
-        *starts(manifest),
+        *((f"loop {n!r}", f"the last {one.steps} steps of {one.loop!r}{before}") for n, one in manifest.starts.items()),
         ("precision", precision(manifest)),
         *tokens(manifest),
         ("rollout cache", kept),
@@ -72,12 +73,6 @@ def policy(artifact: Artifact) -> Section:
 def _observation(one: ObservationSpec) -> str:
     inside = "as it is" if one.normalizer is None else "normalised inside"
     return f"{one.dtype}{list(one.shape)} a stream, {inside}" + ", from pictures of any size" * (one.fit is not None)
-
-
-def starts(manifest: Manifest) -> list[tuple[str, str]]:
-    """The loops that begin with the chunk of the call before."""
-    told = "the last {} steps of {!r}, from the chunk of the call before"
-    return [(f"loop {name!r}", told.format(one.steps, one.loop)) for name, one in manifest.starts.items()]
 
 
 def told_sampler(table: SamplerTable) -> str:
@@ -224,6 +219,22 @@ def score_table(record: Mapping[str, Any]) -> Table:
     errors = "mean action error", "90th percentile"
     head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
     return Table(head, tuple(rows))
+
+
+def calibration(manifest: Manifest) -> Section:
+    """What calibration measured, what that means, and the rest of the record."""
+    if (record := manifest.calibration) is None:
+        return Section("Calibration", (uncalibrated(manifest),))
+    tables, text = [record_table(record)], [*remarks(record)]
+    if scores(record):
+        held, of = (record.get(key, {}).get("validation") for key in ("calls", "episodes"))
+        told = f" ({held} calls of {len(of)} episodes)" if held is not None and of is not None else ""
+        errors = f"Errors of the actions, in their units, on recorded episodes that nothing was learned from{told}"
+        text.insert(
+            0, f"{errors}, against the dense policy with the same noise: the mean over calls, and the 90th percentile."
+        )
+        tables.insert(0, score_table(record))
+    return Section("Calibration", tuple(text), tuple(tables))
 
 
 def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:

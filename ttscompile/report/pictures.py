@@ -5,26 +5,18 @@ They are narrow, so that their text can be read where a phone makes them narrowe
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from ..core.lattice import PlanArray, Source, sparsity
-from ..measure.points import Point
 from ..measure.units import ms
-from ..plots.figure import STEPS_AXIS, beside, new_figure, plain_powers
-from ..plots.frontier import plot_frontier
+from ..plots.figure import STEPS_AXIS, beside, encoded, new_figure, plain_powers, with_grid
 from ..plots.maps import COLOURS, plot_plan
 from .measure import Course
 from .page import Picture
 from .timing import Measurement
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _PARTS = {
     "prologue": ("#0072b2", "prologue"),
@@ -43,24 +35,11 @@ def plain(text: str, most: int = 60) -> str:
     return kept if len(kept) <= most else kept[: most - 3] + "..."
 
 
-def drawn(draw: Callable[[Path], None]) -> bytes:
-    """What a function draws into a PNG file."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
-        draw(path)
-        return path.read_bytes()
-
-
 def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str, caption: str) -> Picture:
     """One plan, ``[K, blocks]``, and its counts, for who cannot see it; see ``ttscompile.plots.maps.plot_plan``."""
-    png = drawn(lambda path: plot_plan(plan, [plain(kind) for kind in kinds], path, plain(title)))
+    png = encoded(plot_plan(plan, [plain(kind) for kind in kinds], plain(title)))
     counts = ", ".join(f"{source.name.lower()} {int(np.count_nonzero(plan == source))}" for source in Source)
     return Picture(png, f"{caption} {sparsity(plan):.1%} of {plan.size} cells are reused: {counts}.")
-
-
-def frontier_picture(points: Sequence[Point], efficient: Sequence[Point], title: str) -> bytes:
-    """Distance against latency, names as matplotlib can draw them; see ``ttscompile.plots.frontier.plot_frontier``."""
-    return drawn(lambda path: plot_frontier(points, efficient, path, plain(title, 110)))
 
 
 def shares_picture(course: Course) -> bytes:
@@ -76,7 +55,7 @@ def shares_picture(course: Course) -> bytes:
         axes.set_ylabel("block")
     panels[-1].set_xlabel(STEPS_AXIS)
     figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
-    return _png(figure)
+    return encoded(figure)
 
 
 def sparsity_picture(course: Course) -> bytes:
@@ -88,14 +67,13 @@ def sparsity_picture(course: Course) -> bytes:
     calls = np.arange(len(course.sparsity))
     axes.plot(calls, 100 * course.sparsity, color=COLOURS[Source.COMPUTE], marker="o", markersize=3, linewidth=1.2)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("call of the episode")
-    axes.set_ylabel("cells reused, %")
+    axes.set(xlabel="call of the episode", ylabel="cells reused, %")
     axes.set_ylim(max(min(100 * float(course.sparsity.min()) - 2, 90.0), -2.0), 100.5)
-    axes.grid(color="#dddddd", linewidth=0.5)
+    with_grid(axes)
     if len(replaced := np.flatnonzero(course.legalised)):
         axes.scatter(replaced, 100 * course.sparsity[replaced], marker="x", color="#0072b2", zorder=3)
         axes.set_title("crosses: cells that read what was never computed were replaced", fontsize=9, loc="left")
-    return _png(figure)
+    return encoded(figure)
 
 
 def latency_picture(measured: Sequence[Measurement]) -> bytes:
@@ -122,7 +100,7 @@ def latency_picture(measured: Sequence[Measurement]) -> bytes:
     axes.set_xlabel("ms of a call, median")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    return _png(figure)
+    return encoded(figure)
 
 
 def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
@@ -140,16 +118,7 @@ def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
         axes.annotate(told, (x, middle), fontsize=9, **beside((x - min(computed)) / span, told, -3))
     axes.set_yscale("log")
     plain_powers(axes.yaxis)
-    axes.set_xlabel("cells computed, %")
-    axes.set_ylabel("error of the actions, in their units")
+    axes.set(xlabel="cells computed, %", ylabel="error of the actions, in their units")
     axes.margins(x=0.2, y=0.1)
-    axes.grid(which="both", color="#dddddd", linewidth=0.5)
-    axes.set_axisbelow(True)
-    return _png(figure)
-
-
-def _png(figure: Figure) -> bytes:
-    # The same figures are the same file: matplotlib would put its version into it.
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})
-    return buffer.getvalue()
+    with_grid(axes)
+    return encoded(figure)

@@ -2,20 +2,228 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from ..artifact.load import load_artifact
-from ..artifact.manifest import MANIFEST
+from ..artifact.load import Artifact, load_artifact
+from ..artifact.manifest import MANIFEST, Manifest
 from ..core.paths import HUB
 from ..core.plan import DENSE
+from ..core.spec import WITHOUT
+from ..core.untrusted_json import parse_json
+from ..errors import ReportError
 from ..hub import upload
-from ..hub.name import require_repository
+from ..hub.name import HubName, read_name, require_repository
+from ..measure.machine import one_line
+from ..measure.units import share
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
-from .card import card, licence_of, read_success
-from .timing import measure_plans
+from . import facts
+from .page import Section, Table
+from .timing import Measurement, latency, measure_plans
+
+BASE, BASE_LICENCE = "base", "base_licence"
+"""Entries of ``PolicySpec.source`` that ``convert`` writes of a checkpoint from the hub."""
+_MOST_BYTES = 64 << 20
+_TOKENIZER = (
+    "It is told its task in words. Text takes the base's tokenizer, which is not in this repository, and the package"
+    " `tokenizers`: give `load` its folder, `tokenizer=DIR`. Without it, give the tokens and their mask yourself."
+)
+_SPECIAL = re.compile(r"([\\`*_\[\]<>|#~])")
+
+
+@dataclass(frozen=True)
+class Success:
+    """How one plan of the artifact did on a task.
+
+    Attributes:
+        variant: artifact and plan, as the evaluation calls them.
+        figures: mean and 95 % interval by name: ``success`` and ``score``.
+        machine: that ran the episodes.
+    """
+
+    environment: str
+    variant: str
+    episodes: int
+    figures: Mapping[str, tuple[float, float, float]]
+    machine: str
+
+
+def read_success(path: Path, identity: str) -> list[Success]:
+    """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact.
+
+    Args:
+        path: of the document.
+        identity: of the artifact.
+
+    Raises:
+        ReportError: it is no such document, or not of this artifact.
+    """
+    expected = "expected what examples/evaluation/evaluate.py --json printed"
+    try:
+        document = parse_json(path.read_bytes(), _MOST_BYTES)
+        machine = one_line(document["machine"])
+        own = [each for each in document["variants"] if each["identity"] == identity]
+        found = [
+            Success(
+                environment=str(document["environment"]),
+                variant=Path(str(each["label"])).name,
+                episodes=len(each["episodes"]),
+                figures={name: _interval(each[name]) for name in ("success", "score")},
+                machine=machine,
+            )
+            for each in own
+        ]
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ReportError(f"{path}: {expected}; found {type(error).__name__}: {error!s:.200}.") from error
+    if not found:
+        raise ReportError(f"{path}: no variant in it has the identity {identity[:12]}. Evaluate this artifact again.")
+    return found
+
+
+def _interval(value: Mapping[str, Any]) -> tuple[float, float, float]:
+    return float(value["mean"]), float(value["low"]), float(value["high"])
+
+
+def licence_of(manifest: Manifest, given: str | None) -> str | None:
+    """The licence of the base, which the artifact is under too; of a base that says none the one that was given.
+
+    Raises:
+        ReportError: both say one, and not the same.
+    """
+    own = manifest.spec.source.get(BASE_LICENCE)
+    if own is not None and given is not None and own.lower() != given.lower():
+        raise ReportError(f"the base is under the licence {own}, which was passed on; found {given}. Leave it out.")
+    return own or given
+
+
+def card(
+    artifact: Artifact,
+    repository: str,
+    measured: Sequence[Measurement],
+    success: Sequence[Success],
+    licence: str | None,
+) -> str:
+    """The text of ``README.md``."""
+    manifest = artifact.manifest
+    base = None if (told := manifest.spec.source.get(BASE)) is None else read_name(told)
+    head = {
+        **({} if licence is None else {"license": licence}),
+        **({} if base is None else {"base_model": base.repository, "base_model_relation": "quantized"}),
+        "library_name": "ttscompile",
+        "pipeline_tag": "robotics",
+        "tags": ["robotics", "diffusion-policy", "ttscompile"],
+    }
+    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in head.items()), "---", ""]
+    lines += [f"# {_plain(repository.partition('/')[2])}", ""]
+    of = "a policy" if base is None else f"[{base.repository}](https://huggingface.co/{base.repository})"
+    lines += [f"This is {of}, compiled by ttscompile: it runs with numpy and onnxruntime alone.", ""]
+    lines += ["```python", "import ttscompile", "", f'policy = ttscompile.load("hf://{repository}", threads=1)', "```"]
+    calibrated, timed = facts.calibration(manifest), latency(measured, manifest.default_plan)
+    if manifest.calibration is None:
+        told_dense = "It was not calibrated: every call is dense, and does what the base does."
+        calibrated = replace(calibrated, text=(told_dense,))
+    if manifest.spec.instruction is not None:
+        lines += ["", _TOKENIZER]
+    for section in (
+        _what(artifact, base, licence),
+        replace(calibrated, tables=calibrated.tables[:-1]),  # without the record
+        _success(success),
+        replace(timed, text=(*timed.text, "Yours is another machine.")),
+        _made(manifest, base),
+        facts.limits(artifact),
+    ):
+        lines += ["", *_markdown(section)]
+    return "\n".join(lines) + "\n"
+
+
+def _what(artifact: Artifact, base: HubName | None, licence: str | None) -> Section:
+    manifest, spec = artifact.manifest, artifact.manifest.spec
+    plan, sampler = facts.plans_of(manifest)[manifest.default_plan], spec.sampler
+    first, last = sampler.timesteps[0], sampler.timesteps[-1]
+    source = ", ".join(f"{k} {v}" for k, v in spec.source.items() if k not in (BASE, BASE_LICENCE))
+    rows = (
+        ("base model", "not from the hub" if base is None else f"{base.repository}, commit {base.revision}"),
+        ("licence", licence or "not known: ask who trained the base"),
+        ("policy", source or "a module"),
+        ("sampler", f"{sampler.name}, K = {sampler.steps}, timesteps {first:g}..{last:g}"),
+        ("default plan", f"{manifest.default_plan}, {plan.kind}"),
+        ("sparsity", f"{share(plan.sparsity)} of the cells are reused, {share(plan.flops_sparsity)} of their FLOPs"),
+        ("precision", facts.precision(manifest)),
+        ("identity", manifest.identity),
+    )
+    return Section("What it is", (), (Table(("", ""), rows), facts.plan_table(artifact)))
+
+
+def _success(found: Sequence[Success]) -> Section:
+    if not found:
+        return Section(
+            "Success", ("No success figures were given. Evaluate it on your own task before a robot moves.",)
+        )
+    rows = tuple(
+        (
+            *(each.environment, each.variant, str(each.episodes)),
+            *("{:.3f} [{:.3f}, {:.3f}]".format(*each.figures[name]) for name in ("success", "score")),
+        )
+        for each in found
+    )
+    head = ("task", "plan", "episodes", "success [95 % interval]", "score [95 % interval]")
+    text = f"Intervals are of the bootstrap over episodes. The episodes ran on {found[0].machine}."
+    return Section("Success", (text,), (Table(head, rows),))
+
+
+def _made(manifest: Manifest, base: HubName | None) -> Section:
+    record, sampler = manifest.calibration, list(manifest.spec.all_loops.values())[-1]
+    steps = sampler.steps // 4 if sampler.name == "rk4" else sampler.steps  # which evaluates four times a step
+    checkpoint = "CHECKPOINT" if base is None else base.at(str(base.revision))
+    precision = "" if manifest.precision is None else f" --precision {manifest.precision_name}"
+    if manifest.precision is not None and (kept := [_word(part) for part in manifest.precision.asked]):
+        precision += f"  # and in Python keep_fp32={kept}"
+    spec = manifest.spec
+    more = " --task TASK" * ("task" in spec.source)
+    more += "".join(f" --without-camera {_word(name)}" for name in spec.source.get(WITHOUT, "").split())
+    more += f" --prediction-horizon {spec.sample[0]}" * (spec.left_out > 0)
+    lines = [f"ttscompile convert {checkpoint} -o DIR --sampler {sampler.name} --steps {steps}{more}{precision}"]
+    if record is not None:
+        told, budget = {key: record[key] for key in ("strategy", "seed") if key in record}, record.get("budget", {})
+        goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error", "max_distance")
+        asked = {key: budget[key] for key in goals if budget.get(key) is not None}
+        words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
+        if (learned := record.get("learned", [])) not in ([], ["schedule"]):
+            words += f" --learn {','.join(map(_word, learned[:8]))}"
+        lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
+    lines.append("ttscompile verify DIR")
+    text = (
+        f"With ttscompile {manifest.ttscompile_version}, by commands like these, from what the artifact records;"
+        " it keeps no paths."
+    )
+    return Section("How it was made", (text,), points=tuple(f"`{line}`" for line in lines))
+
+
+def _word(value: object) -> str:
+    return re.sub(r"[^A-Za-z0-9._+-]", "", str(value))[:40]
+
+
+def _markdown(section: Section) -> list[str]:
+    lines = [f"## {section.title}", ""]
+    for text in section.text:
+        lines += [_plain(text), ""]
+    for table in section.tables:
+        rows = [table.head, tuple("---" for _ in table.head), *table.rows]
+        lines += ["| " + " | ".join(cell if cell == "---" else _plain(cell) for cell in row) + " |" for row in rows]
+        lines.append("")
+    lines += [f"- {point if point.startswith('`') else _plain(point)}" for point in section.points]
+    return lines if lines[-1] else lines[:-1]
+
+
+def _plain(text: str) -> str:
+    """Without what Markdown or HTML would take for a mark: names in an artifact are whoever made it's."""
+    return _SPECIAL.sub(r"\\\1", " ".join(text.split()))
 
 
 def push(

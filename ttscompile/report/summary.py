@@ -49,7 +49,13 @@ def document(artifact: Artifact) -> dict[str, Any]:
             **{loop: {"sampler": table.name, "steps": table.steps} for loop, table in spec.all_loops.items()},
             **{loop: {"last_steps_of": one.loop, "steps": one.steps} for loop, one in manifest.starts.items()},
         },
-        "flops": _flops(manifest),
+        "flops": {  # of one call of one stream, every cell computed; ``captured`` is the policy as it came
+            "captured": manifest.flops.dense,
+            "prologue": manifest.flops.prologue,
+            "pruner": manifest.flops.pruner,
+            "stems_and_tails": manifest.steps * (manifest.flops.stem + manifest.flops.tail),
+            "blocks": manifest.steps * sum(manifest.flops.blocks),
+        },
         "ceiling": {"sparsity": 1 - 1 / manifest.steps, "flops": manifest.flops.ceiling(manifest.steps)},
         "plans": {
             name: asdict(plan) | {"flops": plan_flops(artifact, name)} for name, plan in plans_of(manifest).items()
@@ -70,15 +76,3 @@ def _precision(manifest: Manifest) -> dict[str, Any]:
     size = sum(manifest.files[name].bytes for name in (record.weights, *record.models.values()))
     parts = {"parts": list(record.kept), "asked": list(record.asked)}
     return {"name": record.name, "blocks": record.blocks, "bytes": size, **parts}
-
-
-def _flops(manifest: Manifest) -> dict[str, int]:
-    """FLOPs of one call of one stream, every cell computed; ``captured`` is the policy as it came."""
-    record, steps = manifest.flops, manifest.steps
-    return {
-        "captured": record.dense,
-        "prologue": record.prologue,
-        "pruner": record.pruner,
-        "stems_and_tails": steps * (record.stem + record.tail),
-        "blocks": steps * sum(record.blocks),
-    }

@@ -11,11 +11,12 @@ import numpy as np
 
 from ..core.lattice import Source
 from ..core.spec import Noise, PolicySpec
+from ..measure.machine import fingerprint, one_line
 from ..measure.timer import Timer, Times
 from ..measure.units import flops, ms, share
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import Observation, random_call
-from .page import Table
+from .page import Section, Table
 
 WARM_UP = 3
 """Calls of each that are not counted: allocations, and the first call of an episode, which cannot use ROLLOUT."""
@@ -158,8 +159,9 @@ def timing_table(measured: Sequence[Measurement], default: str, parts: Sequence[
     return Table(("", "ms a call", "quartiles", "speed-up", "FLOPs", "reused", *(PARTS[part] for part in parts)), rows)
 
 
-def timing_remarks(measured: Sequence[Measurement], calls: int) -> str:
+def timing_remarks(measured: Sequence[Measurement]) -> str:
     """What the table is of."""
+    calls = max((len(m.times_ms) for m in measured), default=0)
     told = [
         f"Medians of {calls} calls, one stream; the contestants take turns.",
         "Speed-up: how many times faster than the first row.",
@@ -170,6 +172,12 @@ def timing_remarks(measured: Sequence[Measurement], calls: int) -> str:
     if _taken(measured, "frames"):
         told.append("Every call has frames of its own; those that are known, or prepared before, would cost nothing.")
     return " ".join(told)
+
+
+def latency(measured: Sequence[Measurement], default: str, threads: int = 1) -> Section:
+    """What calls take on this machine."""
+    on = f"{threads} thread{'s' * (threads != 1)}; {one_line(fingerprint())}"
+    return Section("Latency", (timing_remarks(measured), on), (timing_table(measured, default),))
 
 
 def _taken(measured: Sequence[Measurement], part: str) -> bool:

@@ -28,8 +28,7 @@ from ..core.untrusted_json import parse_json
 from ..core.values import check_values, fitted
 from ..core.zip_files import open_zip
 from ..errors import TrajectoryError
-from .frames import Frames, few, frames_of_calls, observation_frames, one_error, require_proportion
-from .instructions import instruction_rows
+from .frames import Frames, few, frames_of_calls, instruction_rows, observation_frames, one_error, require_proportion
 from .sandbox import sandboxed_frames
 
 Array = npt.NDArray[Any]

@@ -1,22 +1,117 @@
-"""Whether recordings fit a policy: names, pictures, ranges and rate; for the doctor."""
+"""Whether recordings fit a policy: names, pictures, ranges and rate; for the doctor, and for who learns from them."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from ..core.finding import Finding, Level
-from ..core.spec import PolicySpec
+from ..core.spec import Affine, PolicySpec
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .episodes import load_trajectories, recorded_names
+from .episodes import Episode, load_trajectories, recorded_names
 from .frames import few, one_error
 from .lerobot_dataset import MAX_INFO
-from .ranges import judged, placed
+
+REACH = 1.05
+"""Normalised numbers are outside beyond this, either way: recordings may stray a little from the training data."""
+
+SOME, USUAL, MOST = 0.02, 0.1, 0.5
+"""Shares of a key's numbers outside that are worth a warning, of a normaliser and of statistics, and an error. Of
+numbers whose mean is 0 and deviation 1, which another kind of normaliser makes, a third are outside; with a unit or an
+order of their own nearly all are."""
+
+LITTLE = 0.05
+"""Share of the range of the training data: who fills less gives another unit, radians for degrees, say."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Recorded numbers ``[N, D]`` of a key, what maps the training data's range to -1..1, and the share to warn at."""
+
+    key: str
+    values: npt.NDArray[np.float32]
+    seen: Affine
+    some: float
+
+    @property
+    def outside(self) -> npt.NDArray[np.bool_]:
+        """``[N, D]``: which of them lie outside of the range."""
+        return np.abs(self.seen.normalize(self.values)) > REACH
+
+    def in_place_of(self) -> dict[int, int]:
+        """Columns that lie outside of their own range, by another such column whose range they lie in; all, or none."""
+        wrong, found = np.flatnonzero(self.outside.mean(0) > MOST), dict[int, int]()
+        for column in wrong.tolist():
+            moved = self.values[:, [column]] * self.seen.scale[wrong] + self.seen.offset[wrong]
+            fits = wrong[(np.abs(moved) > REACH).mean(0) <= SOME].tolist()
+            if not (free := [n for n in fits if n not in found.values()]):
+                return {}
+            found[column] = free[0]
+        return found
+
+
+def placed(episodes: Sequence[Episode], spec: PolicySpec) -> Iterator[Placed]:
+    """The recorded numbers of every key of which it is known where those of the training data were.
+
+    A normaliser inside of the network tells that by its statistics. Where one is by mean and deviation they do not end
+    there; whether it is one is known of the actions alone, whose kind observations mostly share.
+    """
+    for key, one in spec.observations.items():
+        if np.dtype(one.dtype).kind != "f" or one.image or (one.normalizer is None and one.bounds is None):
+            continue
+        seen, some = one.normalizer, SOME
+        if seen is None and one.bounds is not None:
+            low, high = (np.broadcast_to(np.asarray(end, np.float32), one.shape[-1:]) for end in one.bounds)
+            width = np.maximum(high - low, 1e-3 * np.maximum(np.abs(low), 1e-3))
+            seen, some = Affine(2 / width, -(low + high) / width), USUAL
+        assert seen is not None
+        values = np.concatenate([each.observations[key] for each in episodes]).reshape(-1, one.shape[-1])
+        yield Placed(key, values, seen, some if spec.chunk.ranged else MOST)
+
+
+def judged(one: Placed) -> Finding:
+    """The numbers of one key, against those of the training data."""
+    outside, share = one.outside, float(one.outside.mean())
+    filled = np.ptp(one.values, axis=0) * np.abs(one.seen.scale) / 2
+    usual = float(np.median(filled[filled > 0])) if filled.any() else 1.0
+    level = Level.PROBLEM if share > MOST else Level.WARNING if share > one.some or usual < LITTLE else Level.OK
+    worst = np.argsort(-outside.mean(0), kind="stable")[: int(outside.any(0).sum())].tolist()
+    columns = ", ".join(f"{n} ({outside[:, n].mean():.0%})" for n in worst[:5]) + ", .." * (len(worst) > 5)
+    told = (
+        f"{outside.sum()} of {outside.size} recorded numbers ({share:.0%}) lie outside of what the policy's normaliser"
+        f" maps to -1..1, by up to {np.abs(one.seen.normalize(one.values)).max():.3g} times; columns {columns}"
+    )
+    remedy = "Look at their unit (degrees, radians), the order of the columns, and --observation. If these are right,"
+    remedy += " the statistics are of another data set, and what the policy answers means nothing."
+    if exchanged := one.in_place_of():
+        told += "; " + ", ".join(f"column {a} is as {b} was" for a, b in exchanged.items())
+        level, remedy = Level.PROBLEM, "The columns look permuted: give them in the order of the training data."
+    elif share <= one.some:
+        told = f"{share:.1%} of the numbers are outside of the training data's; they fill {usual:.0%} of its range"
+    return Finding("recordings", f"range of {one.key!r}", told, level, "" if level is Level.OK else remedy)
+
+
+def check_ranges(episodes: Sequence[Episode], spec: PolicySpec) -> None:
+    """Warn of recorded numbers outside of what the normaliser maps to -1..1.
+
+    Raises:
+        TrajectoryError: most are outside, or columns are permuted; says how many there are, and in which columns.
+    """
+    for one in placed(episodes, spec):
+        found = judged(one)
+        if found.level is Level.PROBLEM:
+            raise TrajectoryError(f"observation: {found.told}")
+        if float(one.outside.mean()) > one.some:
+            warnings.warn(f"observation: {found.told}", stacklevel=2)
+
 
 PART = "recordings"
 

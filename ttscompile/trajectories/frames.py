@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.spec import ObservationSpec
-from ..core.tokenizer import TASK
+from ..core.spec import Instruction, ObservationSpec
+from ..core.tokenizer import TASK, Tokenizer, padded
 from ..errors import TrajectoryError
 
 Array = npt.NDArray[Any]
@@ -153,10 +153,13 @@ def require_proportion(path: Path, total: int, size: int) -> None:
         )
 
 
-def block_rows(shape: Sequence[int], itemsize: int, chunk: int) -> int:
-    """How many rows of an array ``[F, ...]`` are read at once: about ``BLOCK_BYTES``, and whole chunks of rows."""
-    whole = BLOCK_BYTES // max(1, math.prod(shape[1:]) * itemsize * chunk)
-    return max(1, whole) * chunk
+def blocks(array: Any) -> Iterator[Array]:
+    """The rows of an array ``[F, ...]`` of zarr or h5py: about ``BLOCK_BYTES`` at once, and whole chunks of rows."""
+    chunk = max(1, array.chunks[0]) if array.chunks else 1
+    whole = BLOCK_BYTES // max(1, math.prod(array.shape[1:]) * array.dtype.itemsize * chunk)
+    step = max(1, whole) * chunk
+    for start in range(0, max(1, array.shape[0]), step):
+        yield np.asarray(array[start : start + step])
 
 
 def bytes_of(path: Path) -> int:
@@ -195,17 +198,41 @@ def require_files(path: Path) -> None:
 def one_error(what: str, hint: str = "") -> Iterator[None]:
     """Within the block every error is a ``TrajectoryError``: libraries that decode raise whatever their parts raise.
 
-    It says what went wrong, the error's own words in brackets, and a hint of what to do.
+    It says what went wrong, the error's own words in brackets, and a hint of what to do. A package that is not
+    installed is told by ``sandbox``.
     """
     try:
         yield
-    except TrajectoryError:
+    except (TrajectoryError, ModuleNotFoundError):
         raise
     except Exception as error:
         raise TrajectoryError(f"{what} ({type(error).__name__}: {str(error)[:160]}){hint}.") from error
 
 
-def missing_package(path: Path, package: str, extra: str = "recordings") -> TrajectoryError:
-    """The error of a package that is not installed."""
-    told = f"{path}: reading this takes the package {package!r}, which is not installed"
-    return TrajectoryError(f"{told}. Install 'ttscompile[{extra}]', or {AS_NPZ}")
+def instruction_rows(
+    path: Path, held: Frames, told: Instruction, observations: Mapping[str, ObservationSpec], tokenizer: str
+) -> dict[str, Array]:
+    """Tokens and mask of every row, from its text.
+
+    Args:
+        held: what it holds: ``task``, texts ``[F]`` or their bytes ``[F, L]``.
+        told: how the policy is told its task.
+        tokenizer: path of ``tokenizer.json``, or of its folder.
+
+    Returns:
+        By key int64 ``[F, length]`` and bool ``[F, length]``.
+    """
+    if TASK not in held.names:
+        found = f"{path}: has no array {TASK!r}; it has {few(held.names)}. Expected the text of each row, as LeRobot's"
+        raise TrajectoryError(f"{found} data sets have it. Leave the tokenizer out, and record tokens.")
+    texts = held.read(TASK)
+    if texts.dtype == np.uint8 and texts.ndim == 2 and texts.shape[1]:
+        texts = np.ascontiguousarray(texts).view(f"S{texts.shape[1]}")[:, 0]
+    if texts.dtype.kind not in "US" or texts.ndim != 1:
+        raise TrajectoryError(f"{path}: {TASK!r} is {texts.dtype}{list(texts.shape)}; expected texts [F].")
+    different, rows = np.unique(texts, return_inverse=True)
+    made, length = Tokenizer(tokenizer, TrajectoryError), observations[told.tokens].shape[-1]
+    lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in different.tolist()]
+    numbers = [made(told.line(line), told.skipped + length)[told.skipped :] for line in lines]
+    tokens, mask = padded(numbers, length)
+    return {told.tokens: tokens[rows], told.mask: mask[rows]}

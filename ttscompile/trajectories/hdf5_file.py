@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import AS_NPZ, Array, Recording, block_rows, missing_package, one_error, require_files, require_proportion
+from .frames import AS_NPZ, Array, Recording, blocks, one_error, require_files, require_proportion
 
 FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 """Compression that h5py has itself; others are libraries of their own."""
@@ -19,10 +19,8 @@ FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 
 def hdf5_recording(path: Path) -> Recording:
     """Open a data set. Raises TrajectoryError: not one, damaged, or with data outside of the file."""
-    try:
-        import h5py
-    except ModuleNotFoundError as error:
-        raise missing_package(path, "h5py") from error
+    import h5py
+
     require_files(path)
     hint = "; expected an HDF5 file with data/DEMO/obs/NAME [F, ...]"
     with one_error(f"{path}: cannot be read as a data set of robomimic", hint), h5py.File(path, "r") as file:
@@ -46,9 +44,7 @@ def _blocks(path: Path, demos: list[str], name: str) -> Iterator[Array]:
         total = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
         require_proportion(path, total, path.stat().st_size)
         for array in arrays:
-            step = block_rows(array.shape, array.dtype.itemsize, array.chunks[0] if array.chunks else 1)
-            for start in range(0, max(1, len(array)), step):
-                yield array[start : start + step]
+            yield from blocks(array)
 
 
 def _inside(path: Path, file: Any, name: str) -> Any:

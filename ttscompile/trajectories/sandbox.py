@@ -163,6 +163,11 @@ def serve(request: Mapping[str, Any], out: BinaryIO) -> None:
                 if name in recording.names:
                     _send_array(path, out, {"array": name}, *recording.read(name))
             _send(out, end=True)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        told = f"{path}: reading this takes the package {package!r}, which is not installed"
+        extra = "videos" if package == "av" else "recordings"
+        _send(out, error=f"{told}. Install 'ttscompile[{extra}]', or {AS_NPZ}")
     except TrajectoryError as error:
         _send(out, error=str(error))
 

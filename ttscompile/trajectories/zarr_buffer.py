@@ -10,17 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import (
-    AS_NPZ,
-    Array,
-    Recording,
-    block_rows,
-    bytes_of,
-    missing_package,
-    one_error,
-    require_files,
-    require_proportion,
-)
+from .frames import AS_NPZ, Array, Recording, blocks, bytes_of, one_error, require_files, require_proportion
 
 CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
 """Compression that only computes. zarr also knows codecs that unpickle what they read."""
@@ -32,10 +22,8 @@ def zarr_recording(path: Path) -> Recording:
     Raises:
         TrajectoryError: not one, damaged, or in an encoding that is not read.
     """
-    try:
-        import zarr
-    except ModuleNotFoundError as error:
-        raise missing_package(path, "zarr") from error
+    import zarr
+
     require_files(path)
     hint = "; expected a zarr group with data/NAME [F, ...] and meta/episode_ends [E]"
     with one_error(f"{path}: cannot be read as a replay buffer of Diffusion Policy", hint):
@@ -67,10 +55,8 @@ def _require_plain(path: Path, array: Any, size: int) -> None:
 
 
 def _blocks(path: Path, array: Any) -> Iterator[Array]:
-    step = block_rows(array.shape, array.dtype.itemsize, max(1, array.chunks[0]))
     with one_error(f"{path}: {array.path!r} is damaged", ". Copy it again"):  # truncated chunks and the like
-        for start in range(0, max(1, array.shape[0]), step):
-            yield np.asarray(array[start : start + step])
+        yield from blocks(array)
 
 
 def _codecs(metadata: Any) -> set[str]:

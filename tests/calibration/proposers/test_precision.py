@@ -18,7 +18,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.judge import Score, further, judge
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposers import precision
-from ttscompile.calibration.proposers.precision import MARGIN, Precision
+from ttscompile.calibration.proposers.precision import Precision
 from ttscompile.calibration.trials import LEARNED, Trials
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import FULL, Plan
@@ -59,9 +59,9 @@ def test_all_parts_are_in_eight_bits_where_that_changes_little(trials: Trials) -
     proposer = Precision(request())
     (found,) = proposed(proposer, trials, trials.base)
     assert dict(found.plan.precision) == {"condition": "int8", "blocks": "int8"}
-    assert (found.name, found.margin, found.shared) == (FULL, MARGIN, {"precision": found.plan.precision})
+    assert (found.name, found.margin, found.shared) == (FULL, Precision.margin, {"precision": found.plan.precision})
     exact = judge(trials, trials.base.exact, LEARNED)
-    assert further(judge(trials, found.plan, LEARNED), exact)[1] <= MARGIN
+    assert further(judge(trials, found.plan, LEARNED), exact)[1] <= Precision.margin
     assert proposer.told == "int8 in condition and blocks"
 
 
@@ -72,7 +72,7 @@ def test_what_changes_the_actions_much_stays_fp32(tmp_path: Path) -> None:
     (found,) = proposed(proposer, trials, trials.base)
     assert dict(found.plan.precision) == {"blocks": "int8"}
     alone = found.notes["alone"]
-    assert alone["blocks"] < MARGIN < alone["condition"]
+    assert alone["blocks"] < Precision.margin < alone["condition"]
     assert proposer.told.startswith("int8 in blocks; condition stays fp32")
 
 
@@ -85,12 +85,12 @@ def test_what_is_learned_is_written_for_all_plans(tmp_path: Path) -> None:
 
 
 def test_the_worst_part_is_left_out_first(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
-    both, far, near = ("condition", "blocks"), 3 * MARGIN, 0.9 * MARGIN
+    both, far, near = ("condition", "blocks"), 3 * Precision.margin, 0.9 * Precision.margin
     limits = {(): 0.0, both: far, ("condition",): near, ("blocks",): 2 * near}
     scripted(monkeypatch, limits)
     assert tuple(proposed(Precision(request()), trials, trials.base)[0].plan.precision) == ("condition",)
     scripted(monkeypatch, {**limits, ("condition",): far})
-    proposer = Precision(request(margin=2 * MARGIN))
+    proposer = Precision(request(margin=2 * Precision.margin))
     assert tuple(proposed(proposer, trials, trials.base)[0].plan.precision) == ("blocks",)
     scripted(monkeypatch, {**limits, both: near})
     assert tuple(proposed(Precision(request()), trials, trials.base)[0].plan.precision) == both

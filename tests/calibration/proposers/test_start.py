@@ -149,7 +149,7 @@ def test_what_is_learned_is_written_and_loaded(folder: Path, tmp_path: Path) -> 
 
 
 def test_what_is_far_off_changes_nothing(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(start, "MARGIN", -9.0)
+    monkeypatch.setattr(start.Start, "margin", -9.0)
     before = (folder / "manifest.json").read_bytes()
     with pytest.raises(CalibrationFailedError, match="is allowed"):
         calibrate(folder, recorded(tmp_path / "calls.npz"), learn=("start",), progress=False)

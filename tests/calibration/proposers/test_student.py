@@ -18,8 +18,7 @@ from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
-from ttscompile.calibration.proposers.student import Array, Lesson, Student, trainable
-from ttscompile.calibration.proposers.weights import NAME, Weights
+from ttscompile.calibration.proposers.weights import NAME, Array, Lesson, Student, Weights, trainable
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import Plan

@@ -17,7 +17,7 @@ from ttscompile.calibration.judge import Score, further, judge
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import tokens
-from ttscompile.calibration.proposers.tokens import MARGIN, MOST_COMPUTED, Tokens
+from ttscompile.calibration.proposers.tokens import MOST_COMPUTED, Tokens
 from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.plan import DENSE, FULL, Plan, TokenReuse
 from ttscompile.errors import CalibrationFailedError
@@ -61,11 +61,11 @@ def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_
     trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
     assert found.plan.tokens is not None and found.shared == {"tokens": found.plan.tokens}
     assert found.plan.tokens.refresh == 6, "that of 64 was never seen in episodes of six calls"
-    assert (found.name, found.margin) == (FULL, MARGIN)
+    assert (found.name, found.margin) == (FULL, Tokens.margin)
     whole, score = judge(trials, trials.base, HELD_OUT), judge(trials, found.plan, HELD_OUT)
     assert 5 / 37 <= score.tokens < 0.5
     assert whole.tokens == 1
-    assert further(score, whole)[0] < 2 * MARGIN
+    assert further(score, whole)[0] < 2 * Tokens.margin
     assert found.plan.cells is trials.base.cells and found.plan.precision == trials.base.precision
 
 
@@ -121,7 +121,7 @@ def test_the_fewest_tokens_within_the_upper_limit_are_taken(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A setting whose mean is within the margin, and whose limit over episodes is not, was lucky."""
-    near, lucky = 0.9 * MARGIN, 1.9 * MARGIN
+    near, lucky = 0.9 * Tokens.margin, 1.9 * Tokens.margin
     limits = {TokenReuse(0.0, 6): (0.6, 0.0), TokenReuse(0.1, 6): (0.3, near), TokenReuse(0.2, 6): (0.1, lucky)}
     scripted(monkeypatch, {**limits, TokenReuse(0.0, 4): (0.5, 0.0)})
     _, found = tried(folder, recorded(tmp_path / "calls.npz"))

@@ -24,7 +24,7 @@ from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.artifact.view import View, view_of
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.proposers import student
+from ttscompile.calibration.proposers import weights as student
 from ttscompile.calibration.proposers.weights import NAME, SAVED, Weights
 from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.sparse_loop import fit_correction
@@ -35,7 +35,7 @@ from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.report import facts
-from ttscompile.report.card import card
+from ttscompile.report.push import card
 from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel

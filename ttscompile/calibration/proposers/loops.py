@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...artifact.load import Artifact
 from ...artifact.view import view_of
 from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
@@ -35,7 +34,7 @@ from ..arguments import calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
-from ..proposer import SAFER, SURE, Proposal, Proposals, Request, near
+from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..search import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
@@ -67,21 +66,17 @@ class Cost(NamedTuple):
         return self.one + (steps - 1) * self.step
 
 
-class Loops:
+class Loops(Proposer):
     """See the module, and ``Proposer``."""
 
     def __init__(self, request: Request) -> None:
-        self._request, self._bound, self._farthest = request, request.bound, request.farthest
-        self.told = ""
+        super().__init__(request)
+        self._bound, self._farthest = request.bound, request.farthest
         self._left_out: list[str] = []
         self._scores: dict[str, Score] = {}
         self._best: Proposal | None = None
         self._fastest = float("inf")  # ms of the best one, by its ``Cost``
         self._nearest: Proposal | None = None  # of those within ``farthest``, where none is within the bound
-
-    def applies(self, artifact: Artifact) -> str | None:
-        """See ``Proposer``."""
-        return None
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``. Of a policy of one step all cells, for what is learned after it."""
@@ -129,7 +124,7 @@ class Loops:
 
     def _wanted(self, loop: str) -> float:
         """How near a plan of a loop has to be for the search to end there."""
-        if loop != ORIGINAL or self._best is None or self._deadline is not None:
+        if loop != ORIGINAL or self._best is None or self.request.deadline_ms is not None:
             return self._bound
         found = self._scores[self._best.name].distance
         return SAFER * found if found > self._bound / 2 else self._bound
@@ -191,13 +186,14 @@ class Loops:
         again = self._best is not None and self._best.name == proposal.name  # nearer now
         if near(score.distance, score.interval, self._bound) and (again or cost < self._fastest):
             self._best, self._fastest = alone, cost
-        if near(score.distance, score.interval, self._farthest) and self._is_nearest(proposal.name):
+        nearest = None if self._nearest is None else self._scores[self._nearest.name].distance
+        if near(score.distance, score.interval, self._farthest) and (nearest is None or score.distance <= nearest):
             self._nearest = alone
 
     def _reached(self, loop: str, count: int, wanted: float) -> bool:
         """Whether a plan of so many steps is as near as is wanted; with a deadline as many are tried as keep it."""
         score = self._scores[_name(loop, count)]
-        return near(score.distance, score.interval, wanted) and self._deadline is None
+        return near(score.distance, score.interval, wanted) and self.request.deadline_ms is None
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
         limit, now = trials.clock.limit, trials.clock.elapsed()
@@ -207,19 +203,12 @@ class Loops:
         fewest, most = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
         return replace(own, limits=(fewest, own.state.progress.setdefault(f"most of {loop}", most)))
 
-    @property
-    def _deadline(self) -> float | None:
-        return self._request.deadline_ms
-
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""
-        if self._deadline is not None:
-            slow = least > self._deadline
-            return f"takes {least:.3g} ms and {self._deadline:.3g} are allowed" if slow else None
+        if self.request.deadline_ms is not None:
+            slow = least > self.request.deadline_ms
+            return f"takes {least:.3g} ms and {self.request.deadline_ms:.3g} are allowed" if slow else None
         return f"takes {least:.3g} ms at least, and the best {fastest:.3g}" if least > CLEARLY * fastest else None
-
-    def _is_nearest(self, name: str) -> bool:
-        return self._nearest is None or self._scores[name].distance <= self._scores[self._nearest.name].distance
 
     def _refusal(self, name: str, score: Score, kept: Mapping[str, Score]) -> str | None:
         """Why a plan is too far from the original for all purposes, or no nearer than another of as many steps."""
@@ -256,7 +245,7 @@ class Loops:
         found = []
         for precision in ({}, *([dict.fromkeys(record.kept, record.name)] if record is not None else [])):
             plans = [Plan(loop, uniform_plan(steps, blocks, n), precision=precision) for n in (1, more)]
-            runtime = open_runtime(artifact, "onnxruntime", self._request.threads, None, plans[0])
+            runtime = open_runtime(artifact, "onnxruntime", self.request.threads, None, plans[0])
             noise = trials.noise(view_of(artifact, plans[0]).manifest.spec, [(0, 0, 0, 0)])
             one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
             found.append((one, max(most - one, 0.0) / max(more - 1, 1)))

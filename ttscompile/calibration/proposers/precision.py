@@ -9,20 +9,15 @@ from ...artifact.load import Artifact
 from ...core.plan import Plan
 from ..clock import Clock
 from ..judge import further, judge
-from ..proposer import Proposal, Proposals, Request
+from ..proposer import Proposal, Proposals, Proposer
 from ..trials import LEARNED, Trials
-from . import changed_name
-
-MARGIN = 0.1
-"""Of what other noise changes. Push-T in int8: 0.03."""
 
 
-class Precision:
+class Precision(Proposer):
     """Leaves out parts, the one that changes the actions most alone first, until the rest is within the margin."""
 
-    def __init__(self, request: Request) -> None:
-        self._margin = MARGIN if request.margin is None else request.margin
-        self.told = ""
+    margin = 0.1
+    """Of what other noise changes. Push-T in int8: 0.03."""
 
     def applies(self, artifact: Artifact) -> str | None:
         """Whether the artifact has another precision."""
@@ -45,14 +40,14 @@ class Precision:
         kept, left = list(record.kept), list[str]()
         trials.bar.stage("parts in another precision", len(kept))
         alone = {part: off([part])[0] for part in kept} if len(kept) > 1 else {}
-        while kept and off(kept)[1] > self._margin:
+        while kept and off(kept)[1] > self.margin:
             left.append(max(kept, key=lambda part: alone.get(part, 0.0)))
             kept.remove(left[-1])
             trials.bar.update(len(left), f"{left[-1]} stays fp32", clock.left())
         best = lowered(kept)
-        more = f"{record.name} changes the actions more than {self._margin:g} allows"
+        more = f"{record.name} changes the actions more than {self.margin:g} allows"
         self.told = f"{record.name} in {' and '.join(kept)}" if kept else f"all parts stay fp32: {more}"
         if left and kept:
             self.told += f"; {' and '.join(left)} stay{'s' * (len(left) == 1)} fp32: there {more}"
         notes = {"parts": kept, "alone": alone}
-        yield Proposal(changed_name(trials), best, notes, margin=self._margin, shared={"precision": best.precision})
+        yield Proposal(trials.changed_name, best, notes, margin=self.margin, shared={"precision": best.precision})

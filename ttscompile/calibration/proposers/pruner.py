@@ -16,23 +16,15 @@ from ...ir.pieces import PRUNER
 from ...ir.plan_head import has_head
 from ..clock import Clock
 from ..judge import Score
-from ..proposer import Proposal, Proposals, Request
-from ..pruner.paper import Paper
+from ..proposer import Proposal, Proposals, Proposer
 from ..schedule import one_plan
-from ..search import searched
+from ..search import open_search, searched
 from ..task import Task
 from ..trials import Trials, base_of
 
 
-class Pruner:
-    """Gates for each observation, on average within the cells that the plan so far computes. See ``Proposer``.
-
-    Attributes:
-        told: see ``Proposer``.
-    """
-
-    def __init__(self, request: Request) -> None:
-        self._most, self.told = request.intervals, ""
+class Pruner(Proposer):
+    """Gates for each observation, on average within the cells that the plan so far computes. See ``Proposer``."""
 
     def applies(self, artifact: Artifact) -> str | None:
         """See ``Proposer``."""
@@ -49,8 +41,8 @@ class Pruner:
             )
         computed = int((cells == Source.COMPUTE).sum())
         task = Task.of(trials.executor, trials.windows, computed, trials.seed, trials.pool)
-        search = Paper(replace(task, clock=clock))
-        found, updates, _ = searched(trials, search, clock, self._most, PRUNER)
+        search = open_search("tts-paper", replace(task, clock=clock))
+        found, updates, _ = searched(trials, search, clock, self.request.intervals, PRUNER)
         self.told = f"{updates} updates; its best head is {found.error:.4g} off on calls that it was not trained on"
         share = float(np.mean(cells != Source.COMPUTE))
 

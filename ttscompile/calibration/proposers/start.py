@@ -19,7 +19,7 @@ from ...errors import CalibrationFailedError, SpecError
 from ..clock import Clock
 from ..judge import further, judge
 from ..kept import holding
-from ..proposer import Proposal, Proposals, Request
+from ..proposer import Proposal, Proposals, Proposer
 from ..trials import LEARNED, Trials, base_of
 
 NAME = "warm"
@@ -27,17 +27,14 @@ NAME = "warm"
 
 LAST_STEPS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 """Numbers of steps that are tried, up to half of the loop: beyond that little is saved."""
-MARGIN = 1.2
-"""Of what other noise changes, with the limits of a dozen episodes. On Push-T half of the loop is within it and loses
-nothing in 100 episodes, and fewer steps are beyond it and lose (``docs/decisions.md``)."""
 
 
-class Start:
+class Start(Proposer):
     """Tries numbers of steps, dense and with those steps alone that the plan computes, from what costs least on."""
 
-    def __init__(self, request: Request) -> None:
-        self._margin = MARGIN if request.margin is None else request.margin
-        self.told = ""
+    margin = 1.2
+    """Of what other noise changes, with the limits of a dozen episodes. On Push-T half of the loop is within it and
+    loses nothing in 100 episodes, and fewer steps are beyond it and lose (``docs/decisions.md``)."""
 
     def applies(self, artifact: Artifact) -> str | None:
         """Whether the sampler's table tells what such a call begins with."""
@@ -60,15 +57,15 @@ class Start:
             (steps,) = (record.steps for record in one.starts.values())
             off, limits[steps] = further(judge(holding(trials, one), one.plan, LEARNED), score)
             trials.bar.update(number + 1, f"{steps} steps: {off:.3g} further", clock.left())
-            if limits[steps] <= self._margin:
+            if limits[steps] <= self.margin:
                 self.told = f"calls but an episode's first begin with the chunk before, in the last {steps} steps"
-                kept = yield replace(one, notes={"steps": steps, "further": off}, margin=self._margin)
+                kept = yield replace(one, notes={"steps": steps, "further": off}, margin=self.margin)
                 if kept:
                     return
-        if min(limits.values()) > self._margin:
+        if min(limits.values()) > self.margin:
             least = min(limits, key=limits.__getitem__)
             told = (
-                f"the last {least} steps are {limits[least]:.3g} further off at worst, and {self._margin:g} is allowed"
+                f"the last {least} steps are {limits[least]:.3g} further off at worst, and {self.margin:g} is allowed"
             )
             raise CalibrationFailedError(f"no call that begins with the chunk before is near enough: {told}.")
 

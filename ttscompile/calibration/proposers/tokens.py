@@ -10,30 +10,26 @@ from ...core.plan import Plan, TokenReuse
 from ...errors import CalibrationFailedError
 from ..clock import Clock
 from ..judge import Score, further, judge
-from ..proposer import Proposal, Proposals, Request
+from ..proposer import Proposal, Proposals, Proposer
 from ..trials import LEARNED, Trials
-from . import changed_name
 
 THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
 """Differences that are tried, ascending. Encoders read pixels with a deviation of about one."""
 REFRESHES = (32, 16, 12, 8, 4)
 """Of so many new frames one is whole; never of more than follow each other where plans are judged."""
-MARGIN = 0.1
-"""Of what other noise changes."""
 MOST_COMPUTED = 0.75
 """Share of the tokens: where more are computed, looking for changes costs about what it saves."""
 
 
-class Tokens:
+class Tokens(Proposer):
     """Tries thresholds and refreshes on consecutive calls.
 
     The best of many settings is one that was lucky, so the upper limit of its difference over episodes has to be within
     the margin already where it is chosen.
     """
 
-    def __init__(self, request: Request) -> None:
-        self._margin = MARGIN if request.margin is None else request.margin
-        self.told = ""
+    margin = 0.1
+    """Of what other noise changes."""
 
     def applies(self, artifact: Artifact) -> str | None:
         """Whether an encoder has tokens."""
@@ -56,19 +52,19 @@ class Tokens:
                 off, limit = further(score, whole)
                 tried.append((limit, score, one))
                 trials.bar.update(number * len(THRESHOLDS) + more + 1, f"{score.tokens:.0%} computed", clock.left())
-                if off > self._margin:
+                if off > self.margin:
                     break  # a larger threshold changes more
-        good = [(score, one) for limit, score, one in tried if limit <= self._margin]
+        good = [(score, one) for limit, score, one in tried if limit <= self.margin]
         if not good:
             least = min(limit for limit, _, _ in tried)
-            raise _refused(f"the actions are {least:.3g} further off at least, and {self._margin:g} is allowed")
+            raise _refused(f"the actions are {least:.3g} further off at least, and {self.margin:g} is allowed")
         score, best = min(good, key=lambda one: one[0].tokens)  # of equals the smallest threshold, the rarest refresh
         if (told := _too_many(score, {})) is not None:
             raise _refused(told)
         assert best.tokens is not None
         self.told = f"{score.tokens:.0%} of the tokens of new frames are computed"
         notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
-        yield Proposal(changed_name(trials), best, notes, margin=self._margin, shared=shared, refusal=_too_many)
+        yield Proposal(trials.changed_name, best, notes, margin=self.margin, shared=shared, refusal=_too_many)
 
 
 def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:

@@ -1,8 +1,13 @@
-"""What an artifact needs of this machine, tried: it is loaded and called. Imports at need, to say what is missing."""
+"""What an artifact needs of this machine, tried; what of a checkpoint or of recordings goes wrong without an error.
+
+Imports at need, to say what is missing.
+"""
 
 from __future__ import annotations
 
 import statistics
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +17,9 @@ from .machine import available_bytes
 
 if TYPE_CHECKING:
     from ..artifact.load import Artifact
+    from ..core.spec import PolicySpec
 
-PART = "artifact"
+PART, CHECKPOINT = "artifact", "checkpoint"
 CALLS = 5
 _COPIES = 3
 """Times the weights that loading takes at most, for a moment: the mapped file, and onnxruntime's packed copies."""
@@ -94,3 +100,41 @@ def _call(artifact: Artifact) -> list[Finding]:
     took = f"{median:.1f} ms with one thread (the first {times[0]:.1f})"
     told = f"{took}, for {chunk.stop - chunk.start} actions: {1000 / median:.1f} calls a second"
     return [Finding(PART, "call", told)]
+
+
+def target_findings(
+    target: Path | str, recordings: Sequence[Path] = (), sources: Mapping[str, Sequence[str]] | None = None
+) -> list[Finding]:
+    """What ``convert`` takes or wrote, and whether recordings fit it; see there and ``load_trajectories``."""
+    try:
+        from ..artifact.archive import is_checkpoint
+        from ..artifact.load import load_artifact
+        from ..trajectories.fits import examine_recordings
+
+        if isinstance(target, str) or is_checkpoint(target):
+            found, spec = _checkpoint(target)
+        else:
+            found = artifact_findings(target)
+            if not recordings or any(one.what == "load" for one in found):
+                return found
+            spec = load_artifact(target).manifest.spec
+        return [*found, *(examine_recordings(recordings, spec, sources or {}) if recordings else [])]
+    except ModuleNotFoundError as error:
+        told = f"not tried: {(error.name or '').partition('.')[0]} is not installed"
+        return [Finding(CHECKPOINT, "load", told, Level.PROBLEM, "Run: pip install 'ttscompile[compile]'.")]
+    except TtscompileError as error:
+        return [Finding(CHECKPOINT, "load", str(error), Level.PROBLEM, "As the message says; nothing else was tried.")]
+
+
+def _checkpoint(target: Path | str) -> tuple[list[Finding], PolicySpec]:
+    from ..frontends import load_checkpoint_policy
+    from ..frontends.examined import examine
+    from ..hub import fetch_checkpoint
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        path = target if isinstance(target, Path) else fetch_checkpoint(target).path
+        spec = load_checkpoint_policy(path)[1]
+    found = [Finding(CHECKPOINT, "load", str(each.message), Level.NOTE) for each in said]
+    found.append(Finding(CHECKPOINT, "policy", ", ".join(f"{name} {told}" for name, told in spec.source.items())))
+    return [*found, *examine(path, spec)], spec

@@ -1,4 +1,4 @@
-"""Download what an artifact or a checkpoint is made of, and nothing else that a repository has.
+"""Download what an artifact or a checkpoint is made of, and nothing else that a repository has; and upload an artifact.
 
 The library downloads into its cache, checks sizes, and gives the folder of one commit. A second time, and where there
 is no network, that folder is all that is read. Nothing of a repository is executed, here or later: an artifact is
@@ -8,7 +8,7 @@ checked by ``load`` as any other, and a checkpoint read by ``convert`` as any ot
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 from ..core.paths import HUB
 from ..core.untrusted_json import parse_json
 from ..errors import HubError, RuntimeUnavailableError, TtscompileError
-from .name import HubName, plain, read_name
+from .name import HubName, plain, read_name, require_repository
 
 MANIFEST = "manifest.json"
 CARD = "README.md"
@@ -71,13 +71,12 @@ def fetch_artifact(text: str, anew: bool = False) -> Fetched:
         RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     name, hub = read_name(text), library()
-    inside = f"{name.inside}/" if name.inside else ""
     with told(text):
-        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, inside + MANIFEST])
+        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, name.folder + MANIFEST])
         manifest = folder / name.inside / MANIFEST
         if not manifest.is_file():
             raise HubError(f"{text}: there is no {MANIFEST} in it, so it is no artifact.")
-        chosen = [inside + each for each in _listed(manifest, text)]
+        chosen = [name.folder + each for each in _listed(manifest, text)]
         return _fetched(hub, name, text, folder.name, chosen, anew)
 
 
@@ -111,20 +110,18 @@ def _whole(name: HubName, kept: list[str]) -> bool:
 
     One ``.ckpt`` does not: the repository may have others, which nobody downloaded.
     """
-    inside = f"{name.inside}/" if name.inside else ""
-    return any({inside + each for each in (*policy, *_PROCESSORS)} <= set(kept) for policy in _POLICIES)
+    return any({name.folder + each for each in (*policy, *_PROCESSORS)} <= set(kept) for policy in _POLICIES)
 
 
 def _of_checkpoint(name: HubName, text: str, files: list[str]) -> list[str]:
-    inside = f"{name.inside}/" if name.inside else ""
-    below = [each.removeprefix(inside) for each in files if each.startswith(inside)]
+    below = [each.removeprefix(name.folder) for each in files if each.startswith(name.folder)]
     if any(policy <= set(below) for policy in _POLICIES):
-        return [inside + each for each in below if _OF_LEROBOT.fullmatch(each)]
-    found = [inside + each for each in below if each.endswith(_CHECKPOINT)]
+        return [name.folder + each for each in below if _OF_LEROBOT.fullmatch(each)]
+    found = [name.folder + each for each in below if each.endswith(_CHECKPOINT)]
     if len(found) == 1:
         return found
     if found:
-        example = next((each.removeprefix(inside) for each in found if plain(each)), f"PATH{_CHECKPOINT}")
+        example = next((each.removeprefix(name.folder) for each in found if plain(each)), f"PATH{_CHECKPOINT}")
         raise HubError(f"{text}: it has {len(found)} checkpoints. Say which: {name.at('REVISION')}/{example}")
     has = ", ".join(each for each in files[:4] if plain(each)) or "nothing"
     expected = f"expected {_CONFIG} and {_WEIGHTS} of LeRobot, or one file {_CHECKPOINT} of Diffusion Policy"
@@ -218,3 +215,37 @@ def told(text: str) -> Iterator[None]:
         kind, first = type(last).__name__, f"{last}".strip().split("\n")[0].rstrip(".")
         remedy = "Is the name right, is there a network, and for a private repository a login (hf auth login)?"
         raise HubError(f"{text:.200}: {kind}: {first:.300}. {remedy}") from error
+
+
+_MADE_BY_THE_HUB = frozenset({".gitattributes", CARD})
+
+
+def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, private: bool = False) -> str:
+    """Commit these files and the card; the repository is made if it is not there.
+
+    Args:
+        private: whether the repository is nobody else's to see; one that is there already must be private then.
+
+    Returns:
+        ``hf://org/name@commit``.
+
+    Raises:
+        HubError: the repository holds something else than an artifact, is public although ``private`` was asked for, or
+            cannot be written.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
+    """
+    require_repository(repository, repository)
+    hub = library()
+    with told(repository):
+        api = hub.HfApi()
+        api.create_repo(repository, private=private, exist_ok=True)
+        if private and not api.repo_info(repository).private:
+            raise HubError(f"{repository}: expected a private repository; it is public already. Give another.")
+        there = set(api.list_repo_files(repository)) - _MADE_BY_THE_HUB
+        if there and MANIFEST not in there:
+            found = ", ".join(sorted(there)[:3])
+            raise HubError(f"{repository}: expected an empty repository or an artifact; it has {found}. Give another.")
+        files = [hub.CommitOperationAdd(name, str(folder / name)) for name in names]
+        operations = [*files, hub.CommitOperationAdd(CARD, card.encode())]
+        made = api.create_commit(repository, operations, commit_message="Upload an artifact of ttscompile")
+        return HubName(repository).at(str(made.oid))
