@@ -42,6 +42,7 @@ from ttscompile.calibration.calls import (
 )
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.pruner.paper import UPDATES, Paper
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Search, Task
@@ -49,7 +50,6 @@ from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
-from ttscompile.rivals.paper import UPDATES, Paper
 from ttscompile.runtimes.plans import pruner_plan
 
 WITH_OTHER_NOISE = 64

@@ -1,9 +1,8 @@
 """What calibration is compared with: strategies that others have published, each a row of ``RIVALS``.
 
-``paper`` trains the plan head as test-time sparsity does, with what ``straight_through`` has. ``static`` has strategies
-that follow a rule; ``fixed`` what all of one interval share; ``online`` what those share that decide during a call;
-``slopes`` has the gradients that ``gates`` follows. This module alone imports no torch, so that the command line can
-list them. Nothing that calibrates by default imports the others.
+``static`` has strategies that follow a rule; ``fixed`` what all of one interval share; ``online`` what those share that
+decide during a call; ``slopes`` has the gradients that ``gates`` follows. This module alone imports no torch, so that
+the command line can list them. Nothing that calibrates by default imports the others.
 
 TaylorSeer (arXiv 2503.06923) is not here. It adds ``r(o) + (k - o) * (r(o) - r(p)) / (o - p)``, a combination of two
 computed residuals with a weight that grows with the step. A cell of the lattice adds one computed residual; neither a
@@ -15,13 +14,6 @@ from __future__ import annotations
 from ttscompile.calibration.strategy import Strategy
 
 RIVALS = (
-    Strategy(
-        "tts-paper",
-        "test-time sparsity as published, arXiv 2605.13316: gates trained for each observation",
-        "rivals.paper:Paper",
-        uses_pruner=True,
-        consecutive=True,
-    ),
     Strategy(
         "interval",
         "FORA, arXiv 2407.01425; EfficientVLA (arXiv 2506.10100)",

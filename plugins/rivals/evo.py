@@ -13,11 +13,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from ttscompile.calibration.spacing import spacings
-from ttscompile.calibration.task import Array, Found, Task
+from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 
 from .dense import some_calls
-from .intervals import NothingAfter
 
 POPULATION, GENERATIONS = 30, 100
 

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ttscompile.calibration.task import Array, Found, Task
+from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import PlanArray, dense_plan
 
 from .dense import some_calls
-from .intervals import NothingAfter
 
 COMPARED = 16
 """Calls on which candidates are compared; fewer if there are fewer."""

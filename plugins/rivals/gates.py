@@ -21,12 +21,11 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.calibration.task import Array, Found, Task
+from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, uniform_plan
 
 from .dense import some_calls
 from .fixed import COMPARED
-from .intervals import NothingAfter
 from .slopes import slopes
 
 INTERVALS = 120

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import ttscompile
+from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.search import open_search
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, strategy_of
 from ttscompile.calibration.strategy import Strategy
 from ttscompile.calibration.task import Found, Search
 from ttscompile.core.lattice import Source, illegal_cells
 from ttscompile.errors import CalibrationError
-from ttscompile.rivals import evo, gates, online, paper
+from ttscompile.rivals import evo, gates, online
 
 from .tasks import MakeTask, found_by
 

@@ -10,11 +10,11 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.calibration import execute
 from ttscompile.calibration.calls import Calls, Split, sample_calls, window_of
 from ttscompile.calibration.execute import Executor, whole_windows
+from ttscompile.calibration.pruner.straight_through import Practice, legal
 from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import Source, legalize
 from ttscompile.core.spec import FloatArray
-from ttscompile.rivals.straight_through import Practice, legal
 from ttscompile.trajectories.episodes import Episode
 
 from .tasks import WINDOW, MakeTask, in_windows

@@ -14,7 +14,7 @@ from tests.calibration import policies
 from tests.once import Once
 from ttscompile.calibration import tts
 from ttscompile.calibration.calls import Calls
-from ttscompile.rivals.paper import UPDATES
+from ttscompile.calibration.pruner.paper import UPDATES
 from ttscompile.runtimes.reference.model import Contexts
 
 WAYS = ["searched", "gates", "head", "refined"]

@@ -1,4 +1,4 @@
-"""The strategies by name: this project's own, and those that others have published, the paper's among them."""
+"""The strategies by name: this project's own, the paper's, and those of others."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ import pkgutil
 from ..errors import CalibrationError
 from .strategy import Strategy
 
-STRATEGIES: tuple[Strategy, ...] = (
+OWN = (
     Strategy(
         "tts",
         "whole steps with a correction, the same for every observation; this project's own",
         "calibration.tts:Tts",
         fits_correction=True,
     ),
-    *pkgutil.resolve_name("ttscompile.rivals:RIVALS"),
+    Strategy(
+        "tts-paper",
+        "test-time sparsity as published, arXiv 2605.13316: gates trained for each observation",
+        "calibration.pruner.paper:Paper",
+        uses_pruner=True,
+        consecutive=True,
+    ),
 )
+
+STRATEGIES: tuple[Strategy, ...] = (*OWN, *pkgutil.resolve_name("ttscompile.rivals:RIVALS"))
 """In the order in which they are listed; the first one is the default."""
 
 NAMES = tuple(one.name for one in STRATEGIES)

@@ -153,3 +153,16 @@ class Search(Protocol):
 
     def found(self) -> Found:
         """The outcome."""
+
+
+class NothingAfter:
+    """What a ``Search`` says that has nothing left to do after its intervals: it keeps its best plan throughout."""
+
+    intervals = 1
+    settling = 0.0
+    _interval = 0  # how many were done
+
+    @property
+    def done(self) -> bool:
+        """Whether all intervals were done."""
+        return self._interval >= self.intervals

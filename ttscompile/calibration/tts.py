@@ -1,7 +1,7 @@
 """Whole steps, placed by their true error, with a correction: the default, and the same for every observation.
 
-Test-time sparsity (arXiv 2605.13316) has a head decide for each observation; strategy ``tts-paper`` trains one. This
-search places whole steps, because with a correction (``fit_correction``) it is they that carry information about the
+Test-time sparsity (arXiv 2605.13316) has a head decide for each observation, which ``pruner.paper`` trains. This search
+places whole steps, because with a correction (``fit_correction``) it is they that carry information about the
 observation and the noise, and everything in between is nearly linear. Every candidate gets a correction of its own,
 fitted on some of the calls, and is judged by the true error of its actions on others. It starts with a family of
 crowded schedules. Where there are few others, it tries them all; else it moves one step of the best at a time, far

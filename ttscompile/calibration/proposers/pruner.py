@@ -17,8 +17,9 @@ from ...ir.plan_head import has_head
 from ..clock import Clock
 from ..judge import Score
 from ..proposer import Proposal, Proposals, Proposer
+from ..pruner.paper import Paper
 from ..schedule import one_plan
-from ..search import open_search, searched
+from ..search import searched
 from ..task import Task
 from ..trials import Trials, base_of
 
@@ -41,7 +42,7 @@ class Pruner(Proposer):
             )
         computed = int((cells == Source.COMPUTE).sum())
         task = Task.of(trials.executor, trials.windows, computed, trials.seed, trials.pool)
-        search = open_search("tts-paper", replace(task, clock=clock))
+        search = Paper(replace(task, clock=clock))
         found, updates, _ = searched(trials, search, clock, self.request.intervals, PRUNER)
         self.told = f"{updates} updates; its best head is {found.error:.4g} off on calls that it was not trained on"
         share = float(np.mean(cells != Source.COMPUTE))

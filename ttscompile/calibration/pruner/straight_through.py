@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ttscompile.calibration.calls import Calls, IntArray
-from ttscompile.calibration.execute import Executor, State, latest_before
-from ttscompile.core.lattice import BoolArray, PlanArray, Source
-from ttscompile.runtimes.reference.reuse import Caches, Cell, reuse
+from ...core.lattice import BoolArray, PlanArray, Source
+from ...runtimes.reference.reuse import Caches, Cell, reuse
+from ..calls import Calls, IntArray
+from ..execute import Executor, State, latest_before
 
 BYTES = 2**28
 """Memory for what the blocks compute in the dense calls, as bfloat16. It decides how many calls are learned from."""

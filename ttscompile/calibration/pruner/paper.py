@@ -35,14 +35,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ttscompile.calibration.calls import Calls, IntArray
-from ttscompile.calibration.spacing import spacings
-from ttscompile.calibration.task import Array, Found, Task
-from ttscompile.core.lattice import PlanArray, Source, whole_steps_plan
-from ttscompile.ir.plan_head import first_numbers, has_head
-from ttscompile.runtimes.plans import pruner_plan
-
-from .intervals import NothingAfter
+from ...core.lattice import PlanArray, Source, whole_steps_plan
+from ...ir.plan_head import first_numbers, has_head
+from ...runtimes.plans import pruner_plan
+from ..calls import Calls, IntArray
+from ..spacing import spacings
+from ..task import Array, Found, NothingAfter, Task
 from .straight_through import Practice, legal, written
 
 UPDATES = 240

@@ -18,11 +18,11 @@ from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score
 from ttscompile.calibration.kept import Kept, holding
 from ttscompile.calibration.proposer import Proposal
+from ttscompile.calibration.pruner import paper
+from ttscompile.calibration.pruner.paper import Paper
 from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import Source, whole_steps_plan
-from ttscompile.rivals import paper
-from ttscompile.rivals.paper import Paper
 from ttscompile.runtimes.plans import pruner_plan
 
 BUDGET = 20
