@@ -103,14 +103,15 @@ def once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="session", autouse=True)
-def exporter(once: Once) -> Iterator[None]:
-    """Torch's exporter is what most tests of compiled policies would wait for."""
+def tracers(once: Once) -> Iterator[None]:
+    """Torch's tracer and its exporter are what most tests of compiled policies would wait for."""
     if importlib.util.find_spec("torch") is None:
         yield
         return
+    from .capturer import captured_once
     from .exporter import exported_once
 
-    with exported_once(once.directory / "exports"):
+    with captured_once(once.directory / "captures"), exported_once(once.directory / "exports"):
         yield
 
 

@@ -17,6 +17,8 @@ from torch.onnx._internal.exporter._registration import ONNXRegistry
 from ttscompile.ir.graph import Graph
 from ttscompile.lower import program
 
+from .untraced import untraced
+
 
 @contextmanager
 def exported_once(directory: Path) -> Iterator[None]:
@@ -32,8 +34,10 @@ def exported_once(directory: Path) -> Iterator[None]:
             return run(graphs)
         path = directory / sha256("\n\n".join(map(program.structural_key, graphs)).encode()).hexdigest()
         if not path.exists():
+            with untraced():
+                made = run(graphs).SerializeToString()
             with NamedTemporaryFile(dir=directory, delete=False) as unfinished:
-                unfinished.write(run(graphs).SerializeToString())
+                unfinished.write(made)
             Path(unfinished.name).rename(path)
         return onnx.ModelProto.FromString(path.read_bytes())
 
