@@ -119,7 +119,7 @@ class _Structure(pickle.Pickler):
             return name, *form
         return sha256(numbers(thing).tobytes()).hexdigest(), *form
 
-    def reducer_override(self, thing: object) -> object:
+    def reducer_override(self, thing: object) -> Any:
         for each in type.mro(thing) if isinstance(thing, type) else [thing] if isinstance(thing, FunctionType) else []:
             path = getattr(sys.modules.get(each.__module__), "__file__", None)
             if path is not None:

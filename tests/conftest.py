@@ -6,7 +6,7 @@ import gc
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,7 +56,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Iterator[object]:
+def pytest_collection() -> Generator[None, object, object]:
     """What is imported stays: Python need not look through it for garbage again, which takes a tenth of a run."""
     gc.disable()
     try:
@@ -150,23 +150,37 @@ def compiled_pusht(pusht_checkpoint: Path, once: Once) -> Path:
     return once.compiled("pusht", convert)[0]
 
 
+def first_layer(checkpoint: Path, directory: Path, width: int) -> None:
+    """Save the Push-T policy with the first of its eight layers, and the first channels of each of its four heads."""
+    import torch
+
+    from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
+
+    payload = read_checkpoint(checkpoint)
+    config = plain_config(payload["cfg"])
+    config["policy"]["model"] |= {"n_layer": 1, "n_emb": width}
+    kept = torch.arange(256).view(4, 64)[:, : width // 4].flatten()
+    axes = {256: kept, 768: torch.cat([kept, 256 + kept, 512 + kept]), 1024: torch.arange(4 * width)}
+    weights = {}
+    for name, value in payload["state_dicts"]["ema_model"].items():
+        if not DEEPER.match(name):
+            for axis, size in enumerate(value.shape):
+                value = value.index_select(axis, axes[size]) if size in axes else value
+            weights[name] = value
+    directory.mkdir()
+    torch.save({"cfg": config, "state_dicts": {"ema_model": weights}, "pickles": {}}, directory / "policy.ckpt")
+
+
 @pytest.fixture(scope="session")
 def one_layer_checkpoint(pusht_checkpoint: Path, once: Once) -> Path:
-    """The Push-T policy with the first of its eight layers: three blocks, converted in seconds."""
+    """One layer of the Push-T policy, a quarter as wide: three blocks, soon converted and soon computed."""
+    return once.folder("one_layer", lambda directory: first_layer(pusht_checkpoint, directory, 64)) / "policy.ckpt"
 
-    def save(directory: Path) -> None:
-        import torch
 
-        from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
-
-        payload = read_checkpoint(pusht_checkpoint)
-        config = plain_config(payload["cfg"])
-        config["policy"]["model"]["n_layer"] = 1
-        weights = {name: value for name, value in payload["state_dicts"]["ema_model"].items() if not DEEPER.match(name)}
-        directory.mkdir()
-        torch.save({"cfg": config, "state_dicts": {"ema_model": weights}, "pickles": {}}, directory / "policy.ckpt")
-
-    return once.folder("one_layer", save) / "policy.ckpt"
+@pytest.fixture(scope="session")
+def whole_layer_checkpoint(pusht_checkpoint: Path, once: Once) -> Path:
+    """One layer as it was trained, of which a search of a moment finds a plan."""
+    return once.folder("whole_layer", lambda directory: first_layer(pusht_checkpoint, directory, 256)) / "policy.ckpt"
 
 
 @pytest.fixture(scope="session")
