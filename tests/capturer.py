@@ -53,7 +53,8 @@ def captured_once(directory: Path) -> Iterator[None]:
                     name: numbers(held[one]) if isinstance(one, str) else one for name, one in values.items()
                 }
             with untraced():
-                graph, weights = convert(*trace(self.module, *self.how)).convert(spec)
+                traced = trace(self.module, *self.how)
+            graph, weights = convert(*traced).convert(spec)
             start = "module." if _by_position(self.module) else ""
             values = {
                 name: one if (own := name.removeprefix(start)) not in held else own for name, one in weights.items()

@@ -7,7 +7,6 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable, Generator, Iterator
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ from ttscompile.ir.program import Program
 from ttscompile.measure.machine import has_integer_dot_product
 
 from .once import Once
-from .untraced import untraced
+from .untraced import pytest_runtest_protocol as pytest_runtest_protocol
 
 if TYPE_CHECKING:
     from _pytest.terminal import TerminalReporter
@@ -66,16 +65,6 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
         gc.enable()
         gc.set_threshold(700, 10, 100)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time.
-
-    ``no_cover`` of pytest-cov says this, too, but does nothing in the processes of pytest-xdist.
-    """
-    with untraced() if item.get_closest_marker("slow") else nullcontext():
-        return (yield)
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
