@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-.PHONY: demo quick test lint types pytest test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot test-openpi clean
+.PHONY: demo quick test lint types pytest together alone test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot test-openpi clean
 
 demo: $(READY)
 	$(BIN)/python examples/pusht/demo.py
@@ -26,7 +26,11 @@ demo: $(READY)
 quick: lint
 	$(BIN)/pytest $(TOGETHER) -m "not slow and not alone and not soak"
 
-test: lint types pytest
+# Mypy has one thread, so it runs beside the tests; what takes times waits until both are done.
+test: lint
+	$(MAKE) --jobs=2 types together
+	$(MAKE) alone
+	$(BIN)/python tests/covered.py
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -46,10 +50,16 @@ types: $(READY)
 # On all cores, each with a file at a time; then, one by one, what takes times. The tests of make quick are measured on
 # the way: what share of the core's lines they run.
 TOGETHER := -n logical --dist loadfile --benchmark-disable
-pytest: $(READY)
-	$(BIN)/pytest $(TOGETHER) -m "not alone and not soak" --cov --cov-report=
-	$(BIN)/pytest -m "alone and not soak"
+pytest: together
+	$(MAKE) alone
 	$(BIN)/python tests/covered.py
+
+together: $(READY)
+	$(BIN)/pytest $(TOGETHER) -m "not alone and not soak" --cov --cov-report=
+
+# Of the files that have such tests, so that the others are not imported once more.
+alone: $(READY)
+	$(BIN)/pytest -m "alone and not soak" $$(grep --recursive --files-with-matches --include='test_*.py' 'mark\.alone' tests)
 
 # The same as on a processor without AVX-512: torch, MKL, oneDNN, OpenBLAS and numpy each have a switch of their own.
 # onnxruntime has none; its matrix products of fp32 give the same bits with either (Conv and Softmax do not).
@@ -113,5 +123,6 @@ clean:
 
 $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile $(PIP_FLAGS) -c constraints.txt -e '.[$(EXTRAS)]'
+	$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV)/lib || true  # all cores; pip has one, and some files are templates
 	touch $@

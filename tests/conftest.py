@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from ttscompile.ir.program import Program
 from ttscompile.measure.machine import has_integer_dot_product
 
 from .once import Once
-from .untraced import untraced
+from .untraced import pytest_runtest_protocol as pytest_runtest_protocol
 
 if TYPE_CHECKING:
     from _pytest.terminal import TerminalReporter
@@ -55,13 +55,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time.
-
-    ``no_cover`` of pytest-cov says this, too, but does nothing in the processes of pytest-xdist.
-    """
-    with untraced() if item.get_closest_marker("slow") else nullcontext():
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported stays: Python need not look through it for garbage again, which takes a tenth of a run."""
+    gc.disable()
+    try:
         return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
+        gc.set_threshold(700, 10, 100)
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
@@ -103,14 +106,15 @@ def once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="session", autouse=True)
-def exporter(once: Once) -> Iterator[None]:
-    """Torch's exporter is what most tests of compiled policies would wait for."""
+def tracers(once: Once) -> Iterator[None]:
+    """Torch's tracer and its exporter are what most tests of compiled policies would wait for."""
     if importlib.util.find_spec("torch") is None:
         yield
         return
+    from .capturer import captured_once
     from .exporter import exported_once
 
-    with exported_once(once.directory / "exports"):
+    with captured_once(once.directory / "captures"), exported_once(once.directory / "exports"):
         yield
 
 
@@ -135,23 +139,37 @@ def compiled_pusht(pusht_checkpoint: Path, once: Once) -> Path:
     return once.compiled("pusht", convert)[0]
 
 
+def first_layer(checkpoint: Path, directory: Path, width: int) -> None:
+    """Save the Push-T policy with the first of its eight layers, and the first channels of each of its four heads."""
+    import torch
+
+    from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
+
+    payload = read_checkpoint(checkpoint)
+    config = plain_config(payload["cfg"])
+    config["policy"]["model"] |= {"n_layer": 1, "n_emb": width}
+    kept = torch.arange(256).view(4, 64)[:, : width // 4].flatten()
+    axes = {256: kept, 768: torch.cat([kept, 256 + kept, 512 + kept]), 1024: torch.arange(4 * width)}
+    weights = {}
+    for name, value in payload["state_dicts"]["ema_model"].items():
+        if not DEEPER.match(name):
+            for axis, size in enumerate(value.shape):
+                value = value.index_select(axis, axes[size]) if size in axes else value
+            weights[name] = value
+    directory.mkdir()
+    torch.save({"cfg": config, "state_dicts": {"ema_model": weights}, "pickles": {}}, directory / "policy.ckpt")
+
+
 @pytest.fixture(scope="session")
 def one_layer_checkpoint(pusht_checkpoint: Path, once: Once) -> Path:
-    """The Push-T policy with the first of its eight layers: three blocks, converted in seconds."""
+    """One layer of the Push-T policy, a quarter as wide: three blocks, soon converted and soon computed."""
+    return once.folder("one_layer", lambda directory: first_layer(pusht_checkpoint, directory, 64)) / "policy.ckpt"
 
-    def save(directory: Path) -> None:
-        import torch
 
-        from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
-
-        payload = read_checkpoint(pusht_checkpoint)
-        config = plain_config(payload["cfg"])
-        config["policy"]["model"]["n_layer"] = 1
-        weights = {name: value for name, value in payload["state_dicts"]["ema_model"].items() if not DEEPER.match(name)}
-        directory.mkdir()
-        torch.save({"cfg": config, "state_dicts": {"ema_model": weights}, "pickles": {}}, directory / "policy.ckpt")
-
-    return once.folder("one_layer", save) / "policy.ckpt"
+@pytest.fixture(scope="session")
+def whole_layer_checkpoint(pusht_checkpoint: Path, once: Once) -> Path:
+    """One layer as it was trained, of which a search of a moment finds a plan."""
+    return once.folder("whole_layer", lambda directory: first_layer(pusht_checkpoint, directory, 256)) / "policy.ckpt"
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,8 @@ from torch.onnx._internal.exporter._registration import ONNXRegistry
 from ttscompile.ir.graph import Graph
 from ttscompile.lower import program
 
+from .untraced import untraced
+
 
 @contextmanager
 def exported_once(directory: Path) -> Iterator[None]:
@@ -25,19 +27,25 @@ def exported_once(directory: Path) -> Iterator[None]:
     Processes that a test starts have an exporter of their own, and so has a test that watches ``torch.onnx.export``.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    run, export = program._run_exporter, torch.onnx.export
+    export, watched = program._export, torch.onnx.export
 
-    def once(graphs: list[Graph]) -> onnx.ModelProto:
-        if torch.onnx.export is not export:
-            return run(graphs)
-        path = directory / sha256("\n\n".join(map(program.structural_key, graphs)).encode()).hexdigest()
-        if not path.exists():
-            with NamedTemporaryFile(dir=directory, delete=False) as unfinished:
-                unfinished.write(run(graphs).SerializeToString())
-            Path(unfinished.name).rename(path)
-        return onnx.ModelProto.FromString(path.read_bytes())
+    def once(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
+        if torch.onnx.export is not watched:
+            return export(graphs)
+        paths = {
+            name: directory / sha256(program.structural_key(graph).encode()).hexdigest()
+            for name, graph in graphs.items()
+        }
+        if missing := {name: graph for name, graph in graphs.items() if not paths[name].exists()}:
+            with untraced():
+                made = {name: model.SerializeToString() for name, model in export(missing).items()}
+            for name, content in made.items():
+                with NamedTemporaryFile(dir=directory, delete=False) as unfinished:
+                    unfinished.write(content)
+                Path(unfinished.name).rename(paths[name])
+        return {name: onnx.ModelProto.FromString(path.read_bytes()) for name, path in paths.items()}
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(program, "_run_exporter", once)
+        patch.setattr(program, "_export", once)
         patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib)))
         yield

@@ -106,7 +106,7 @@ def test_a_checkpoint_becomes_a_policy(one_layer_checkpoint: Path, tmp_path: Pat
     recording = tmp_path / "calls.npz"
     np.savez(recording, obs=np.repeat(walks, 2, 1).astype(np.float32), episode_ends=[6, 12, 18, 24])
     words = ["build", str(one_layer_checkpoint), "-t", str(recording), "-o", str(tmp_path / "compiled")]
-    result = CliRunner().invoke(main, [*words, "--minutes", "0.3", "--error", "3"], catch_exceptions=False)
+    result = CliRunner().invoke(main, [*words, "--minutes", "0.05", "--error", "3"], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     artifact = load_artifact(tmp_path / "compiled")
     record = artifact.manifest.calibration

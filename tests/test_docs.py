@@ -41,10 +41,10 @@ FOLLOWED = sorted(
 
 
 @pytest.fixture(scope="module")
-def folder(one_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(whole_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the pages after the tutorial speak of, from the first of the policy's eight layers."""
     place = tmp_path_factory.mktemp("docs")
-    shutil.copy(one_layer_checkpoint, place / "policy.ckpt")
+    shutil.copy(whole_layer_checkpoint, place / "policy.ckpt")
     (place / "examples").symlink_to(ROOT / "examples")
     rng = np.random.default_rng(0)
     calls = rng.uniform(100, 400, (60, 2, 20)).astype(np.float32)
@@ -141,8 +141,8 @@ def test_a_page_can_be_followed(page: Path, request: pytest.FixtureRequest, tmp_
         (tmp_path / "examples" / "pusht").mkdir(parents=True)
         (tmp_path / "examples" / "evaluation").symlink_to(ROOT / "examples" / "evaluation")
         for file in (ROOT / "examples" / "pusht").iterdir():
-            one_layer = request.getfixturevalue("one_layer_checkpoint")
-            (tmp_path / "examples" / "pusht" / file.name).symlink_to(one_layer if file.suffix == ".ckpt" else file)
+            layer = request.getfixturevalue("whole_layer_checkpoint")
+            (tmp_path / "examples" / "pusht" / file.name).symlink_to(layer if file.suffix == ".ckpt" else file)
         monkeypatch.chdir(tmp_path)
     else:
         request.getfixturevalue("here")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from . import conftest, untraced
 from .covered import ROOT, by_room, room, table
 
 TESTS = ROOT / "tests"
@@ -71,13 +72,14 @@ def test_coverage_is_told_by_room_and_the_worst_comes_first() -> None:
 
 @pytest.mark.slow
 def test_slow_tests_are_not_measured(tmp_path: Path) -> None:
-    """With the tree's own conftest, in processes of its own, as ``make test`` has them."""
+    """With the hook of the tree's own conftest, in processes of its own, as ``make test`` has them."""
+    assert conftest.pytest_runtest_protocol is untraced.pytest_runtest_protocol
     (tmp_path / "measured.py").write_text("def quick():\n    return 1\n\n\ndef slow():\n    return 2\n")
     (tmp_path / "test_it.py").write_text(
         "import pytest, measured\n\n\ndef test_a():\n    assert measured.quick() == 1\n\n\n"
         "@pytest.mark.slow\ndef test_b():\n    assert measured.slow() == 2\n"
     )
-    words = ["-m", "pytest", "-q", "-n", "1", "-p", "tests.conftest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml"]
+    words = ["-m", "pytest", "-q", "-n", "1", "-p", "tests.untraced", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml"]
     words += [
         "--cov",
         tmp_path,

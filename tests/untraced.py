@@ -1,9 +1,13 @@
-"""Coverage that stands still for a while."""
+"""Coverage that stands still for a while. As a plugin of pytest: while a slow test runs."""
+
+from __future__ import annotations
 
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+
+import pytest
 
 
 @contextmanager
@@ -17,3 +21,13 @@ def untraced() -> Iterator[None]:
     finally:
         sys.settrace(tracers[0])
         threading.settrace(tracers[1])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time.
+
+    ``no_cover`` of pytest-cov says this, too, but does nothing in the processes of pytest-xdist.
+    """
+    with untraced() if item.get_closest_marker("slow") else nullcontext():
+        return (yield)

@@ -65,8 +65,7 @@ def test_spec_comes_back_with_its_order() -> None:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [TensorType((Batch(), 16, 64), "float32"), TensorType((Batch(12), 0), "int64"), TensorType((), "bool")],
+    "kind", [TensorType((Batch(), 16, 64), "float32"), TensorType((Batch(12), 0), "int64"), TensorType((), "bool")]
 )
 def test_types_come_back(kind: TensorType) -> None:
     assert from_json(TensorType, Value(to_json(kind), "t")) == kind

@@ -34,10 +34,7 @@ def tiny_spec(seed: int = 0) -> PolicySpec:
     normalizer = Affine(np.array([0.1, 1 / 3], np.float32), np.array([-0.7, 1e-30], np.float32))
     return PolicySpec(
         sample=(HORIZON, CHANNELS),
-        observations={
-            "obs": ObservationSpec((1, 2), normalizer),
-            "goal": ObservationSpec((MEMORY,), None),
-        },
+        observations={"obs": ObservationSpec((1, 2), normalizer), "goal": ObservationSpec((MEMORY,), None)},
         sampler=SamplerTable(name="ddpm", timesteps=np.array([90, 50, 0]), clip=1.0, **columns),
         chunk=ChunkSpec(action_dim=2, start=0, stop=3, normalizer=normalizer),
         source={"format": "by hand", "architecture": "tiny"},

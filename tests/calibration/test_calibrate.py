@@ -78,8 +78,7 @@ def test_what_it_measured_is_what_the_artifact_does(
     draw = np.random.default_rng(5)
     shape = (len(obs["obs"]), policies.HORIZON, policies.CHANNELS)
     noise = ttscompile.Noise(
-        draw.standard_normal(shape, dtype=np.float32),
-        draw.standard_normal((policies.STEPS, *shape), dtype=np.float32),
+        draw.standard_normal(shape, dtype=np.float32), draw.standard_normal((policies.STEPS, *shape), dtype=np.float32)
     )
     actions = {}
     for plan in ("dense", "schedule", "uniform"):

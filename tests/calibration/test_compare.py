@@ -66,11 +66,7 @@ def points(frontier: Comparison) -> dict[tuple[str, str], MeasuredPoint]:
 
 def test_every_plan_is_measured_on_the_same_calls(frontier: Comparison) -> None:
     found = points(frontier)
-    assert list(found) == [
-        ("this artifact", "dense"),
-        ("this artifact", "half"),
-        ("five", "dense"),
-    ]
+    assert list(found) == [("this artifact", "dense"), ("this artifact", "half"), ("five", "dense")]
     dense = found["this artifact", "dense"]
     assert (dense.error or 0.0) < 1e-6  # the truth, with the same noise, in another runtime
     assert dense.distance == pytest.approx(0.0, abs=1e-3)

@@ -21,10 +21,7 @@ from ttscompile.measure.energy import TENTH, pairs, rooted
 from ttscompile.report import facts
 
 SPEC = PolicySpec(
-    sample=(4, 2),
-    observations={"state": ObservationSpec((1, 3))},
-    sampler=direct_table(),
-    chunk=ChunkSpec(2, 0, 3),
+    sample=(4, 2), observations={"state": ObservationSpec((1, 3))}, sampler=direct_table(), chunk=ChunkSpec(2, 0, 3)
 )
 
 
@@ -113,12 +110,7 @@ def test_there_is_no_other_noise(made: Path, recorded: Path, tmp_path: Path) -> 
 
 @pytest.mark.parametrize(("allowed", "told"), [(100.0, "int8 in condition"), (1e-4, "all parts stay fp32")])
 def test_precision_is_learned_and_nothing_is_reused(
-    made: Path,
-    recorded: Path,
-    tmp_path: Path,
-    allowed: float,
-    told: str,
-    monkeypatch: pytest.MonkeyPatch,
+    made: Path, recorded: Path, tmp_path: Path, allowed: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As ``build`` does it: eight bits where they are near enough. The record says why no schedule was looked for."""
     monkeypatch.setattr("ttscompile.calibration.proposers.precision.Precision.margin", allowed)

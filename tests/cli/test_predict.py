@@ -87,11 +87,7 @@ def test_grey_jpegs_and_pictures_of_any_size(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "state", "message"),
     [
-        (
-            ["side"],
-            None,
-            "--image side: no camera has this name; expected one of observation.images.front",
-        ),
+        (["side"], None, "--image side: no camera has this name; expected one of observation.images.front"),
         (["front", FRONT], None, "observation.images.front is given twice"),
         (["small"], None, "no camera"),
     ],

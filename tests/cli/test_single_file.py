@@ -42,7 +42,7 @@ def test_convert_writes_one_file_of_the_same_policy(one_layer_checkpoint: Path, 
     plan[2] = ttscompile.Source.TIMESTEP
     expected = policy.predict_action(obs, noise=noise, plan=plan)["action"]
     feeds = {**obs, "initial_noise": noise.initial, "plan": plan[None], "rollout_keep": np.zeros((4, 3), np.bool_)}
-    feeds |= {"rollout_rows": np.zeros((0, 1, 16, 256), np.float32), "rollout_index": np.full((1, 4, 3), -1)}
+    feeds |= {"rollout_rows": np.zeros((0, 1, 16, 64), np.float32), "rollout_index": np.full((1, 4, 3), -1)}
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     (found,) = session.run(["action"], feeds)
     # Actions are pixels, 0 to 512; int8 rounds values that differ in the last bit to different integers.

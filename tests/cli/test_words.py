@@ -52,10 +52,7 @@ NEEDED = {
     "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
     "predict": [("A", "--state", "0.5,-1")],
     "push": [("A", "org/name", "--dry-run")],
-    "serve": [
-        ("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"),
-        ("A", "--copies", "1", "--port", "0"),
-    ],
+    "serve": [("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"), ("A", "--copies", "1", "--port", "0")],
     "verify": [("A",)],
 }
 """Command lines of each command that can be run, and end soon: one for each section of its options."""

@@ -157,10 +157,7 @@ def test_numbers_are_of_the_dtype_and_nothing_else_becomes_one() -> None:
 
 @pytest.mark.parametrize(
     ("make", "message"),
-    [
-        (lambda n: np.int64(2), None),
-        (lambda n: n, r"must be an integer of at least 1.*; found 2\.5"),
-    ],
+    [(lambda n: np.int64(2), None), (lambda n: n, r"must be an integer of at least 1.*; found 2\.5")],
 )
 def test_arguments_that_count_are_whole(make: Callable[[Any], Any], message: str | None) -> None:
     """At every place of the public interface that needs no artifact; those that do are tested with it."""

@@ -142,8 +142,7 @@ def test_a_file_never_takes_the_place_of_a_device(endless: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [("n" * 256, "File name too long"), ("none\0", "null"), ("none", "does not exist")],
+    ("name", "message"), [("n" * 256, "File name too long"), ("none\0", "null"), ("none", "does not exist")]
 )
 def test_names_that_cannot_be(tmp_path: Path, name: str, message: str) -> None:
     with pytest.raises(ArtifactError, match=message) as caught:

@@ -112,11 +112,7 @@ def test_the_steps_to_a_plan_are_named_by_what_it_says() -> None:
     assert steps_to("fast", Plan(cells=cells)) == {**first, two: "fast"}
     assert steps_to("pruner", Plan()) == {**first, "the cells computed that the pruner chooses": "pruner"}
     small = steps_to("fast", Plan(cells=cells, precision={"blocks": INT8, "condition": INT8, "tail": BF16}))
-    assert small == {
-        **first,
-        two: "fast@fp32",
-        "8-bit weights in blocks, condition; 16-bit weights in tail": "fast",
-    }
+    assert small == {**first, two: "fast@fp32", "8-bit weights in blocks, condition; 16-bit weights in tail": "fast"}
 
 
 @pytest.mark.slow

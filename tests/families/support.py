@@ -90,11 +90,7 @@ def read_record() -> dict[str, list[Row]]:
 
 def render(content: dict[str, list[Row]]) -> str:
     """The table in Markdown, between its markers."""
-    lines = [
-        BEGIN,
-        f"| {' | '.join(COLUMNS)} |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+    lines = [BEGIN, f"| {' | '.join(COLUMNS)} |", "| --- | --- | --- | --- | --- |"]
     lines += [
         f"| {each['family']} | {each['verified_against']} | {each['sampler']} | {_blocks(each)} | {_hoisted(each)} |"
         for each in content["families"]

@@ -26,11 +26,7 @@ _STANDARD, _RANGE = "MEAN_STD", "MIN_MAX"
 VARIANTS: dict[str, dict[str, Any]] = {
     # lerobot's defaults, but for the config: two cameras, the encoder of its variational autoencoder in the file.
     "two_cameras": {
-        "inputs": {
-            STATE: ("STATE", [STATE_DIM]),
-            TOP: ("VISUAL", [3, 49, 70]),
-            WRIST: ("VISUAL", [3, 49, 70]),
-        },
+        "inputs": {STATE: ("STATE", [STATE_DIM]), TOP: ("VISUAL", [3, 49, 70]), WRIST: ("VISUAL", [3, 49, 70])},
         "modes": {"VISUAL": _STANDARD, "STATE": _STANDARD, "ACTION": _STANDARD},
         "renamed": {"observation.images.front": TOP, "observation.arm": STATE},
         "settings": {"n_action_steps": 4},

@@ -319,10 +319,7 @@ def test_another_sampler_keeps_the_betas(payload: Build, save: Save) -> None:
     path = save(payload())
     original = load_checkpoint_policy(path)[1].sampler
     betas = {"num_train_timesteps": 20, "beta_schedule": "squaredcos_cap_v2"}
-    for spacing, name, timesteps in (
-        (None, "ddim-4", [15, 10, 5, 0]),
-        ("trailing", "ddim-4-trailing", [19, 14, 9, 4]),
-    ):
+    for spacing, name, timesteps in ((None, "ddim-4", [15, 10, 5, 0]), ("trailing", "ddim-4-trailing", [19, 14, 9, 4])):
         spec = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=4, spacing=spacing))[1]
         assert list(spec.loops) == [name] and spec.sampler.same_as(original)
         found = spec.loops[name]

@@ -64,10 +64,7 @@ NAMES = [
     ("DiffusionUnetTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
-    (
-        "DiffusionTransformerTimmPolicy",
-        "a diffusion policy with another observation encoder.*inside the module",
-    ),
+    ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("TEDiUnetLowdimPolicy", "Streaming Diffusion Policy.*is not compiled"),
     ("KarrasUnetHybridImagePolicy", "a teacher of Consistency Policy.*EDMDenoiser"),
     ("CTMPPUnetHybridImagePolicy", f"a student of Consistency Policy.*{OWN_MODULE}.*nothing can be reused"),

@@ -40,12 +40,7 @@ SOLVER = "diffusers.schedulers.scheduling_dpmsolver_multistep.DPMSolverMultistep
     ],
 )
 def test_it_gives_what_diffusers_gives(
-    payload: Build,
-    save: Save,
-    own: dict[str, Any],
-    arguments: Any,
-    settings: dict[str, Any],
-    steps: int,
+    payload: Build, save: Save, own: dict[str, Any], arguments: Any, settings: dict[str, Any], steps: int
 ) -> None:
     """A policy of DDPM, with the bound on the sample that it was trained with; and one of RDT-1B's scheduler."""
     built = payload()

@@ -164,14 +164,7 @@ def worker(target: str, seed: int, first: int, stop: int, corpus: Path, work: Pa
     tempfile.tempdir = str(inside / "tmp")
     _warm_up(target, make, corpus, inside)
     guard = Guard(inside)
-    report: dict[str, Any] = {
-        "refused": 0,
-        "accepted": 0,
-        "stopped": 0,
-        "slowest": 0.0,
-        "defects": [],
-        "next": stop,
-    }
+    report: dict[str, Any] = {"refused": 0, "accepted": 0, "stopped": 0, "slowest": 0.0, "defects": [], "next": stop}
     seconds_apart = 0.0
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     descriptor = os.open(work / "case", os.O_WRONLY | os.O_CREAT)

@@ -134,11 +134,7 @@ def test_main_means_what_was_downloaded_last_where_nobody_answers(
     [
         ("hf://org/none", None, "RepositoryNotFoundError|404"),
         ("hf://org/name@nothing", {}, "Revision|404"),
-        (
-            "hf://org/name",
-            {"README.md": CARD},
-            "no manifest.json in it, so it is no artifact",
-        ),
+        ("hf://org/name", {"README.md": CARD}, "no manifest.json in it, so it is no artifact"),
         ("hf://org/name", {"manifest.json": b"{"}, "manifest.json lists no files"),
         ("hf://org/name", {"manifest.json": b"[" * 10_000}, "manifest.json lists no files"),
         ("hf://org/name", {"manifest.json": b'{"files": 3}'}, "manifest.json lists no files"),

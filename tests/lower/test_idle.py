@@ -130,10 +130,7 @@ def test_a_norm_without_weights_and_a_stem_with_positions_have_the_form() -> Non
             },
             "is not over the 4 numbers",
         ),
-        (
-            {"tail": reads_a_context()},
-            "values of the observation or the step",
-        ),
+        ({"tail": reads_a_context()}, "values of the observation or the step"),
     ],
 )
 def test_near_misses_have_no_model(change: dict[str, LoopPiece], why: str) -> None:

@@ -142,10 +142,7 @@ def test_plans_of_any_integers_are_the_same_plan(policy: CompiledPolicy, dtype: 
     "plan", [PLAN > 0, PLAN.astype(float), PLAN.astype(object), PLAN.astype("U1"), PLAN + np.int16(300)]
 )
 def test_plans_of_anything_else_are_refused_everywhere(policy: CompiledPolicy, plan: Any) -> None:
-    for call in (
-        lambda: actions(policy, plan=plan),
-        lambda: legalize(plan, range(5), np.zeros((5, 5), np.bool_)),
-    ):
+    for call in (lambda: actions(policy, plan=plan), lambda: legalize(plan, range(5), np.zeros((5, 5), np.bool_))):
         with pytest.raises(IllegalPlanError, match=r"plan (has dtype|holds values 300\.\.302)"):
             call()
 

@@ -282,8 +282,7 @@ def test_a_pruner_that_gives_nan_is_refused(make_artifact: MakeArtifact) -> None
 
 
 @pytest.mark.parametrize(
-    ("runtime_name", "threads"),
-    [("tensorrt", 1), ("onnxruntime", 0), ("onnxruntime", True), ("onnxruntime", 100_000)],
+    ("runtime_name", "threads"), [("tensorrt", 1), ("onnxruntime", 0), ("onnxruntime", True), ("onnxruntime", 100_000)]
 )
 def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, runtime_name: str, threads: int) -> None:
     with pytest.raises(RuntimeUnavailableError, match="expected one of|at least 1"):

@@ -150,10 +150,7 @@ def test_the_cells_of_a_matrix_are_those_of_the_loop_that_was_loaded(artifact: A
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        (
-            {"loop": "ddim-3"},
-            r"no loop 'ddim-3'; it has \['original', 'euler-4', 'original-last-2'",
-        ),
+        ({"loop": "ddim-3"}, r"no loop 'ddim-3'; it has \['original', 'euler-4', 'original-last-2'"),
         ({"weights": "mine"}, r"no weights 'mine'; it has \['original', 'trained'\]"),
         ({"tokens": ttscompile.TokenReuse(0.1, 8)}, "no image encoder of this policy has tokens"),
         ({"loop": 3}, "a plan's loop: expected a name; found 3"),

@@ -113,10 +113,7 @@ def test_images_are_what_the_policy_was_trained_on(bytes_per_pixel: str) -> None
     """The same picture as 0..255, as bytes, as -1..1 and with its channels last, in a window and as one frame."""
     good = PIXELS.astype(np.float32) / 255
     bad, message = {
-        "as float": (
-            PIXELS.astype(np.float32),
-            r"'camera' is an image .* of 0 to 1; found 0 to 25\d\. Divide by 255,",
-        ),
+        "as float": (PIXELS.astype(np.float32), r"'camera' is an image .* of 0 to 1; found 0 to 25\d\. Divide by 255,"),
         "as they are": (PIXELS, r"uint8.*Divide by 255, channels first: image\.astype\(np\.float32\) / 255\."),
         "normalised": (good * 2 - 1, r"'camera' .* of 0 to 1; found -\S+ to \S+\. Give what the camera measures"),
         "channels last": (np.moveaxis(good, 1, -1), r"np\.moveaxis\(image, -1, -3\)"),

@@ -34,13 +34,7 @@ from .conftest import MakeArtifact
 from .plans import random_correction, random_plan
 from .toys import B, f32, node, toy_program
 
-VARIANTS = [
-    {},
-    {"noise": 0.0, "steps": 8},
-    {"steps": 1},
-    {"blocks": 1},
-    {"normed": True, "sequence_first": True},
-]
+VARIANTS = [{}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}, {"normed": True, "sequence_first": True}]
 
 
 def replaying(lines: list[Line]) -> Callable[[Line], Line]:
@@ -234,10 +228,7 @@ def test_weights_of_products_are_kept_in_fewer_bits(toy_artifact: Artifact) -> N
             {"plan": "dense@int8"},
             "runtime 'torch' computes in fp32, and beside it bf16 in blocks, fp16 in blocks; the plan wants",
         ),
-        (
-            {"runtime": "onnxruntime", "device": "cuda"},
-            "on the CPU alone; found device 'cuda'. Use runtime='torch'",
-        ),
+        ({"runtime": "onnxruntime", "device": "cuda"}, "on the CPU alone; found device 'cuda'. Use runtime='torch'"),
         (
             {"runtime": "reference", "plan": "dense@bf16"},
             "'reference' computes in fp32 alone; the plan wants 'blocks' in 'bf16'",

@@ -213,12 +213,7 @@ def toy_program(
         if pruner
         else None,
         tables={name: table.astype(np.float32) for name, table in tables.items() if name == "row" or blocks > 2},
-        bindings={
-            "row": Binding.TABLE,
-            "time": Binding.TABLE,
-            "cond": Binding.CONDITION,
-            "stepped": Binding.STEP,
-        },
+        bindings={"row": Binding.TABLE, "time": Binding.TABLE, "cond": Binding.CONDITION, "stepped": Binding.STEP},
         features=("cond",),
     )
     spec = PolicySpec(

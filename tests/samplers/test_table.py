@@ -210,11 +210,7 @@ def test_impossible_settings(steps: int, arguments: dict[str, Any], message: str
 
 
 DPM: dict[str, Any] = {"num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2"}
-RDT: dict[str, Any] = {
-    "num_train_timesteps": 1000,
-    "beta_schedule": "squaredcos_cap_v2",
-    "prediction_type": "sample",
-}
+RDT: dict[str, Any] = {"num_train_timesteps": 1000, "beta_schedule": "squaredcos_cap_v2", "prediction_type": "sample"}
 """The scheduler of RDT-1B, which takes five steps."""
 
 MULTISTEP: list[tuple[dict[str, Any], int, int]] = [

@@ -22,10 +22,7 @@ from .data_sets import ENDS, arrays, read_here
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 TOLD = Instruction(TOKENS, MASK, new_line=True)
 WORDS = {"?": 0, "push": 1, "left": 2, "right": 3, "\n": 4}
-LANGUAGE = {
-    TOKENS: ObservationSpec((3,), dtype="int64", bounds=(0, 4)),
-    MASK: ObservationSpec((3,), dtype="bool"),
-}
+LANGUAGE = {TOKENS: ObservationSpec((3,), dtype="int64", bounds=(0, 4)), MASK: ObservationSpec((3,), dtype="bool")}
 OBSERVED = {"state": ObservationSpec((1, 5)), **LANGUAGE}
 TEXTS = ["push left", "push right right right"]
 

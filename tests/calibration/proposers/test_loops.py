@@ -233,10 +233,7 @@ def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> 
 
 
 def chosen(
-    monkeypatch: pytest.MonkeyPatch,
-    trials: Trials,
-    figures: Mapping[str, tuple[float, float, float]],
-    **asked: float,
+    monkeypatch: pytest.MonkeyPatch, trials: Trials, figures: Mapping[str, tuple[float, float, float]], **asked: float
 ) -> Mapping[str, str]:
     """What the names of the artifact's plans were called while they were tried.
 

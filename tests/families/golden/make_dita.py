@@ -58,11 +58,7 @@ def run(folder: Path) -> dict[str, Arrays]:
     }
     chunk = HORIZON + 1 - FRAMES
     prediction = network(
-        observed,
-        None,
-        noisy_action_tokens=torch.from_numpy(noise),
-        timesteps=timesteps,
-        num_pred_action=chunk,
+        observed, None, noisy_action_tokens=torch.from_numpy(noise), timesteps=timesteps, num_pred_action=chunk
     )
     with noise_from(noise), on_cpu():
         made = network.inference(observed, num_pred_action=chunk)

@@ -340,11 +340,7 @@ def command(toy_compiled: Path) -> list[str]:
         (["--token-file", "token"], TOKEN, "there are two tokens, in TTSCOMPILE_TOKEN and in "),
         ([], "", "the environment's TTSCOMPILE_TOKEN: expected at least 22"),
         ([], OTHER[:9], "the environment's TTSCOMPILE_TOKEN: expected at least 22"),
-        (
-            ["--tls", "certificate.pem", "other_key.pem"],
-            None,
-            "expected a certificate and its",
-        ),
+        (["--tls", "certificate.pem", "other_key.pem"], None, "expected a certificate and its"),
         (["--tls", "certificate.pem", "key.pem", "ca.pem"], None, "its key if that is in another file; found 3"),
     ],
 )
