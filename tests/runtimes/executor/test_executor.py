@@ -10,7 +10,6 @@ import time
 from itertools import pairwise
 from math import inf
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,20 +47,6 @@ def test_every_tick_has_the_action_for_its_time() -> None:
     assert (counted.ticks, counted.holds, counted.starved, counted.deadlines_missed) == (61, 0, 0, 0)
     assert counted.chunks == counted.calls == len(world.policy.calls)
     assert counted.latency_ms.p50 == pytest.approx(100)
-
-
-def test_calls_far_outside_of_what_was_recorded_are_counted() -> None:
-    """Every third is, by the report of the policy."""
-    with World() as world:
-        far = property(lambda policy: SimpleNamespace(far=len(policy.calls) % 3 == 0, timings=None, frames=None))
-        world.policy.__class__ = type("Reporting", (ScriptedPolicy,), {"last_report": far})
-        world.begin()
-        for _ in range(60):
-            world.tick()
-        counted = world.executor.statistics()
-    assert counted.calls == len(world.policy.calls) > 6
-    assert counted.calls_outside == counted.calls // 3
-    assert counted.to_json()["calls_outside"] == counted.calls_outside
 
 
 def test_calls_start_with_the_last_frame_that_comes_early_enough() -> None:

@@ -7,6 +7,7 @@ import inspect
 import json
 from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from ttscompile.runtimes.executor.statistics import Counts, ExecutorStatistics, 
 from ttscompile.runtimes.executor.trace import CONTROL, WORKER, Trace
 from ttscompile.runtimes.report import Timings
 
-from .simulation import World
+from .simulation import ScriptedPolicy, World
 
 
 def test_percentiles_are_of_the_last_measurements_and_extremes_of_all() -> None:
@@ -144,3 +145,17 @@ def test_a_run_leaves_ticks_calls_and_resets_in_the_trace() -> None:
     assert len(calls) == len(world.policy.calls)
     assert all(event["dur"] == pytest.approx(1e5) for event in calls)
     assert calls[0]["args"] == {"plan": "dense", "epoch": 0, "chunk": "scheduled"}
+
+
+def test_calls_far_outside_of_what_was_recorded_are_counted() -> None:
+    """Every third is, by the report of the policy."""
+    with World() as world:
+        far = property(lambda policy: SimpleNamespace(far=len(policy.calls) % 3 == 0, timings=None, frames=None))
+        world.policy.__class__ = type("Reporting", (ScriptedPolicy,), {"last_report": far})
+        world.begin()
+        for _ in range(60):
+            world.tick()
+        counted = world.executor.statistics()
+    assert counted.calls == len(world.policy.calls) > 6
+    assert counted.calls_outside == counted.calls // 3
+    assert counted.to_json()["calls_outside"] == counted.calls_outside
