@@ -26,14 +26,15 @@ class Tokenizer:
     Args:
         path: of the file, or of the folder that has it.
         error: class of the errors.
+        most: tokens of a text, those that the tokenizer adds before and after it counted; None for no limit.
 
     Raises:
         TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
     """
 
-    def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
+    def __init__(self, path: str | os.PathLike[str], error: Errors, most: int | None = None) -> None:
         own = Path(path)
-        self._path, self._error = own / FILE if own.is_dir() else own, error
+        self._path, self._error, self._most = own / FILE if own.is_dir() else own, error, most
         self._tokenizer: Any = self._read()
 
     def _read(self) -> Any:
@@ -50,10 +51,10 @@ class Tokenizer:
             ) from missing
         try:
             made = tokenizers.Tokenizer.from_file(str(path))
+            made.no_truncation() if self._most is None else made.enable_truncation(self._most)
         except Exception as damaged:  # of damaged files the package raises plain Exception
             raise self._error(f"{path}: no tokenizer that can be read: {damaged!s:.200}. Copy it again.") from damaged
         made.no_padding()
-        made.no_truncation()
         return made
 
     @property
@@ -62,7 +63,7 @@ class Tokenizer:
         return int(self._tokenizer.get_vocab_size())
 
     def __call__(self, text: str) -> list[int]:
-        """The tokens of a text, all of them, with those that the tokenizer adds."""
+        """The tokens of a text, with those that the tokenizer adds."""
         try:
             return list(self._tokenizer.encode(text).ids)
         except Exception as refused:
