@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -128,10 +129,15 @@ def main() -> None:
         save(kind, words)
         policy = XVLAPolicy.from_pretrained(kind)
         for call in (0, 1):
-            numbers[f"{kind}.{call}"] = chunk(policy, kind, call, xvlas.observation(call, kind))
+            numbers[f"{kind}.{call}"] = chunk(policy, kind, kind, call, xvlas.observation(call, kind))
         given = {key: value for key, value in xvlas.observation(0, kind).items() if key != CAMERAS[0]}
-        numbers[f"{kind}.missing"] = chunk(policy, kind, 0, given)
+        numbers[f"{kind}.missing"] = chunk(policy, kind, kind, 0, given)
         Path(kind, "model.safetensors").unlink()
+    for mode in xvlas.MODES:
+        with TemporaryDirectory() as folder:
+            directory = xvlas.save(mode, Path(folder))
+            policy, given = XVLAPolicy.from_pretrained(directory), xvlas.observation(0, mode)
+            numbers[mode] = chunk(policy, str(directory), mode, 0, given)
     path = Path(__file__).with_name("lerobot_xvla.npz")
     np.savez_compressed(path, **numbers)
     print(path, path.stat().st_size, "bytes")
@@ -221,9 +227,9 @@ def earlier(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return found
 
 
-def chunk(policy: Any, kind: str, call: int, given: dict[str, Any]) -> Any:
+def chunk(policy: Any, directory: str, kind: str, call: int, given: dict[str, Any]) -> Any:
     """The actions of a whole chunk in robot units."""
-    before, after = make_pre_post_processors(policy.config, pretrained_path=kind)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=directory)
     batch = before({**{key: torch.from_numpy(value) for key, value in given.items()}, "task": xvlas.TASKS[call]})
     with patch("torch.randn", lambda *shape, **_: torch.from_numpy(xvlas.noise(kind)).reshape(shape)):
         return after(policy.predict_action_chunk(batch)).numpy()
