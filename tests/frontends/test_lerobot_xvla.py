@@ -21,6 +21,7 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.frontends.lerobot_files import lerobot_files
+from ttscompile.passes.split_frames import SplitFrames
 from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
@@ -111,6 +112,15 @@ def test_runtimes_agree_on_random_plans(compiled: Path) -> None:
 
 
 @pytest.mark.slow
+def test_pictures_are_encoded_each_by_itself(once: Once, compiled: Path) -> None:
+    """At its real size; the tower of this one costs less than looking whether a picture is new."""
+    _, program = once.compiled("whole xvla", lambda _: pytest.fail("made above"))
+    (tower,) = SplitFrames(1000)(program).program.pieces.towers
+    assert [each.shape[1:] for each in tower.inputs.values()] == [(3, 32, 32)]
+    assert len(tower.outputs) == 1
+
+
+@pytest.mark.slow
 def test_every_rung_of_verify_holds(compiled: Path) -> None:
     assert ttscompile.verify(compiled, calls=1).passed
 
@@ -121,7 +131,7 @@ def test_a_step_mixes_the_prediction_with_the_first_noise(directory: Path, steps
     (name,), (table,) = spec.loops.keys(), spec.loops.values()
     assert (name, spec.sampler.steps, table.memories) == (f"remix-{steps}", 4, 1)
     assert table.timesteps.tolist() == [np.float32(i / steps) for i in range(steps, 0, -1)]
-    with pytest.raises(TtscompileError, match="xvla has a loop of its own; expected none"):
+    with pytest.raises(TtscompileError, match="the loop of xvla is its own. Leave it out"):
         load_checkpoint_policy(directory, options=LoadOptions(task="go", sampler="euler"))
 
 

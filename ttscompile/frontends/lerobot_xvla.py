@@ -218,7 +218,7 @@ def _words(
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     if options.sampler is not None:
-        raise SpecError(f"sampler {options.sampler!r}: xvla has a loop of its own; expected none, and steps at most.")
+        raise SpecError(f"sampler {options.sampler!r}: the loop of xvla is its own. Leave it out; steps may be others.")
     return remixed_table(integration_steps(settings, options, "num_denoising_steps", 10))
 
 
@@ -245,8 +245,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, network: XVLA, domain:
     for name in expected.keys() - found.keys():
         if re.search(r"^vlm\.vision_tower\..*\.[qkv]_proj\.bias$", name):  # qkv_bias: false
             found[name] = torch.zeros(expected[name].shape)
-    mixed = found.get("transformer.action_encoder.weight")
-    config = network.config
+    mixed, config = found.get("transformer.action_encoder.weight"), network.config
     if mixed is not None and mixed.shape == expected["transformer.action_encoder.weight"].shape:
         for gripper in config.grippers:  # lerobot clears what the network would read of them
             mixed[:, gripper] = mixed[:, config.actions + gripper] = 0
