@@ -114,7 +114,7 @@ class _Patches(nn.Module):
         self.norm, self.first = nn.LayerNorm(before if stage.normed else width), stage.normed
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.conv(self._normed(x)) if self.first else self._normed(self.conv(x))  # type: ignore[no-any-return]
+        return self.conv(self._normed(x)) if self.first else self._normed(self.conv(x))
 
     def _normed(self, x: Tensor) -> Tensor:
         return self.norm(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)  # type: ignore[no-any-return]
@@ -132,12 +132,12 @@ class _Windows(SelfAttention):
         side = self.window
         below, right = -height % side, -width % side
         rows, columns = (height + below) // side, (width + right) // side
-        grid = functional.pad(x.unflatten(1, (height, width)), (0, 0, 0, right, 0, below))
+        grid: Any = functional.pad(torch.unflatten(x, 1, (height, width)), (0, 0, 0, right, 0, below))
         cut = grid.unflatten(2, (columns, side)).unflatten(1, (rows, side)).transpose(2, 3)
         seen = self(cut.flatten(3, 4).flatten(0, 2), None, side**2)
         grid = seen.unflatten(1, (side, side)).unflatten(0, (-1, rows, columns)).transpose(2, 3)
         grid = grid.flatten(3, 4).flatten(1, 2)
-        return grid[:, :height, :width].flatten(1, 2)
+        return grid[:, :height, :width].flatten(1, 2)  # type: ignore[no-any-return]
 
 
 class _Channels(SelfAttention):
@@ -168,7 +168,7 @@ class _Half(nn.Module):
         x = rows.transpose(1, 2).unflatten(2, (height, width))
         rows = (self.conv2(x) + x).flatten(2).transpose(1, 2)
         rows = rows + self.ffn(self.norm2(rows))
-        return rows.transpose(1, 2).unflatten(2, (height, width))
+        return rows.transpose(1, 2).unflatten(2, (height, width))  # type: ignore[no-any-return]
 
 
 def _block(stage: Stage, window: int) -> nn.Module:
@@ -196,7 +196,7 @@ class Davit(nn.Module):
         x = self.colours(pixels)
         for conv, blocks in zip(self.convs, self.blocks, strict=True):
             x = blocks(conv(x))
-        return x
+        return x  # type: ignore[no-any-return]
 
 
 class _Projector(nn.Module):

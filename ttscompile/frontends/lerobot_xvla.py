@@ -163,7 +163,7 @@ def _views(shared: LeRobotConfig) -> int:
     """Images of the network, those of no camera counted, as lerobot counts them when it loads a policy."""
     settings, name = shared.settings, "num_image_views"
     own = 0 if settings.values.get(name) is None else settings.number(name, None, _MOST_VIEWS)
-    cameras = sum(feature.get("type") == "VISUAL" for feature in settings.values["input_features"].values())
+    cameras: int = sum(feature.get("type") == "VISUAL" for feature in settings.values["input_features"].values())
     return max(own, cameras + settings.number("empty_cameras", 0, _MOST_VIEWS, least=0))
 
 

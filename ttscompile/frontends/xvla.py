@@ -107,8 +107,7 @@ class Denoiser(nn.Module):
     def __init__(self, network: XVLA) -> None:
         super().__init__()
         self.config, self.transformer = network.config, network.transformer
-        grippers = [channel in network.config.grippers for channel in range(network.config.actions)]
-        self.register_buffer("grippers", torch.tensor(grippers, device="cpu"), persistent=False)
+        self.grippers = [channel in network.config.grippers for channel in range(network.config.actions)]
 
     def forward(self, sample: Tensor, timestep: Tensor, encoded: tuple[Tensor, ...]) -> Tensor:
         """``[B, T, D]``, times ``[B]`` from 1 to 0, what ``Prefix`` gives -> the actions ``[B, T, D]``.
@@ -122,7 +121,7 @@ class Denoiser(nn.Module):
         x = own.action_encoder(torch.cat([sample, beside], 2)) + own.pos_emb[:, :count]
         x = own.blocks(torch.cat([x, context], 1))
         actions: Tensor = own.action_decoder(own.norm(x[:, :count]))
-        return torch.where(self.grippers, torch.sigmoid(actions), actions) if self.config.grippers else actions
+        return torch.where(torch.tensor(self.grippers), actions.sigmoid(), actions) if any(self.grippers) else actions
 
 
 def _waves(timestep: Tensor, width: int) -> Tensor:
