@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,20 @@ def test_it_is_torchs_bilinear_with_a_black_rest(size: tuple[int, int], fit: str
     before = (left, up) if fit == "start" else (left // 2, up // 2)
     expected = functional.pad(resized, (before[0], left - before[0], before[1], up - before[1]))[:, None]
     np.testing.assert_allclose(fitted(image, spec), expected.numpy(), atol=1e-5)
+
+
+def test_the_rest_has_a_colour() -> None:
+    spec = ObservationSpec((1, 3, 20, 24), bounds=(0.0, 1.0), fit="start", fill=(0.5, 0.25, 0.125))
+    image = np.random.RandomState(0).uniform(0, 1, (2, 1, 3, 10, 24)).astype(np.float32)
+    found = fitted(image, spec)
+    np.testing.assert_array_equal(found[..., 10:, :], image)
+    assert [set(found[:, :, c, :10].flat) for c in range(3)] == [{0.5}, {0.25}, {0.125}]
+
+
+@pytest.mark.parametrize("changes", [{"fit": "stretch"}, {"fit": None}, {"fill": (0.5, 0.5)}])
+def test_only_a_rest_of_as_many_channels_has_one(changes: dict[str, Any]) -> None:
+    with pytest.raises(SpecError, match="fill is one number for each channel, with fit start or centre; found"):
+        ObservationSpec((1, 3, 4, 4), **{"bounds": (0.0, 1.0), "fit": "start", "fill": (0.5, 0.5, 0.5)} | changes)
 
 
 @pytest.mark.parametrize("size", [(30, 50), (96, 17), (20, 20), (3, 40), (61, 61)])

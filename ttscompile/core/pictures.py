@@ -12,14 +12,15 @@ _BEND = -0.5
 """Of the cubic filter, as Pillow has it."""
 
 
-def proportional(array: FloatArray, height: int, width: int, centre: bool) -> FloatArray:
-    """Images ``[..., h, w]`` as large as fit, and black beside them, as openpi and LeRobot resize them.
+def proportional(array: FloatArray, height: int, width: int, centre: bool, fill: tuple[float, ...] = ()) -> FloatArray:
+    """Images ``[..., C, h, w]`` as large as fit, and black beside them, as openpi and LeRobot resize them.
 
     Bilinear, without smoothing what becomes smaller.
 
     Args:
         array: in 0..1.
-        centre: whether they are in the middle, rather than at the top and the left.
+        centre: whether they are in the middle, rather than at the bottom and the right.
+        fill: what is beside them in place of black, a number for each of the C channels.
     """
     before = array.shape[-2:]
     ratio = max(before[1] / width, before[0] / height)
@@ -30,6 +31,7 @@ def proportional(array: FloatArray, height: int, width: int, centre: bool) -> Fl
         small = np.clip(small, 0, 1)  # openpi clips what it resized
         top, left = top // 2, left // 2
     whole = np.zeros((*array.shape[:-2], height, width), np.float32)
+    whole += np.asarray(fill or 0, np.float32).reshape(-1, 1, 1)
     whole[..., top : top + rows, left : left + columns] = small
     return whole
 

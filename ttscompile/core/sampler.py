@@ -30,7 +30,7 @@ class SamplerTable:
     stages have in common.
 
     Attributes:
-        name: ``ddpm``, ``ddim``, ``dpmsolver++``, ``euler``, ``rk4`` or ``edm``, for people.
+        name: ``ddpm``, ``ddim``, ``dpmsolver++``, ``euler``, ``rk4``, ``remix`` or ``edm``, for people.
         timesteps: float32 ``[K]`` or int64 ``[K]``: what the network is given, in order of execution.
         clip: bound on the predicted sample; None for no bound.
         memory_to_next: float32 ``[K, S]``; empty where S = 0.

@@ -89,6 +89,7 @@ class ObservationSpec:
         fit: of an image: one of another size is resized to this shape (``core.values``). With ``start`` and ``centre``
             it keeps its proportions, and the rest is black: after it, or on both sides. With ``stretch`` it fills the
             shape, and is rounded to 256 steps, whatever its size. None: no other size is taken.
+        fill: of an image that keeps its proportions: what is beside it in place of black, a number for each channel.
     """
 
     shape: Shape
@@ -97,6 +98,7 @@ class ObservationSpec:
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
     fit: Literal["start", "centre", "stretch"] | None = None
+    fill: tuple[float, ...] = field(default=(), metadata=OMITTED)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in an observation's shape", SpecError, 1) for n in self.shape)
@@ -117,6 +119,9 @@ class ObservationSpec:
             object.__setattr__(self, "bounds", (tuple(low.tolist()), tuple(high.tolist())))
         if self.fit is not None and not self.image:
             raise SpecError(f"fit is for images with bounds; found an observation of shape {self.shape}.")
+        if self.fill and (self.fit not in ("start", "centre") or len(self.fill) != self.shape[-3]):
+            told = f"{len(self.fill)} numbers, fit {self.fit!r} and shape {self.shape}"
+            raise SpecError(f"fill is one number for each channel, with fit start or centre; found {told}.")
 
     @property
     def frames(self) -> int | None:

@@ -90,4 +90,4 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
     check_values(array, replace(spec, normalizer=None), what, error)  # what is resized is clipped, and looks right
     if spec.fit == "stretch":
         return stretched(array, height, width)
-    return proportional(array, height, width, spec.fit == "centre")
+    return proportional(array, height, width, spec.fit == "centre", spec.fill)

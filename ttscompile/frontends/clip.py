@@ -53,7 +53,7 @@ class TowerConfig:
     layer_norm_eps: float = 1e-5
 
     def __post_init__(self) -> None:
-        settings = Settings(vars(self), "CLIP's ")
+        settings = Settings(vars(self), "an encoder's ")
         for field in fields(self):
             if field.type == "int" and (field.name, vars(self)[field.name]) != ("eos_token_id", 0):  # no size: 0 is one
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
@@ -193,7 +193,9 @@ def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Pat
         raise CheckpointError(f"{where}: {error}") from error
 
 
-class _SelfAttention(nn.Module):
+class SelfAttention(nn.Module):
+    """Attention of a layer; Florence-2's have the same."""
+
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         width = config.hidden_size
@@ -212,7 +214,9 @@ class _SelfAttention(nn.Module):
         return self.out_proj(mixed.transpose(1, 2).flatten(2))  # type: ignore[no-any-return]
 
 
-class _FeedForward(nn.Module):
+class FeedForward(nn.Module):
+    """Feed-forward of a layer."""
+
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.fc1 = nn.Linear(config.hidden_size, config.intermediate_size)
@@ -220,6 +224,7 @@ class _FeedForward(nn.Module):
         self.fc2 = nn.Linear(config.intermediate_size, config.hidden_size)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[..., width]`` -> the same."""
         return self.fc2(ACTIVATIONS[self.activation](self.fc1(x)))  # type: ignore[no-any-return]
 
 
@@ -227,9 +232,9 @@ class _Layer(nn.Module):
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.layer_norm1 = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
-        self.self_attn = _SelfAttention(config)
+        self.self_attn = SelfAttention(config)
         self.layer_norm2 = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
-        self.mlp = _FeedForward(config)
+        self.mlp = FeedForward(config)
         self.scaled = config.SCALED
         if self.scaled:
             self.lambda_1, self.lambda_2 = (nn.Parameter(torch.ones(config.hidden_size)) for _ in range(2))

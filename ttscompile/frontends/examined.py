@@ -82,7 +82,7 @@ def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[s
     entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
     both = {**entries["input_features"], **entries["output_features"]}
     features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
-    found = read_processors(directory, features)
+    found = read_processors(directory, features, str(entries["type"]))
     step: dict[str, Any] = {"config": {}} | next(one for one in steps if one.get("registry_name") == NORMALIZE)
     doubts, action = [], {} if found.action is None else {ACTION: found.action}
     for key, (kind, _) in features.items():

@@ -45,7 +45,7 @@ def task_tokens(
             f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put its"
             f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {remedy}".rstrip()
         )
-    tokens = Tokenizer(path, CheckpointError)(text, most)
+    tokens = Tokenizer(path, CheckpointError, most)(text)
     if not tokens or max(tokens) >= vocabulary:
         found = f"token {max(tokens)}; the language model has {vocabulary}" if tokens else "no token at all"
         raise CheckpointError(f"{path}: it gives {found}. It belongs to another language model.")

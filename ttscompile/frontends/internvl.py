@@ -95,25 +95,37 @@ class _Embeddings(nn.Module):
         return functional.pad(patches, (0, 0, 1, 0)) + torch.cat((first, positions[1:]))
 
 
-class InternVit(nn.Module):
-    """Pixels in -1..1 ``[N, 3, size, size]`` to patches ``[N, side ** 2, width]``."""
+class Colours(nn.Module):
+    """Pixels in -1..1 ``[N, 3, H, W]`` normalised by the mean and the deviation of colours in 0..1."""
 
     mean: Tensor
     deviation: Tensor
+
+    def __init__(self, mean: tuple[float, ...] = MEAN, deviation: tuple[float, ...] = DEVIATION) -> None:
+        super().__init__()
+        # Made of numbers, so that a network without memory (on the meta device) has them all the same.
+        colours = torch.tensor((mean, deviation), device="cpu")[:, :, None, None] * 2
+        self.register_buffer("mean", colours[0] - 1, persistent=False)
+        self.register_buffer("deviation", colours[1], persistent=False)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """See the class."""
+        return (pixels - self.mean) / self.deviation
+
+
+class InternVit(nn.Module):
+    """Pixels in -1..1 ``[N, 3, size, size]`` to patches ``[N, side ** 2, width]``."""
 
     def __init__(self, config: InternVitConfig) -> None:
         super().__init__()
         self.embeddings, self.encoder = _Embeddings(config), Layers(config)
         pooled = config.use_mean_pooling
         self.layernorm = nn.Identity() if pooled else nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
-        # Made of numbers, so that a network without memory (on the meta device) has them all the same.
-        colours = torch.tensor((MEAN, DEVIATION), device="cpu")[:, :, None, None] * 2
-        self.register_buffer("mean", colours[0] - 1, persistent=False)
-        self.register_buffer("deviation", colours[1], persistent=False)
+        self.colours = Colours()
 
     def forward(self, pixels: Tensor) -> Tensor:
         """See the class."""
-        tokens = self.embeddings((pixels - self.mean) / self.deviation)
+        tokens = self.embeddings(self.colours(pixels))
         return self.layernorm(self.encoder(tokens))[:, 1:]  # type: ignore[no-any-return]
 
 

@@ -6,7 +6,7 @@ Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,9 @@ _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
     PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, _RELATIVE}),
     POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE, _CROP}),
 }
+IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
+OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN)}
+"""By type of policy, steps before it that no other has, in the order that lerobot saves."""
 _ONCE = frozenset({_RENAME, _TOKENIZE, NORMALIZE, _UNNORMALIZE})
 
 
@@ -136,6 +139,7 @@ class Processors:
         tokenizer: settings of the tokenizer; none without one.
         new_line: whether an instruction ends with a new line before it is tokenized.
         state_in_prompt: whether it holds the state too, as numbers in words.
+        own: settings of the steps before the policy that its type alone has, by name, in their order.
     """
 
     normalizers: Mapping[str, Statistics]
@@ -144,11 +148,13 @@ class Processors:
     tokenizer: Mapping[str, Any]
     new_line: bool = False
     state_in_prompt: bool = False
+    own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
-def read_processors(directory: Path, features: Features) -> Processors:
-    """The pipelines of a policy that LeRobot saved, with these features."""
-    before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
+def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:
+    """The pipelines of a policy of this type that LeRobot saved, with these features."""
+    own = OWN_STEPS.get(kind, ())
+    before, after = (_steps(directory, name, own) for name in (PREPROCESSOR, POSTPROCESSOR))
     padded = any(step["registry_name"] in _PAD for step in before)
     return Processors(
         renamed=_renamed(directory, before, features),
@@ -157,10 +163,11 @@ def read_processors(directory: Path, features: Features) -> Processors:
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
         state_in_prompt=any(step["registry_name"] == PROMPT for step in before),
+        own={step["registry_name"]: step["config"] for step in before if step["registry_name"] in own},
     )
 
 
-def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
+def _steps(directory: Path, name: str, own: tuple[str, ...]) -> list[dict[str, Any]]:
     """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order."""
     path = directory / name
     if not path.is_file():
@@ -171,12 +178,13 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     steps = read_json(path).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
         raise CheckpointError(f"{path}: has no list of steps; expected a pipeline that lerobot saved.")
+    known = _KNOWN_STEPS[name].union(own if name == PREPROCESSOR else ())
     for step in steps:
         registered = step.get("registry_name")  # a step of somebody's own has a class instead
-        if not isinstance(registered, str) or registered not in _KNOWN_STEPS[name]:
+        if not isinstance(registered, str) or registered not in known:
             raise CheckpointError(
                 f"{path}: the step {step.get('registry_name', step.get('class'))!r:.80} is not known here; expected"
-                f" {', '.join(sorted(_KNOWN_STEPS[name]))}. Do its work outside of the policy, and leave it out."
+                f" {', '.join(sorted(known))}. Do its work outside of the policy, and leave it out."
             )
         if not isinstance(step.setdefault("config", {}), dict):
             raise CheckpointError(f"{path}: the configuration of {registered} is no object.")
@@ -189,11 +197,11 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
                 " a policy of absolute actions."
             )
     order = [step["registry_name"] for step in steps]
-    twice = sorted(kind for kind in _ONCE if order.count(kind) > 1)
+    twice = sorted(kind for kind in _ONCE.union(own) if order.count(kind) > 1)
     if twice:
         found = f"found {order.count(twice[0])} of {twice[0]}"
         raise CheckpointError(f"{path}: expected at most one step of a kind; {found}. Combine them into one.")
-    if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (NORMALIZE, _TOKENIZE)):
+    if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (NORMALIZE, _TOKENIZE, *own)):
         raise CheckpointError(
             f"{path}: expected {_RENAME} before the other steps, as lerobot saves them; found {', '.join(order)}."
             " Save the pipeline again in that order."

@@ -29,6 +29,7 @@ from .lerobot_vla import (
     read_vla_config,
     read_vla_processors,
     require_square,
+    seen_size,
     vla_spec,
 )
 from .saved_weights import require_weights
@@ -138,10 +139,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
 def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
     """What the encoder sees; lerobot saves width before height."""
     resize = shared.settings.size("resize_imgs_with_padding", [512, 512], MOST_PIXELS)
-    shapes = {shape[1:] for shape in shared.cameras.values()}
-    if resize is None and len(shapes) > 1:
-        raise shared.settings.refusal("resize_imgs_with_padding", "a size: cameras have several")
-    height, width = resize[::-1] if resize is not None else next(iter(shapes))
+    height, width = seen_size(shared, None if resize is None else (resize[1], resize[0]))
     require_square(shared.settings, "resize_imgs_with_padding", (height, width), multiple)
     return height, width
 

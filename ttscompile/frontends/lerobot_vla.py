@@ -33,7 +33,8 @@ def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOp
 
     LeRobot shows the network a black image for such a camera, and masks it: nothing reads it.
     """
-    config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True)
+    stateless = entries.get("use_proprio") is False  # of xvla
+    config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True, stateless=stateless)
     if config.settings.flag("adapt_to_pi_aloha", False) or config.settings.flag("use_relative_actions", False):
         raise config.settings.error(
             "adapt_to_pi_aloha or use_relative_actions is set: joints are turned into others, or actions are relative"
@@ -57,8 +58,8 @@ def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOp
 
 
 def read_vla_processors(config: LeRobotConfig) -> Processors:
-    """The processors of a policy, which leave images alone."""
-    processors = read_processors(config.directory, config.features)
+    """The processors of a policy, which leave images alone but in steps that its type alone has."""
+    processors = read_processors(config.directory, config.features, str(config.settings.values["type"]))
     normalised = sorted(key for key in config.cameras if key in processors.normalizers)
     if normalised:
         raise CheckpointError(
@@ -136,7 +137,7 @@ class Gathered(nn.Module):
 
     Args:
         prefix: takes images, tokens, their mask and the state.
-        state: numbers of the state, padded; None where the instruction holds it.
+        state: numbers of the state, padded or cut; None where the instruction holds it, or nothing reads it.
         task: tokens int64 ``[1, L]`` of the one instruction that is compiled in; None where it is an input.
     """
 
@@ -147,7 +148,7 @@ class Gathered(nn.Module):
     ) -> None:
         super().__init__()
         names = {key: processors.renamed.get(key, key).replace(".", "_") for key in config.features}
-        self.images, self.state = [names[key] for key in config.cameras], names[STATE]
+        self.images, self.state = [names[key] for key in config.cameras], names.get(STATE, "")
         self.normalizer = Normalizer(processors.normalizers.get(STATE))
         self.prefix, self.missing = prefix, None if state is None else state - config.state_dim
         self.register_buffer("task", task, persistent=False)
@@ -157,13 +158,23 @@ class Gathered(nn.Module):
         images = [observations[name][:, -1] * 2 - 1 for name in self.images]
         state = None
         if self.missing is not None:
-            state = functional.pad(self.normalizer(observations[self.state])[:, -1], (0, self.missing))
+            state = self.normalizer(observations[self.state])[:, -1]
+            state = functional.pad(state, (0, self.missing)) if self.missing >= 0 else state[:, : self.missing]
         if self.task is None:
             tokens, mask = (observations[name.replace(".", "_")] for name in (TOKENS, MASK))
         else:
             tokens = self.task.expand(len(images[0]), -1)
             mask = torch.ones_like(tokens, dtype=torch.bool)
         return self.prefix(images, tokens, mask, state)  # type: ignore[no-any-return]
+
+
+def seen_size(config: LeRobotConfig, resize: tuple[int, int] | None) -> tuple[int, int]:
+    """Height and width of what the image encoder sees: what images are resized to, or the size of all cameras."""
+    shapes = {shape[1:] for shape in config.cameras.values()}
+    if resize is None and len(shapes) > 1:
+        raise config.settings.refusal("resize_imgs_with_padding", "a size: cameras have several")
+    height, width = resize or next(iter(shapes))
+    return height, width
 
 
 def require_square(settings: Settings, name: str, image: Sequence[int], multiple: int) -> None:

@@ -105,14 +105,13 @@ DIRECTORIES = (
 ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
-LEROBOT_TYPES = "act, diffusion, evo1, multi_task_dit, smolvla, pi0 or pi05"
+LEROBOT_TYPES = "act, diffusion, evo1, multi_task_dit, smolvla, pi0, pi05 or xvla"
 
 LEROBOT = (
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
     Refusal(r"^groot$", "a GR00T whose backbone, Qwen3-VL, is not rebuilt here", _HEAD),
-    Refusal(r"^xvla$", "a policy whose backbone, Florence-2, is not rebuilt here", _HEAD),
     Refusal(r"^vla_jepa$", "a policy whose backbone, Qwen3-VL with V-JEPA, is not rebuilt here", _HEAD),
     Refusal(
         r"^(wall_x|eo1)$",

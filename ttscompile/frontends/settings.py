@@ -41,12 +41,12 @@ class Settings:
     where: str
     remedy: str = ""
 
-    def number(self, name: str, default: int | None = None, most: int | None = None) -> int:
-        """A positive whole number, ``most`` at most."""
+    def number(self, name: str, default: int | None = None, most: int | None = None, least: int = 1) -> int:
+        """A positive whole number, ``most`` at most; or with ``least`` 0 one that is not negative."""
         value = self.values.get(name, default)
-        if type(value) is not int or value < 1 or (most is not None and value > most):
+        if type(value) is not int or value < least or (most is not None and value > most):
             limit = "" if most is None else f", {most} at most"
-            raise self.refusal(name, f"a positive whole number{limit}", default)
+            raise self.refusal(name, f"a {'positive ' * least}whole number{limit}", default)
         return value
 
     def flag(self, name: str, default: bool) -> bool:
