@@ -29,8 +29,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(compiled: Path, recording: Path) -> Nested:
-    sizes = {"most": 4, "fitted": 12, "learned": 8, "judged": 8}
-    return nested.nested(compiled, [recording], (3.0,), **sizes, minutes=0.001)
+    return nested.nested(compiled, [recording], (3.0,), most=4, fitted=12, learned=8, judged=8, minutes=0.001)
 
 
 def test_three_parts_of_the_episodes_share_none(found: Nested) -> None:
