@@ -73,7 +73,7 @@ class Nested:
     """What was found.
 
     Attributes:
-        fixed: schedules, by their number of computed steps.
+        fixed: the best of all schedules that were tried, by their number of computed steps.
         rows: of these.
         decided: without going back to before the last computed step, and with it.
         calls: that corrections were fitted on, that schedules and thresholds were learned on, and judged.
@@ -205,8 +205,9 @@ def nested(
     clock = Clock(60 * minutes)
     whole = Kept(executor, actions, fit, learn, min(3, most), seed)
     task = replace(Task.of(executor, fit, 0, seed), whole=whole)
-    fixed = _searched(task, most, clock.until(SEARCHING), progress)
+    _search(task, most, clock.until(SEARCHING), progress)
     _endings(whole, most, clock, progress)
+    fixed = {count: _ranked(whole, count)[0] for count in range(2, most + 1)}
 
     def error(samples: torch.Tensor, calls: Calls) -> Array:
         return actions.errors(samples, calls.targets, units=True).astype(np.float64)
@@ -250,26 +251,25 @@ def nested(
     )
 
 
-def _searched(task: Task, most: int, clock: Clock, progress: Progress) -> dict[int, Steps]:
-    """Fixed schedules, as calibration finds them: by their number of computed steps, from 2 on."""
-    found = {}
+def _search(task: Task, most: int, clock: Clock, progress: Progress) -> None:
+    """Try the schedules that calibration tries, of each number of computed steps from 2 on."""
     for count in range(2, most + 1):
         progress("fixed schedules", count - 2, most - 1)
         share = clock.until((clock.elapsed() + clock.left() / (most + 1 - count)) / clock.limit)
-        search = Tts(replace(task, budget=count * task.executor.model.blocks, clock=share))
-        found[count] = tuple(int(k) for k in search_plan(search, share)[0].notes["steps"])
+        search_plan(Tts(replace(task, budget=count * task.executor.model.blocks, clock=share)), share)
     progress("fixed schedules", most - 1, most - 1)
-    return found
+
+
+def _ranked(whole: Kept, count: int) -> list[Steps]:
+    """All schedules of so many computed steps that were tried, the best first."""
+    return sorted((one for one in whole.answers if len(one) == count), key=lambda one: whole.errors(one).normalised)
 
 
 def _endings(whole: Kept, most: int, clock: Clock, progress: Progress) -> None:
     """Try schedules that begin as good ones do, and all beginnings alone, as long as there is time."""
     beginnings: dict[Steps, None] = {}
     for count in range(2, most + 1):
-        ranked = sorted(
-            (one for one in whole.answers if len(one) == count), key=lambda one: whole.errors(one).normalised
-        )
-        for one in ranked[:GOOD]:
+        for one in _ranked(whole, count)[:GOOD]:
             beginnings.update(dict.fromkeys(one[:length] for length in BEGINNINGS if length <= count))
     coming = list(dict.fromkeys(_continued(whole.steps, beginnings, most)))
     for number, steps in enumerate(clock.in_time(coming)):
