@@ -9,11 +9,13 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from ttscompile.artifact.manifest import Manifest
 from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray
 from ttscompile.core.spec import FloatArray, Noise, SamplerTable
-from ttscompile.errors import ArtifactError, TtscompileError
+from ttscompile.errors import ArtifactError, ObservationError, TtscompileError
+from ttscompile.ir.graph import TensorType
 
 from .inpainting import Known
 
@@ -115,6 +117,23 @@ def fitting(view: View) -> Iterator[None]:
     except Exception as error:
         problem = f"its manifest, tables and graphs do not fit each other ({type(error).__name__}: {str(error)[:300]})"
         raise ArtifactError(f"{view.artifact.path}: {problem}. Convert the checkpoint again.") from error
+
+
+def stream_type(manifest: Manifest, streams: int) -> TensorType:
+    """The type of the residual stream, which is float32, and the same for all blocks.
+
+    Raises:
+        ArtifactError: it is not.
+        ObservationError: it has no axis for the streams, of which there are several.
+    """
+    kind = manifest.blocks[0].type
+    if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
+        types = sorted({str(block.type) for block in manifest.blocks})
+        raise ArtifactError(f"the residual stream changes its type, or is not float32: {types}. It cannot be executed.")
+    if kind.batch_axis is None and streams > 1:
+        problem = f"this policy's residual stream has type {kind}, without an axis for the streams"
+        raise ObservationError(f"{problem}; found {streams} streams. Call it with one stream at a time.")
+    return kind
 
 
 def fill_initial(initial: FloatArray, noise: Noise, known: Known | None) -> None:

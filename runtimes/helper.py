@@ -22,7 +22,8 @@ class Helper:
 
     def __init__(self, name: str) -> None:
         self._todo: _Todo = SimpleQueue()
-        threading.Thread(target=_work, args=(self._todo,), name=name, daemon=True).start()
+        self._thread = threading.Thread(target=_work, args=(self._todo,), name=name, daemon=True)
+        self._thread.start()
         weakref.finalize(self, self._todo.put, None).atexit = False
 
     def submit(self, work: Callable[[], Result]) -> Future[Result]:
@@ -30,6 +31,11 @@ class Helper:
         future: Future[Result] = Future()
         self._todo.put((future, work))
         return future
+
+    def end(self, timeout: float) -> None:
+        """Do what was submitted and nothing else, and wait for the end of it, for so many seconds at most."""
+        self._todo.put(None)
+        self._thread.join(timeout)
 
 
 def _work(todo: _Todo) -> None:

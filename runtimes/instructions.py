@@ -138,6 +138,14 @@ def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
     )
 
 
+def by_plan(plans: Sequence[Instructions]) -> dict[Instructions, list[int]]:
+    """The streams of a batch by the plan that they follow: those of one plan go through the loop together."""
+    streams: dict[Instructions, list[int]] = {}
+    for s, plan in enumerate(plans):
+        streams.setdefault(plan, []).append(s)
+    return streams
+
+
 def _makers(cells: Cells, starts: Positions, stops: Positions) -> dict[int, int]:
     """For each gap that adds the same residuals as an earlier one, the first such gap.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 from ttscompile.artifact.load import Artifact
@@ -61,9 +62,10 @@ class Kind:
 
 
 def _onnxruntime(options: Options) -> Open:
-    from .onnxruntime.backend import OnnxBackends
+    from .onnxruntime.backend import OnnxBackend
+    from .onnxruntime.sessions import Sessions
 
-    return OnnxBackends(options.threads)
+    return partial(OnnxBackend, sessions=Sessions(options.threads), known={})
 
 
 def _reference(options: Options) -> Open:
@@ -73,9 +75,11 @@ def _reference(options: Options) -> Open:
 
 
 def _torch(options: Options) -> Open:
-    from .torch.backend import TorchBackends
+    from .torch.backend import TorchBackend
+    from .torch.devices import device_of
+    from .torch.network import Placed
 
-    return TorchBackends(options.threads, options.device)
+    return partial(TorchBackend, placed=Placed(device_of(options.device)), threads=options.threads)
 
 
 RUNTIMES = {

@@ -104,8 +104,8 @@ class CompiledPolicy:
             precision=" and ".join(dict.fromkeys(default.precision.values())) or FP32,
             rollout=rollout_needs(view),
             prefix_refusal=self._prefix_refusal(default),
-            frames=self._runtime.frame_pieces,
-            reuses_tokens=self._runtime.reuses_tokens,
+            frames=len(self._runtime.frames),
+            reuses_tokens=self._runtime.frames.reuses_tokens,
             follows=default.otherwise is not None,
             noise=manifest.spec.noise,
             other_noise=(self._artifact.manifest.calibration or {}).get("other_noise") or None,
@@ -198,14 +198,15 @@ class CompiledPolicy:
             TtscompileError: the policy is in the middle of a call.
         """
         with self._turn():
-            if not self._runtime.frame_pieces:
+            if not self._runtime.frames:
                 return FrameWork()
             specs = self._spec.observations
             one, whole = Queues(specs), self._read(frame, others=True)[0]
             obs = one.observation(one.after(whole))  # a window that holds nothing else
             self._runtime.require_streams(len(next(iter(obs.values()))))
             with np.errstate(all="ignore"):
-                return self._runtime.learn({key: specs[key].normalized(array) for key, array in obs.items()}, stop)
+                normalized = {key: specs[key].normalized(array) for key, array in obs.items()}
+                return self._runtime.frames.learn(normalized, stop)
 
     def follow(self, executed: int) -> None:
         """Say how many steps of the last chunk are executed before the next call, where it is not all of ``action``.

@@ -132,14 +132,9 @@ class Runtime:
         return self._streams
 
     @property
-    def frame_pieces(self) -> int:
-        """How many pieces are computed for new frames only; 0 of a backend that computes all frames in every call."""
-        return len(self._used.frames)
-
-    @property
-    def reuses_tokens(self) -> bool:
-        """Whether of new frames only some tokens are computed."""
-        return self._used.frames.reuses_tokens
+    def frames(self) -> FramePieces:
+        """What is computed for new frames only; nothing of a backend that computes all frames in every call."""
+        return self._used.frames
 
     def reset(self) -> None:
         """Forget the rollout cache and all frames: a new episode, of any number of streams. Its memory is kept."""
@@ -150,15 +145,6 @@ class Runtime:
         """Forget all frames, so that the next call computes every one of its own."""
         for one in self._opened.values():
             one.frames.forget()
-
-    def learn(self, obs: Mapping[str, Any], stop: Callable[[], bool]) -> FrameWork:
-        """Compute what depends on single frames alone, for calls to come.
-
-        Args:
-            obs: as ``predict`` takes it.
-            stop: asked before each frame; the rest is left out if it says so.
-        """
-        return self._used.frames.learn(obs, stop)
 
     def follow(self, executed: int) -> None:
         """Say how many steps of the last chunk are executed before the next call, where it is not all of ``action``.

@@ -82,7 +82,7 @@ class AsyncExecutor:
         self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
         self.trace = Trace(settings.trace_events, self._identity)
         self._failure_told = self._closed = False
-        self._worker = Worker(policy, settings, self._resolved, self._clock, self.trace)
+        self._worker = Worker(policy, self._resolved, self._clock, self.trace)
         self._finalizer = weakref.finalize(self, self._worker.abandon)
         self._finalizer.atexit = False  # the worker sees to that itself
         self._state = self._worker.open(latencies, open_timeout)
@@ -255,7 +255,7 @@ class AsyncExecutor:
         """
         self._here()
         counts = self._state.recorder.counts
-        return counts.reserve + counts.holds
+        return int(counts.reserve + counts.holds)
 
     def now(self) -> float:
         """Seconds on the executor's clock: what times of observations and actions are compared with."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
@@ -16,7 +16,7 @@ from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
 from ttscompile.measure.timer import Timer, Times
 
-from .settings import ExecutorSettings, Policy
+from .settings import Policy, Resolved
 
 
 class Clock(Protocol):
@@ -63,13 +63,12 @@ def some_observation(specs: Mapping[str, ObservationSpec]) -> dict[str, npt.NDAr
     return {key: spec.draw(rng) for key, spec in specs.items()}
 
 
-def measure_latencies(
-    policy: Policy, clock: Clock, settings: ExecutorSettings, plans: Sequence[str]
-) -> dict[str, Times]:
+def measure_latencies(policy: Policy, clock: Clock, settings: Resolved) -> dict[str, Times]:
     """What the measured calls of each plan take on ``some_observation``; with a prefix, if calls will have one.
 
     The plans take turns. The caller resets the policy before and after.
     """
+    plans = settings.plans
     obs, known = some_observation(policy.info.observation), {}
     if settings.seam == "prefix":  # one action that the normaliser maps to 0
         chunk = policy.info.action

@@ -11,7 +11,7 @@ from ttscompile.core.spec import FloatArray
 from ttscompile.errors import ExecutorError
 
 from .guard import Guard
-from .settings import ExecutorSettings, Resolved
+from .settings import Resolved
 from .timeline import TickGrid, Timeline, expand, splice
 
 FAR = 1e6
@@ -28,14 +28,14 @@ class Schedule:
         refusal: why the last chunk was refused; None if it was not.
     """
 
-    def __init__(self, settings: ExecutorSettings, resolved: Resolved, guard: Guard) -> None:
-        self._settings, self._resolved, self._guard = settings, resolved, guard
-        self.grid = TickGrid(resolved.control_hz)
+    def __init__(self, settings: Resolved, guard: Guard) -> None:
+        self._settings, self._guard = settings, guard
+        self.grid = TickGrid(settings.control_hz)
         self.timeline: Timeline | None = None
         self.due = 0
         self.refusal: str | None = None
         self._stood = 0.0  # seconds from the observation of the newest chunk to when it begins
-        most = (resolved.horizon + resolved.reserve) * resolved.ticks_per_step
+        most = (settings.horizon + settings.reserve) * settings.ticks_per_step
         self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(most, 3))
 
     @property
@@ -71,13 +71,13 @@ class Schedule:
             actions: ``[horizon + reserve, Da]``; the reserve is left out where the guard refuses that alone.
             alone: whether no mean of it and others is made.
         """
-        settings, resolved = self._settings, self._resolved
-        self.refusal = self._guard.refuse(actions[: resolved.horizon])
+        settings = self._settings
+        self.refusal = self._guard.refuse(actions[: settings.horizon])
         if self.refusal is not None:
             return "refused"
-        if self._guard.refuse(actions[resolved.horizon :]) is not None:
-            actions = actions[: resolved.horizon]
-        rows = expand(actions, resolved.ticks_per_step, settings.interpolation)
+        if self._guard.refuse(actions[settings.horizon :]) is not None:
+            actions = actions[: settings.horizon]
+        rows = expand(actions, settings.ticks_per_step, settings.interpolation)
         start = self.grid.tick(observed)
         new = Timeline.of(start, rows, observed)
         if self._guard.clips:
@@ -93,7 +93,7 @@ class Schedule:
             spliced = spliced.clipped_to(self._guard.limited(past, spliced.rows))
         refusal = self._guard.refuse_motion(past, spliced.rows)
         if refusal is not None:  # without its reserve it may do, if anything is left then
-            spliced = spliced.between(seam, start + resolved.horizon * resolved.ticks_per_step)
+            spliced = spliced.between(seam, start + settings.horizon * settings.ticks_per_step)
             self.refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
             if self.refusal is not None:
                 return "refused"
@@ -121,13 +121,13 @@ class Schedule:
     def _past(self) -> FloatArray:
         """The last three actions that were given out, or as many as there are, oldest first."""
         played = [action for _, action in list(self._played)[-3:]]
-        return np.stack(played) if played else np.empty((0, self._resolved.channels), np.float32)
+        return np.stack(played) if played else np.empty((0, self._settings.channels), np.float32)
 
     @property
     def executed(self) -> float:
         """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
         assert self.timeline is not None
-        return float(self.timeline.observed.max()) + self._stood + self._resolved.horizon / self._resolved.policy_hz
+        return float(self.timeline.observed.max()) + self._stood + self._settings.horizon / self._settings.policy_hz
 
     def need_by(self, time: float) -> None:
         """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""
@@ -146,12 +146,12 @@ class Schedule:
         tick, last = self.grid.tick(observed), self.grid.tick(until)
         played = dict(self._played)
         rows: list[FloatArray] = []
-        while tick <= last and len(rows) < self._resolved.horizon:
+        while tick <= last and len(rows) < self._settings.horizon:
             row = played.get(tick)
             if row is None and self.timeline is not None:
                 row = self.timeline.at(tick)
             if row is None:
                 break
             rows.append(row)
-            tick += self._resolved.ticks_per_step
-        return np.stack(rows) if rows else np.empty((0, self._resolved.channels), np.float32)
+            tick += self._settings.ticks_per_step
+        return np.stack(rows) if rows else np.empty((0, self._settings.channels), np.float32)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 INTERPOLATIONS = ("hold", "linear")
 SEAMS = ("replace", "blend", "ensemble", "prefix")
 
-_MAY_BE_ZERO = frozenset({"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve"})
+_MAY_BE_ZERO = frozenset({"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve", "first"})
 """Of the whole numbers among the settings; the others are at least 1."""
 
 _MOST = 10**9
@@ -168,36 +168,29 @@ def require_number(
         raise ExecutorError(f"{name} must be a number, {wanted}; found {value!r}.")
 
 
-@dataclass(frozen=True)
-class Resolved:
-    """Settings with everything that follows from the policy filled in; see ``ExecutorSettings``.
+@dataclass(frozen=True, kw_only=True)
+class Resolved(ExecutorSettings):
+    """Settings with everything that follows from the policy filled in.
 
     Attributes:
         control_hz: ticks a second.
-        policy_hz: frames and actions a second.
         ticks_per_step: control ticks that an action lasts.
-        horizon: actions of a chunk that are played.
-        reserve: actions after these that may be.
         first: index in ``action_pred`` of the first action that is played.
         channels: Da.
         frames: what one frame holds.
-        max_age: of the newest frame of a window when a call starts, seconds.
-        tiers: plans, slowest first.
-        margin_ticks: control ticks that a chunk shall be there before it is needed.
         stall: when the policy has stopped moving; None if nobody looks.
     """
 
-    control_hz: float
     policy_hz: float
-    ticks_per_step: int
     horizon: int
     reserve: int
+    max_age: float
+    tiers: tuple[str, ...]
+    control_hz: float
+    ticks_per_step: int
     first: int
     channels: int
     frames: FrameSpec
-    max_age: float
-    tiers: tuple[str, ...]
-    margin_ticks: int
     stall: StallRule | None
 
     @property
@@ -243,17 +236,17 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         raise ExecutorError(
             f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
         )
-    return Resolved(
-        control_hz=control_hz,
-        policy_hz=policy_hz,
-        ticks_per_step=ticks_per_step,
-        horizon=horizon,
-        reserve=reserve,
-        first=chunk.start,
-        channels=chunk.action_dim,
-        frames=FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
-        max_age=settings.max_age or 3 / policy_hz,
-        tiers=tiers,
-        margin_ticks=settings.margin_ticks,
-        stall=stall,
-    )
+    found = {
+        "policy_hz": policy_hz,
+        "horizon": horizon,
+        "reserve": reserve,
+        "max_age": settings.max_age or 3 / policy_hz,
+        "tiers": tiers,
+        "control_hz": control_hz,
+        "ticks_per_step": ticks_per_step,
+        "first": chunk.start,
+        "channels": chunk.action_dim,
+        "frames": FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
+        "stall": stall,
+    }
+    return Resolved(**{**vars(settings), **found})

@@ -9,7 +9,7 @@ from __future__ import annotations
 import atexit
 import copy
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial, partialmethod
@@ -19,6 +19,7 @@ import numpy as np
 
 from ttscompile.errors import ObservationError
 from ttscompile.measure.energy import Numbers
+from ttscompile.runtimes.helper import Helper
 
 from .measure import Clock, MonotonicClock
 from .settings import require_number
@@ -103,16 +104,14 @@ class Shadow:
         self._original, self._compiled, self._noise, self._deadline = original, compiled, noise, deadline
         self._other_noise = getattr(getattr(compiled, "info", None), "other_noise", None)
         self._clock = clock or MonotonicClock()
-        self._due: deque[Callable[[], object]] = deque()
-        self._work = threading.Condition()
-        self._ending = self._missed = False
+        self._lock = threading.Lock()
+        self._waiting, self._missed = 0, False
         self._count: Counter[str] = Counter()
         self._failure, self._worst = "", (0.0, -1)
         self._sum = np.zeros(0)  # of the mean differences, by number of the action
         self._times = Samples(TIMES), Samples(TIMES)
         self.worst_observation: Mapping[str, Any] | None = None
-        self._thread = threading.Thread(target=self._run, name="ttscompile-shadow", daemon=True)
-        self._thread.start()
+        self._helper = Helper("ttscompile-shadow")
         atexit.register(self.close)  # a thread that comes back when the interpreter is gone may abort the process
 
     @property
@@ -140,7 +139,7 @@ class Shadow:
 
     def report(self) -> ShadowReport:
         """What was found so far."""
-        with self._work:
+        with self._lock:
             mean, noise = self._sum / max(self._count["compared"], 1), self._other_noise
             return ShadowReport(
                 **{name: self._count[name] for name in ("calls", "compared", "dropped", "failed", "late")},
@@ -154,10 +153,7 @@ class Shadow:
 
     def close(self, timeout: float = 10.0) -> ShadowReport:
         """Wait for the calls that are due, for so many seconds of real time, and end the thread."""
-        with self._work:
-            self._ending = True
-            self._work.notify()
-        self._thread.join(timeout)
+        self._helper.end(timeout)
         atexit.unregister(self.close)
         return self.report()
 
@@ -172,11 +168,11 @@ class Shadow:
         begun = self._clock.now()
         answer = getattr(self._original, name)(obs, **words, **own)
         took = self._clock.now() - begun
-        with self._work:
+        with self._lock:
             number = self._count["calls"]
             self._count["calls"] += 1
             self._times[0].add(1e3 * took)
-            full = len(self._due) >= WAITING
+            full = self._waiting >= WAITING
             self._missed |= full
             drop = full or (self._missed and name != "predict_action")  # the others keep frames from call to call
             self._count["dropped"] += drop
@@ -194,29 +190,23 @@ class Shadow:
     select_action = partialmethod(_both, "select_action")
 
     def _give(self, work: Callable[[], object]) -> None:
-        with self._work:
-            self._due.append(work)
-            self._work.notify()
+        with self._lock:
+            self._waiting += 1
+        self._helper.submit(partial(self._try, work))
 
     def _fail(self, error: Exception) -> None:
-        with self._work:
+        with self._lock:
             self._count["failed"] += 1
             self._failure = f"{type(error).__name__}: {error!s:.300}"
 
-    def _run(self) -> None:
-        while True:
-            with self._work:
-                self._work.wait_for(lambda: self._due or self._ending)
-                if not self._due:
-                    return
-                work = self._due[0]
-            try:
-                work()
-            except Exception as error:
-                self._missed = True
-                self._fail(error)
-            with self._work:
-                self._due.popleft()
+    def _try(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except Exception as error:
+            self._missed = True
+            self._fail(error)
+        with self._lock:
+            self._waiting -= 1
 
     def _compare(self, call: Callable[[], Any], obs: Any, number: int, answer: Numbers, within: float) -> None:
         begun = self._clock.now()
@@ -226,7 +216,7 @@ class Shadow:
         apart = np.abs(made[..., :steps, :] - answer[..., :steps, :]).reshape(-1, made.shape[-1])
         if not np.isfinite(apart).all():
             raise ObservationError("actions of the original, or of the compiled policy, are not finite.")
-        with self._work:
+        with self._lock:
             self._sum = apart.mean(0) + (self._sum if self._count["compared"] else 0.0)
             self._count["compared"] += 1
             self._count["late"] += took > within

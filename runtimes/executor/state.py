@@ -16,7 +16,7 @@ from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObserv
 from .feasibility import LatencyWindow, Tiers
 from .guard import Guard
 from .schedule import Schedule
-from .settings import ExecutorSettings, Resolved
+from .settings import Resolved
 from .stall import Watchdog
 from .statistics import Recorder
 from .window import Frame, ObservationWindow
@@ -57,16 +57,15 @@ class ExecutorState:
 
     def __init__(
         self,
-        settings: ExecutorSettings,
-        resolved: Resolved,
+        settings: Resolved,
         normalizer: Affine | None,
         tiers: tuple[str, ...],
         latencies: Mapping[str, LatencyWindow],
     ) -> None:
-        self._settings, self._resolved = settings, resolved
-        self._guard = Guard(settings.guard, normalizer, resolved.channels)
+        self._settings = settings
+        self._guard = Guard(settings.guard, normalizer, settings.channels)
         self._tiers = Tiers(tiers, settings.down_after, settings.up_after)
-        self._coverable = resolved.feasibility(0.0).max_latency
+        self._coverable = settings.feasibility(0.0).max_latency
         self._latencies = latencies
         self.recorder = Recorder(settings.statistics_window)
         self.epoch = 0
@@ -74,12 +73,11 @@ class ExecutorState:
         self._begin_episode()
 
     def _begin_episode(self) -> None:
-        settings, resolved = self._settings, self._resolved
-        period = 1 / resolved.policy_hz
-        self._window = ObservationWindow(resolved.frames.steps, period, settings.rate_tolerance, resolved.max_age)
-        self._schedule = Schedule(settings, resolved, self._guard)
-        self._watchdog = Watchdog(resolved.stall)
-        self._early: deque[Frame] = deque(maxlen=2 * resolved.frames.steps)  # handed out
+        settings, period = self._settings, 1 / self._settings.policy_hz
+        self._window = ObservationWindow(settings.frames.steps, period, settings.rate_tolerance, settings.max_age)
+        self._schedule = Schedule(settings, self._guard)
+        self._watchdog = Watchdog(settings.stall)
+        self._early: deque[Frame] = deque(maxlen=2 * settings.frames.steps)  # handed out
         self._used = float("-inf")  # time of the newest frame that a call was made from
         self._holds = 0
         self._gap = False
@@ -106,7 +104,7 @@ class ExecutorState:
     def observe(self, frame: Frame, time: float, now: float) -> None:
         """Take a frame. Raises ObservationError: it comes from the future."""
         ahead = time - now
-        if not ahead <= 0.5 / self._resolved.control_hz:
+        if not ahead <= 0.5 / self._settings.control_hz:
             what = f"the observation's time is {ahead:.6g} s ahead of the executor's clock, {now:.6f}"
             remedy = "Stamp frames with time.monotonic(), or with the clock that the executor was given."
             raise ObservationError(f"{what}. {remedy}")
@@ -145,8 +143,8 @@ class ExecutorState:
         if late:
             recorder.counts.reserve += 1
             self._miss()
-        recorder.queue_depth.add(max(schedule.due - tick - 1, 0))
-        recorder.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
+        recorder.samples.queue_depth.add(max(schedule.due - tick - 1, 0))
+        recorder.samples.action_age_ms.add(1e3 * (time - float(timeline.observed[tick - timeline.start])))
         recorder.counts.actions_clipped += int(timeline.clipped[tick - timeline.start])
         recorder.tick(now)
         self._holds, self._gap = 0, late
@@ -201,7 +199,7 @@ class ExecutorState:
         window = self._window.complete
         if window is None:
             return f"there is no complete observation window: {self._window.why_incomplete()}", True
-        age, limit = now - window.time, self._resolved.max_age
+        age, limit = now - window.time, self._settings.max_age
         if age > limit:
             return f"the newest complete observation window is {age:.4g} s old, and may be {limit:.4g} s", True
         if window.time <= self._used:
@@ -217,7 +215,7 @@ class ExecutorState:
         the last that is to be expected early enough, if that is sooner. If that does not come, with the one before.
         """
         window, schedule = self._window.complete, self._schedule
-        if window is None or window.time <= self._used or now - window.time > self._resolved.max_age:
+        if window is None or window.time <= self._used or now - window.time > self._settings.max_age:
             return None
         runs_out = schedule.runs_out(now)
         if runs_out is None or window.time + self._window.interval / 2 > schedule.executed:
@@ -263,7 +261,7 @@ class ExecutorState:
         window = self._window.complete
         assert window is not None  # next_start said so
         self._used = window.time
-        self.recorder.observation_age_ms.add(1e3 * (now - window.time))
+        self.recorder.samples.observation_age_ms.add(1e3 * (now - window.time))
         schedule, prefix = self._schedule, None
         if self._settings.seam == "prefix":
             prefix = schedule.committed(window.time, now + self._latency)
@@ -289,7 +287,7 @@ class ExecutorState:
         counts.stalls += job.stalled
         latency = now - job.started
         self._latencies[job.plan].add(latency)
-        self.recorder.latency_ms.add(1e3 * latency)
+        self.recorder.samples.latency_ms.add(1e3 * latency)
         if job.epoch != self.epoch:
             counts.chunks_discarded += 1
             return "discarded"
@@ -306,7 +304,7 @@ class ExecutorState:
         else:
             counts.chunks_overdue += 1
         if job.deadline is not None:
-            self.recorder.slack_ms.add(1e3 * (job.deadline - now))
+            self.recorder.samples.slack_ms.add(1e3 * (job.deadline - now))
         late = job.deadline is not None and now > job.deadline
         if outcome == "refused" and not late:  # a faster plan is no remedy for that, nor has it kept up
             return outcome
@@ -330,7 +328,7 @@ class ExecutorState:
     @property
     def _takes(self) -> float:
         """Seconds that the next call has to start before its chunk is needed."""
-        return self._latency + self._settings.margin_ticks / self._resolved.control_hz
+        return self._latency + self._settings.margin_ticks / self._settings.control_hz
 
     def _update_due(self) -> None:
         """Say what of the schedule is in reserve: what goes on for longer than the next call has to take.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -57,32 +58,6 @@ def summary(kept: npt.NDArray[np.float64], count: int, low: float, high: float) 
         return None
     p50, p95, p99 = (float(p) for p in np.percentile(kept, [50, 95, 99]))
     return Summary(count, low, p50, p95, p99, high)
-
-
-@dataclass
-class Counts:
-    """What happened so far, in numbers; ``ExecutorStatistics`` has the same fields, and says what they are."""
-
-    ticks: int = 0
-    reserve: int = 0
-    holds: int = 0
-    actions_clipped: int = 0
-    starved: int = 0
-    frames: int = 0
-    frames_late: int = 0
-    frames_replaced: int = 0
-    frames_early: int = 0
-    calls: int = 0
-    calls_outside: int = 0
-    stalls: int = 0
-    chunks: int = 0
-    chunks_refused: int = 0
-    chunks_overdue: int = 0
-    chunks_discarded: int = 0
-    deadlines_missed: int = 0
-    switches_down: int = 0
-    switches_up: int = 0
-    resets: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,31 +134,38 @@ class ExecutorStatistics:
         return asdict(self)
 
 
+COUNTS, MEASURED = (
+    tuple(each.name for each in fields(ExecutorStatistics) if each.type == kind) for kind in ("int", "Summary | None")
+)
+"""Of these fields what is counted, and what is measured."""
+
+
 class Recorder:
-    """Counts and samples of an executor. Changed under its lock only; nothing here allocates while the loop runs."""
+    """Counts and samples of an executor, by the names that ``ExecutorStatistics`` has for them.
+
+    Changed under the executor's lock only; nothing here allocates while the loop runs.
+    """
 
     def __init__(self, window: int) -> None:
-        self.counts = Counts()
+        self.counts = SimpleNamespace(**dict.fromkeys(COUNTS, 0))
+        self.samples = SimpleNamespace(**{name: Samples(window) for name in MEASURED})
         self.last_refusal: str | None = None
-        self.latency_ms, self.observation_age_ms, self.action_age_ms = (Samples(window) for _ in range(3))
-        self.slack_ms, self.queue_depth, self.tick_ms = (Samples(window) for _ in range(3))
         self.last_tick: float | None = None  # None where the loop stands still on purpose
 
     def tick(self, now: float) -> None:
         """An action was given out."""
         self.counts.ticks += 1
         if self.last_tick is not None:
-            self.tick_ms.add(1e3 * (now - self.last_tick))
+            self.samples.tick_ms.add(1e3 * (now - self.last_tick))
         self.last_tick = now
 
     def copy(self) -> dict[str, Any]:
         """What ``statistics`` needs, copied while the lock is held; the percentiles are made without it."""
-        samples = {name: value.copy() for name, value in vars(self).items() if isinstance(value, Samples)}
-        return {"last_refusal": self.last_refusal, "counts": asdict(self.counts), "samples": samples}
+        samples = {name: each.copy() for name, each in vars(self.samples).items()}
+        return {**vars(self.counts), **samples, "last_refusal": self.last_refusal}
 
 
 def statistics(plan: str, copied: dict[str, Any], identity: str = "") -> ExecutorStatistics:
     """Statistics from what ``Recorder.copy`` gave."""
-    summaries: dict[str, Any] = {name: summary(*sample) for name, sample in copied["samples"].items()}
-    counts, last = copied["counts"], copied["last_refusal"]
-    return ExecutorStatistics(plan=plan, identity=identity, last_refusal=last, **counts, **summaries)
+    summaries = {name: summary(*copied[name]) for name in MEASURED}
+    return ExecutorStatistics(plan=plan, identity=identity, **{**copied, **summaries})

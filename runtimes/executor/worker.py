@@ -9,7 +9,8 @@ from __future__ import annotations
 import atexit
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -20,7 +21,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import Clock, measure_latencies
-from .settings import ExecutorSettings, Policy, Resolved, SeeingPolicy
+from .settings import Policy, Resolved, SeeingPolicy
 from .state import ExecutorState, Job
 from .trace import Trace
 from .window import Frame
@@ -35,12 +36,10 @@ class Worker:
         failure: what ended the thread; None if nothing did.
     """
 
-    def __init__(
-        self, policy: Policy, settings: ExecutorSettings, resolved: Resolved, clock: Clock, trace: Trace
-    ) -> None:
-        self._policy, self._settings, self._resolved = policy, settings, resolved
+    def __init__(self, policy: Policy, settings: Resolved, clock: Clock, trace: Trace) -> None:
+        self._policy, self._settings = policy, settings
         self._clock, self._trace = clock, trace
-        prepares = bool(getattr(policy.info, "frames", 0)) and resolved.frames.seen_before
+        prepares = bool(getattr(policy.info, "frames", 0)) and settings.frames.seen_before
         self._seeing = cast("SeeingPolicy", policy) if prepares else None
         self.lock = threading.Lock()
         self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
@@ -137,12 +136,7 @@ class Worker:
         try:
             self._open()
             while (due := self._next()) is not None:
-                if isinstance(due, Job):
-                    self._call(due)
-                elif isinstance(due, dict):
-                    self._prepare(due)
-                else:
-                    self._policy.reset(*due)
+                due()
         except BaseException as error:
             with self.lock:
                 self.failure = error
@@ -154,41 +148,41 @@ class Worker:
             self._ready.set()
 
     def _open(self) -> None:
-        settings, resolved, given = self._settings, self._resolved, self._latencies
+        settings, given = self._settings, self._latencies
         if settings.cores is not None:
             _pin(settings.cores)
         if given is None:
             self._policy.reset()
-            times = measure_latencies(self._policy, self._clock, settings, resolved.plans)
+            times = measure_latencies(self._policy, self._clock, settings)
             measured = {name: [ms / 1e3 for ms in each.ms] for name, each in times.items()}
-        elif missing := [name for name in resolved.plans if name not in given]:
-            raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {resolved.plans}.")
+        elif missing := [name for name in settings.plans if name not in given]:
+            raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {settings.plans}.")
         else:
-            measured = {name: [given[name]] for name in resolved.plans}
+            measured = {name: [given[name]] for name in settings.plans}
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
-        self.feasibility = {name: resolved.feasibility(max(measured[name])) for name in resolved.tiers}
+        self.feasibility = {name: settings.feasibility(max(measured[name])) for name in settings.tiers}
         tiers = fast_enough(self.feasibility, settings.refuse_infeasible)
         action = self._policy.info.action
         normalizer = action.normalizer if action.ranged else None
         with self.lock:
-            self._state = ExecutorState(settings, resolved, normalizer, tiers, latencies)
+            self._state = ExecutorState(settings, normalizer, tiers, latencies)
         self._ready.set()
 
-    def _next(self) -> Job | Frame | tuple[int | None] | None:
+    def _next(self) -> Callable[[], object] | None:
         """Wait for what to do: a call, a frame to prepare, a reset of the policy with a seed, or (None) the end."""
         with self.lock:
             state = self._opened
             while not self._ending:
                 if self._reset_due:
                     seed, self._reset_due, self._reset_seed = self._reset_seed, False, None
-                    return (seed,)
+                    return partial(self._policy.reset, seed)
                 now = self._clock.now()
                 start = state.next_start(now)
                 if start is not None and start <= now:
-                    return state.begin(now)
+                    return partial(self._call, state.begin(now))
                 if self._seeing and (frame := state.early(now)) is not None:
                     state.begin_early(frame)
-                    return frame
+                    return partial(self._prepare, frame)
                 self._waiting, self._timed = True, start is not None
                 self._clock.wait(self._work, None if start is None else start - now)
                 self._waiting = False
@@ -204,29 +198,29 @@ class Worker:
 
         start = self._clock.now()
         assert self._seeing is not None  # or there was none to prepare
-        work = self._seeing.prepare_frame(self._resolved.frames.alone(frame), useless)
+        work = self._seeing.prepare_frame(self._settings.frames.alone(frame), useless)
         if self._trace.on:
             self._trace.frame(start, self._clock.now(), work)
 
     def _call(self, job: Job) -> None:
-        resolved = self._resolved
-        obs = resolved.frames.observation(job.frames)
+        settings = self._settings
+        obs = settings.frames.observation(job.frames)
         prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
-        last = resolved.first + resolved.horizon + resolved.reserve
+        last = settings.first + settings.horizon + settings.reserve
         if job.stalled:  # all but the sequence of its noise is forgotten
             self._policy.reset()
         elif (follow := getattr(self._policy, "follow", None)) is not None and job.epoch == self._followed[0]:
-            follow(round((job.observed - self._followed[1]) * resolved.policy_hz))
+            follow(round((job.observed - self._followed[1]) * settings.policy_hz))
         self._followed = job.epoch, job.observed
         try:
             predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
         except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out
-            predicted = np.full((1, last, resolved.channels), np.nan, np.float32)
+            predicted = np.full((1, last, settings.channels), np.nan, np.float32)
         streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
-        if streams != 1 or steps < last or channels != resolved.channels:
-            expected = f"[1, T, Da] with T of at least {last} and Da = {resolved.channels}"
+        if streams != 1 or steps < last or channels != settings.channels:
+            expected = f"[1, T, Da] with T of at least {last} and Da = {settings.channels}"
             raise ExecutorError(f"the policy's action_pred has shape {list(predicted.shape)}; expected {expected}.")
-        actions: npt.NDArray[np.float32] = predicted[0, resolved.first : last].astype(np.float32)
+        actions: npt.NDArray[np.float32] = predicted[0, settings.first : last].astype(np.float32)
         report = getattr(self._policy, "last_report", None)
         with self.lock:
             now = self._clock.now()

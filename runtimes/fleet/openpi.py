@@ -116,7 +116,7 @@ class OpenPiServer(FleetServer):
         obs = dict[str, Any]()
         for key, value in given.items():
             if (spec := self._specs.get(key)) is not None and not isinstance(value, str):
-                value = value if isinstance(value, np.ndarray) else read_arrays({key: value}, {key: spec.dtype})[key]
+                value = value if isinstance(value, np.ndarray) else read_arrays({key: value}, {key: spec})[key]
                 if value.ndim == 0 and prod(spec.shape) == 1:
                     value = value.reshape(spec.shape)
                 if spec.frames == 1 and value.ndim == len(spec.shape) - 1:

@@ -16,12 +16,7 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.errors import (
-    DeadlineMissedError,
-    IllegalPlanError,
-    ObservationError,
-    OverloadedError,
-)
+from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.liveness import reading_earlier_calls
 from ttscompile.runtimes.server.limits import ServerLimits
@@ -162,7 +157,7 @@ class FleetServer(Listener):
 
     def _checked(self, given: Mapping[str, Any]) -> dict[str, Array]:
         """The arrays of an observation: one that does not fit must not fail the others of its batch."""
-        obs = read_arrays(given, {key: one.dtype for key, one in self._specs.items()})
+        obs = read_arrays(given, self._specs)
         if obs.keys() != self._specs.keys():
             raise ObservationError(f"expected an observation of {sorted(self._specs)}; found {sorted(obs)[:20]}.")
         for key, one in self._specs.items():

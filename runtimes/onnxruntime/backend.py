@@ -15,7 +15,7 @@ from ttscompile.core.lattice import PlanArray
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.runtimes.backend import Call
 from ttscompile.runtimes.frames import FramePieces
-from ttscompile.runtimes.instructions import Instructions, instructions_of
+from ttscompile.runtimes.instructions import Instructions, by_plan, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 from ttscompile.runtimes.tokens import token_towers
 
@@ -24,31 +24,13 @@ from .sessions import Sessions, renew_piece, run_piece
 from .workspace import Workspace
 
 
-class OnnxBackends:
-    """Opens backends on views of one artifact, which share sessions, and what they remember of frames."""
-
-    def __init__(self, threads: int = 1) -> None:
-        self.sessions = Sessions(threads)
-        self._frames: dict[object, FramePieces] = {}
-
-    def __call__(self, view: View) -> OnnxBackend:
-        """The backend for a view, within its ``reading``.
-
-        Raises:
-            RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
-            ArtifactError: onnxruntime refuses a graph.
-        """
-        backend = OnnxBackend(view, self.sessions)
-        backend.frames = self._frames.setdefault(view.frames_key, backend.frames)
-        return backend
-
-
 class OnnxBackend:
     """A ``Backend`` on onnxruntime.
 
     Args:
         view: of an artifact.
-        sessions: of its models.
+        sessions: of the artifact's models; those of other views are shared.
+        known: what backends of other views remember of frames, by ``View.frames_key``, to share it.
 
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
@@ -61,7 +43,7 @@ class OnnxBackend:
         ArtifactError: onnxruntime refuses a graph.
     """
 
-    def __init__(self, view: View, sessions: Sessions) -> None:
+    def __init__(self, view: View, sessions: Sessions, known: dict[object, FramePieces]) -> None:
         self._manifest, self._view, self._pool = view.manifest, view, sessions
         groups, plans = self._manifest.groups, view.schedules.values()
         self._lowered = {plan.tobytes(): instructions_of(plan, groups) for plan in plans}
@@ -70,9 +52,10 @@ class OnnxBackend:
         self.sessions = sessions.of(view, self._blocks)
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
         self._renew = partial(renew_piece, self.sessions, self._manifest.pieces)
-        self.frames: FramePieces = self._open_frames()
+        self.frames = known.setdefault(view.frames_key, self._open_frames())
         self.keeps = readable_rollout(view)
         self.workspace: Workspace | None = self._open_workspace(1)
+        self._some: dict[int, Workspace] = {}  # for streams of a batch that follow a plan of their own
 
     def lower(self, plan: PlanArray) -> Instructions:
         """See ``Backend.lower``."""
@@ -82,10 +65,12 @@ class OnnxBackend:
         """Make the workspace of a batch size, and the sessions of single blocks for the first plans that need them."""
         if self.workspace is None or self.workspace.streams != streams:
             self.workspace = None  # give the old memory back first; there may be too little for the new
+            self._some.clear()
             self.workspace = self._open_workspace(streams)
         if not self._blocks and (plans is None or any(one.partial for one in plans)):
             self.sessions |= self._pool.of_blocks(self._view)
-            self.workspace.bind_blocks()
+            for work in (self.workspace, *self._some.values()):
+                work.bind_blocks()
             self._blocks = True
 
     def start(self, call: Call) -> None:
@@ -108,8 +93,23 @@ class OnnxBackend:
 
     def other_steps(self, plans: Sequence[Instructions]) -> FloatArray:
         """See ``Backend.other_steps``."""
-        decode_rest(self._work, plans, self._keep)
+        streams = by_plan(plans)
+        if len(streams) == 1:
+            decode_rest(self._work, plans[0], self._keep)
+        else:
+            for plan, some in streams.items():
+                self._decode_some(plan, some)
         return self._work.result()
+
+    def _decode_some(self, plan: Instructions, streams: Sequence[int]) -> None:
+        """The steps after step 0 for the streams of a batch that follow this plan."""
+        if len(streams) not in self._some:
+            self._some[len(streams)] = Workspace(self._view, self.sessions, len(streams))
+        work, kept = self._some[len(streams)], plan.computed & self._keep
+        kept[0] = False  # step 0 was all streams'
+        work.take(self._work, streams, np.flatnonzero(plan.rollout).tolist())
+        decode_rest(work, plan, self._keep)
+        work.give(self._work, streams, np.flatnonzero(kept).tolist())
 
     def _open_frames(self) -> FramePieces:
         towers = token_towers(self._manifest, self._view.variant.tokens, self._run, self._renew)
@@ -134,7 +134,7 @@ class OnnxBackend:
             for k in np.flatnonzero(lowered.computed.all(axis=1)).tolist():
                 work.bind_dense(k)
         for cell in np.flatnonzero(self.keeps).tolist():
-            work.rollout.entry(cell)
+            work.entry(cell)
         spec = self._manifest.spec
         obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.observations.items()}
         with np.errstate(all="ignore"):  # zeros need not be in the range of the policy

@@ -18,8 +18,7 @@ from __future__ import annotations
 import ctypes
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 from weakref import WeakSet
@@ -85,7 +84,6 @@ class Sessions:
         self.threads = threads
         self._known: dict[tuple[str, int, bool], Any] = {}
         self._careful: dict[str, bool] = {}
-        self._contents: dict[str, bytes] = {}
 
     def of(self, view: View, blocks: bool = True) -> dict[str, Any]:
         """What runs each ONNX piece of a view, by name: an ``InferenceSession``, or a ``JointBlock``.
@@ -103,10 +101,10 @@ class Sessions:
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
         unused = filter(of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
         others = set(filter(is_of_loop, manifest.pieces))
-        with self._reading(view):
-            sessions = self._open(view, set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others)
-            sessions[FIRST_STEP] = self._session(view, DENSE_STEP, first_step=True)
-            return sessions | self._of_blocks(view) if blocks else sessions
+        once, contents = set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others, _contents(view)
+        sessions = {piece: self._session(view, piece, contents) for piece in sorted(once)}
+        sessions[FIRST_STEP] = self._session(view, DENSE_STEP, contents, first_step=True)
+        return sessions | self._of_blocks(view, contents) if blocks else sessions
 
     def of_blocks(self, view: View) -> dict[str, Any]:
         """What runs single blocks, by name, some time after the artifact was loaded.
@@ -114,8 +112,8 @@ class Sessions:
         Raises:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
         """
-        with view.artifact.reading(), self._reading(view):
-            return self._of_blocks(view)
+        with view.artifact.reading():
+            return self._of_blocks(view, _contents(view))
 
     def of_layers(self, view: View) -> dict[str, Any]:
         """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
@@ -123,24 +121,15 @@ class Sessions:
         Raises:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
         """
-        with view.artifact.reading(), self._reading(view):
-            return self._open(view, [LAYERS])
+        with view.artifact.reading():
+            return {LAYERS: self._session(view, LAYERS, _contents(view))}
 
-    @contextmanager
-    def _reading(self, view: View) -> Iterator[None]:
-        """Within the block sessions are opened with what ``_contents`` says; each copies what it needs of that."""
-        self._contents = _contents(view)
-        try:
-            yield
-        finally:
-            self._contents = {}
-
-    def _of_blocks(self, view: View) -> dict[str, Any]:
+    def _of_blocks(self, view: View, contents: Mapping[str, bytes]) -> dict[str, Any]:
         manifest = view.manifest
         names = [block_name(b) for b in range(len(manifest.blocks))]
         if self.threads == 1:
-            return self._open(view, names)
-        session, blanks = self._session(view, JOINT), dict[int, dict[str, Array]]()
+            return {name: self._session(view, name, contents) for name in names}
+        session, blanks = self._session(view, JOINT, contents), dict[int, dict[str, Array]]()
         pieces = [manifest.pieces[name] for name in names]
         joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
         return {
@@ -148,10 +137,7 @@ class Sessions:
             for b, (name, piece) in enumerate(zip(names, pieces, strict=True))
         }
 
-    def _open(self, view: View, pieces: Iterable[str]) -> dict[str, Any]:
-        return {piece: self._session(view, piece) for piece in sorted(pieces)}
-
-    def _session(self, view: View, piece: str, first_step: bool = False) -> Any:
+    def _session(self, view: View, piece: str, contents: Mapping[str, bytes], first_step: bool = False) -> Any:
         file = view.onnx_file(piece, first_step)
         threads = 1 if piece in SINGLE_THREADED else self.threads
         spins = piece in OF_ALL_BLOCKS
@@ -159,19 +145,22 @@ class Sessions:
             precision = view.precision.get(str(part_of(piece)), FP32)
             if precision not in self._careful:
                 self._careful[precision] = needs_care(precision)
-            session = _open_file(view, file, threads, spins, self._careful[precision], self._contents)
+            session = _open_file(view, file, threads, spins, self._careful[precision], contents)
             self._known[file, threads, spins] = session
         return self._known[file, threads, spins]
 
 
 def _contents(view: View) -> dict[str, bytes]:
-    """All files with weights if they are small, or none: what onnxruntime is given in memory it does not map."""
+    """All files with weights if they are small, or none: what onnxruntime is given in memory it does not map.
+
+    A session copies what it needs of them when it is opened.
+    """
     sizes = {name: record.bytes for name, record in view.manifest.acting.items() if name.endswith(".safetensors")}
     small = sum(sizes.values()) < MAPPED
     return {name: read_file(view.artifact.files / name, size) for name, size in sizes.items()} if small else {}
 
 
-def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool, contents: dict[str, bytes]) -> Any:
+def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool, contents: Mapping[str, bytes]) -> Any:
     try:
         import onnxruntime as ort
     except ImportError as error:

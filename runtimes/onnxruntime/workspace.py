@@ -8,24 +8,22 @@ same context buffers, to which the values of the step are copied.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ttscompile.artifact.manifest import Manifest
+from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.view import View
 from ttscompile.core.correction import HISTORY, Correction, no_correction, remember
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
-from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.ir import pieces
-from ttscompile.ir.graph import TensorType
-from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
-from ttscompile.runtimes.backend import fill_initial, fill_offset, hold_known
+from ttscompile.ir.pieces import ADVANCE, CONDITION, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STEP, STREAM, block_name
+from ttscompile.runtimes.backend import fill_initial, fill_offset, hold_known, stream_type
+from ttscompile.runtimes.contexts import ContextValues
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
-from .contexts import BoundBlock, ContextValues
 from .idle_steps import IdleSteps
 from .sessions import FIRST_STEP, Array, Bound, run_named
 
@@ -37,20 +35,21 @@ class Workspace:
     sample has two buffers, taken in turn: step k reads that of ``k % 2``, and ``advance`` writes the other.
 
     Attributes:
-        axis: the axis of the streams in the residual stream.
         sample: two arrays ``[D, B, T]``.
         fresh: the residual stream as a step begins.
         stream: the residual stream after what was added to it.
         current: float32 ``[blocks, *stream]``, what each block computed last.
         table: float32 ``[blocks, *stream]``, what each reused block adds at the moment.
+        rollout: entries of the rollout cache by flat index ``k * blocks + b``: copies of computed residuals that a
+            later call of the episode can read. One is made when it is first kept, and stays for the next episodes.
         idle: for steps without a computed block; None if the network is of another form.
     """
 
     def __init__(self, view: View, sessions: Mapping[str, Any], streams: int) -> None:
         manifest = view.manifest
-        kind = _stream_type(manifest, streams)
+        kind = stream_type(manifest, streams)
         shape = kind.at(streams)
-        self.streams, self.axis = streams, kind.batch_axis or 0
+        self.streams, self._axis = streams, kind.batch_axis or 0
         self._manifest, self._sessions = manifest, sessions
         self._steps, count = manifest.steps, len(manifest.blocks)
         horizon, dimensions = manifest.spec.sample
@@ -59,11 +58,11 @@ class Workspace:
         self.fresh, self.stream = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self.current = np.zeros((count, *shape), np.float32)
         self.table = np.zeros((count, *shape), np.float32)
-        self.rollout = RolloutStore(shape, self.axis)
+        self.rollout: dict[int, Array] = {}
         self._sums = np.zeros((0, *shape), np.float32)
         self._sampler = manifest.spec.sampler
         self._offset = np.zeros((self._steps, dimensions, streams, horizon), np.float32)
-        self._contexts = ContextValues(manifest, sessions, view.tables, streams)
+        self._contexts = ContextValues(manifest, streams, np, np.zeros, view.tables)
         stem = manifest.pieces[STEM]
         assert stem.stream is not None
         at_first = {name: self._contexts.at(name, 0) for name in stem.contexts}
@@ -72,6 +71,7 @@ class Workspace:
         size = self._sampler.memories * horizon
         self._memory = [np.zeros((dimensions, streams, size), np.float32) for _ in range(2 * bool(size))]
         self._prediction = np.zeros_like(self.sample[0])
+        self._correction: Correction | None = None
         self._known: Known | None = None
         self._read = np.zeros((streams, 0), np.float32)
         self.idle: IdleSteps | None = None
@@ -80,10 +80,9 @@ class Workspace:
         self._no_correction = no_correction(self._steps, manifest.spec.sample, view.groups)
         # By the correction's identity, which the entry keeps from reuse, and whether there is a prefix.
         self._advances: dict[tuple[int, bool], _Advances] = {}
-        self._advance = self.advances_with(self._no_correction)
+        self._advance = self.advances_with(None)
         self._dense: dict[int, Bound] = {}
         self._blocks: list[BoundBlock] = []
-        self._some: dict[tuple[int, int], BoundBlock] = {}
         if block_name(0) in sessions:
             self.bind_blocks()
 
@@ -93,23 +92,35 @@ class Workspace:
         """Take in what a call is given, and run what decides before the loop."""
         fill_initial(self._initial, noise, known)
         np.copyto(self.sample[0], self._initial.transpose(2, 0, 1))
-        self._advance = self.advances_with(correction or self._no_correction, known)
+        self._correction, self._known = correction, known
+        self._advance = self.advances_with(correction, known)
         self._history.fill(0)
         if self._memory:
             self._memory[0].fill(0)
         fill_offset(self._offset, self._sampler, noise, correction)
         if obs:
-            self._contexts.fill(obs)
-        self._known, self._read = known, np.zeros((self.streams, 0), np.float32)
+            self._prologue(obs)
+        self._read = np.zeros((self.streams, 0), np.float32)
         if correction is not None and correction.reads:
-            self._read = correction.read(self._contexts.condition())
+            self._read = correction.read(self.condition())
             self._offset += correction.from_condition(self._read)
         if known is not None:
             hold_known(self._offset, known)
 
+    def _prologue(self, obs: Mapping[str, FloatArray]) -> None:
+        """What the normalised observations ``[B, ...]`` decide before the loop."""
+        contexts, found = self._contexts, self._manifest.pieces
+        condition, step = found[CONDITION], found.get(STEP)
+        if condition.outputs:
+            feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}
+            contexts.keep(run_named(self._sessions[CONDITION], condition.outputs, feed).items())
+        if step is not None:
+            feed = dict(zip(step.inputs, contexts.for_step_piece(step.inputs), strict=True))
+            contexts.keep_steps(run_named(self._sessions[STEP], step.outputs, feed).items())
+
     def condition(self) -> FloatArray:
         """What a correction reads of the observation, ``[B, N]``."""
-        return self._contexts.condition()
+        return np.asarray(self._contexts.features(), dtype=np.float32)
 
     def begin(self) -> None:
         """The residual stream of step 0; fills ``fresh``."""
@@ -168,9 +179,19 @@ class Workspace:
         """The sample after the last step, a copy ``[B, T, D]``."""
         return self.sample[self._steps % 2].transpose(1, 2, 0).copy()
 
+    def entry(self, cell: int) -> Array:
+        """An entry of the rollout cache; a new one holds zeros."""
+        if cell not in self.rollout:
+            self.rollout[cell] = np.full(self.stream.shape, 0.0, np.float32)  # which commits its pages now
+        return self.rollout[cell]
+
     def bind_blocks(self) -> None:
         """Make what running a single block would have to make; ``sessions`` has those of single blocks."""
-        self._blocks = [self._bound_block(b, self.stream, row, self.streams) for b, row in enumerate(self.current)]
+        names = map(block_name, range(len(self.current)))
+        self._blocks = [
+            BoundBlock(self._sessions[name], self._manifest.pieces[name], self._contexts, self.stream, residual)
+            for name, residual in zip(names, self.current, strict=True)
+        ]
 
     def bind_dense(self, k: int) -> Bound:
         """What runs all blocks at step k; made once."""
@@ -186,42 +207,31 @@ class Workspace:
         """All blocks at step k for all streams: reads ``fresh``, writes ``stream`` and ``current``."""
         self.bind_dense(k).run()
 
-    def run_dense_some(self, k: int, streams: Sequence[int]) -> list[Array]:
-        """All blocks at step k for these streams only; reads ``fresh``.
-
-        Returns:
-            The stream after the blocks, and the residual of each, with the streams on axis 0.
-        """
-        piece = self._manifest.pieces[DENSE_STEP]
-        feed = {STREAM: np.take(self.fresh, streams, axis=self.axis)}
-        for name in piece.contexts:
-            axis, value = self._manifest.contexts[name].type.batch_axis, self._contexts.at(name, k)
-            feed[CONTEXT + name] = value if axis is None else np.take(value, streams, axis=axis)
-        made = run_named(self._sessions[DENSE_STEP], piece.outputs, feed)
-        return [np.moveaxis(value, self.axis, 0) for value in made.values()]
-
     def run(self, k: int, b: int) -> None:
         """Block b at step k for all streams: reads ``stream``, writes ``current[b]``."""
         self._blocks[b].run(k)
 
-    def run_some(self, k: int, b: int, streams: Sequence[int]) -> Array:
-        """Block b at step k for these streams only.
+    def take(self, whole: Workspace, streams: Sequence[int], cells: Iterable[int]) -> None:
+        """What some streams of a batch have after step 0, and their entries of the rollout cache for these cells."""
+        self._contexts.take(whole._contexts, streams)
+        self._correction, self._known, self._read = whole._correction, whole._known, whole._read[streams]
+        self._advance = self.advances_with(self._correction, self._known)
+        for own, theirs in zip(self._left_by_step_0(cells), whole._left_by_step_0(cells), strict=True):
+            own[:] = theirs[streams]
 
-        Returns:
-            Their residuals, the streams on axis 0: a view that holds until the next such run. ``current`` is as it was.
-        """
-        key = b, len(streams)
-        some = self._some.get(key)
-        if some is None:
-            shape = self._manifest.blocks[b].type.at(len(streams))
-            stream, residual = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-            some = self._some[key] = self._bound_block(b, stream, residual, len(streams))
-        some.gather(k, streams, self.stream)
-        return some.rows
+    def give(self, whole: Workspace, streams: Sequence[int], cells: Iterable[int]) -> None:
+        """Put the sample of some streams, and their entries of these cells, into those of the batch."""
+        last = self._steps % 2
+        np.moveaxis(whole.sample[last], 1, 0)[streams] = np.moveaxis(self.sample[last], 1, 0)
+        for cell in cells:
+            np.moveaxis(whole.entry(cell), self._axis, 0)[streams] = np.moveaxis(self.entry(cell), self._axis, 0)
 
-    def _bound_block(self, b: int, stream: Array, residual: Array, count: int) -> BoundBlock:
-        session, piece = self._sessions[block_name(b)], self._manifest.pieces[block_name(b)]
-        return BoundBlock(session, piece, self._contexts, self.axis, stream, residual, count)
+    def _left_by_step_0(self, cells: Iterable[int]) -> list[Array]:
+        """What the steps after step 0 go on from, with the streams first: views."""
+        state = [(self.sample[1], 1), (self._history, 1), (self._offset, 2), *((each, 1) for each in self._memory[1:])]
+        stream = [(self.fresh, 0), (self.current, 1), *((self.entry(cell), 0) for cell in cells)]
+        state += [(array, self._axis + before) for array, before in stream]
+        return [np.moveaxis(array, axis, 0) for array, axis in state]
 
     def sums(self, count: int) -> Array:
         """Room for sums, float32 ``[>= count, *stream]``; what was in it is lost when it grows."""
@@ -229,16 +239,17 @@ class Workspace:
             self._sums = np.zeros((count, *self.stream.shape), np.float32)
         return self._sums
 
-    def advances_with(self, correction: Correction, known: Known | None = None) -> _Advances:
+    def advances_with(self, correction: Correction | None, known: Known | None = None) -> _Advances:
         """Bindings of all steps to the rows of a correction; made once for each, and once for its prefixes."""
         made = self._advances.get((id(correction), known is not None))
         if made is None:
             masked = None
             if known is not None:
                 masked = MaskedUpdates(self.advances_with(correction).updates, self._manifest.spec.chunk)
-            updates = matrices(self._sampler, correction) if masked is None else masked.updates
+            used = correction or self._no_correction
+            updates = matrices(self._sampler, used) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
-            made = _Advances(correction, correction.anchors.tolist(), updates, steps, masked)
+            made = _Advances(used, used.anchors.tolist(), updates, steps, masked)
             self._advances[id(correction), known is not None] = made
         if made.masked is not None and known is not None:
             made.masked.mask(known.values.shape[2])
@@ -271,31 +282,25 @@ class Workspace:
         return Bound(self._sessions[ADVANCE], {name: inputs[name] for name in piece.inputs}, outputs)
 
 
-class RolloutStore:
-    """Entries of the rollout cache: copies of computed residuals that a later call of the episode can read.
+class BoundBlock:
+    """A block bound to the stream that it reads and the residual that it writes, of all streams."""
 
-    Memory is taken when an entry is kept for the first time, and stays for the next episodes.
+    def __init__(
+        self, session: Any, piece: PieceRecord, contexts: ContextValues, stream: Array, residual: Array
+    ) -> None:
+        self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
+        read: dict[str, Array] = {name: contexts.at(name, 0) for name in piece.contexts}
+        for name in filter(contexts.is_stepwise, read):
+            read[name] = read[name].copy()
+            self._by_step.append((read[name], contexts.values[name]))
+        assert piece.stream is not None
+        self._bound = Bound(session, {piece.stream: stream, **read}, {piece.outputs[0]: residual})
 
-    Attributes:
-        entries: by flat index ``k * blocks + b``.
-    """
-
-    def __init__(self, shape: tuple[int, ...], axis: int) -> None:
-        self._shape, self._axis = shape, axis
-        self.entries: dict[int, Array] = {}
-
-    def entry(self, cell: int) -> Array:
-        """The entry of a cell; a new one holds zeros."""
-        found = self.entries.get(cell)
-        if found is None:
-            found = self.entries[cell] = np.empty(self._shape, np.float32)
-            found.fill(0.0)  # commits its pages now
-        return found
-
-    def of_stream(self, cell: int, s: int) -> Array:
-        """One stream's part of an entry, as a view."""
-        view: Array = np.moveaxis(self.entry(cell), self._axis, 0)[s]
-        return view
+    def run(self, k: int) -> None:
+        """Run at step k on the stream as it is."""
+        for to, values in self._by_step:
+            np.copyto(to, values[k])
+        self._bound.run()
 
 
 class _Advances(NamedTuple):
@@ -306,15 +311,3 @@ class _Advances(NamedTuple):
     updates: Array  # float32 [K, G, R, T]
     steps: list[Bound]
     masked: MaskedUpdates | None  # what the updates are of, with a prefix
-
-
-def _stream_type(manifest: Manifest, streams: int) -> TensorType:
-    """The type of the residual stream, which is float32, the same for all blocks, and has an axis for the streams."""
-    kind = manifest.blocks[0].type
-    if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
-        types = sorted({str(block.type) for block in manifest.blocks})
-        raise ArtifactError(f"the residual stream changes its type, or is not float32: {types}. It cannot be executed.")
-    if kind.batch_axis is None and streams > 1:
-        problem = f"this policy's residual stream has type {kind}, without an axis for the streams"
-        raise ObservationError(f"{problem}; found {streams} streams. Call it with one stream at a time.")
-    return kind

@@ -20,9 +20,9 @@ from .reuse import RolloutCache
 class ReferenceBackend:
     """A ``Backend`` on ``ReferenceModel``, without gradients; what fails is an error of the artifact."""
 
-    def __init__(self, view: View, device: torch.device | None = None) -> None:
+    def __init__(self, view: View) -> None:
         self._view = view
-        self.model = ReferenceModel.from_view(view, device)
+        self.model = ReferenceModel.from_view(view)
         self.keeps = np.ones((self.model.steps, self.model.blocks), dtype=np.bool_)
         self._residuals: Mapping[tuple[int, int], Tensor] = {}
 

@@ -17,7 +17,7 @@ from .limits import ServerLimits
 from .listener import Listener
 from .lock import Lock
 from .metrics import Metric, of_statistics
-from .protocol import METHODS, Request, read_frame
+from .protocol import METHODS, Request, read_arrays
 
 WAITS_PER_CLIENT = 4
 """Threads that may wait for an action, a client: one for it, the others for those before it that vanished waiting."""
@@ -54,7 +54,7 @@ class ExecutorServer(Listener):
         """See ``Listener``."""
         executor, params = self._executor, request.params
         if request.method == "observe":
-            frame = await self.apart(request.large, read_frame, params["obs"], executor.frames)
+            frame = await self.apart(request.large, read_arrays, params["obs"], executor.frames.specs)
             executor.observe(frame, params.get("t"))
             return {}
         if request.method == "action":

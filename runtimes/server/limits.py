@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import prod
 
 from ttscompile.core.coercion import integer
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
-
-_COUNTS = ("clients", "message_bytes", "message_values", "handshakes", "handshakes_per_address", "refusals_per_minute")
 
 NUMBER_BYTES = 8
 """Of a message for each number of an observation: a float32 in base64 takes 5.4 bytes, a pixel in digits takes four."""
@@ -62,8 +60,9 @@ class ServerLimits:
         return cls(clients, max(cls.message_bytes, size), max(cls.message_values, values))
 
     def __post_init__(self) -> None:
-        for name in (*_COUNTS, *(["clients_per_address"] if self.clients_per_address is not None else [])):
-            object.__setattr__(self, name, integer(getattr(self, name), f"the server's {name}", ExecutorError, 1))
-        for name, value in vars(self).items():
-            if value is not None and not value > 0:
+        for one in fields(self):
+            name, value = one.name, getattr(self, one.name)
+            if value is not None and one.type in ("int", "int | None"):
+                object.__setattr__(self, name, integer(value, f"the server's {name}", ExecutorError, 1))
+            elif value is not None and not value > 0:
                 raise ExecutorError(f"the server's {name} must be positive; found {value}.")

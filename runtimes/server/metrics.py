@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
-from ttscompile.runtimes.executor.statistics import Counts, ExecutorStatistics, Summary
+from ttscompile.runtimes.executor.statistics import COUNTS, ExecutorStatistics, Summary
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -46,7 +46,7 @@ def of_statistics(statistics: ExecutorStatistics) -> list[Metric]:
     """What an executor did so far: its counts, and percentiles of what it measured."""
     labels = {"plan": statistics.plan, "identity": statistics.identity}
     found = [Metric("plan_info", "gauge", "The plan that the next call runs, and the artifact.", [(labels, 1)])]
-    for name in asdict(Counts()):
+    for name in COUNTS:
         found.append(
             Metric(f"{name}_total", "counter", f"See {name} in ExecutorStatistics.", [({}, getattr(statistics, name))])
         )

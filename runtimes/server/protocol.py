@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ttscompile.core.spec import ObservationSpec
 from ttscompile.core.untrusted_json import MAX_VALUES, most_values
 from ttscompile.errors import ProtocolError
-from ttscompile.runtimes.executor.window import Array, FrameSpec
+from ttscompile.runtimes.executor.window import Array
 
 Message = str | bytes
 Methods = Mapping[str, frozenset[str]]
@@ -99,18 +100,15 @@ def _checked(document: dict[str, Any], methods: Methods) -> tuple[str, dict[str,
     return str(method), document
 
 
-def read_frame(obs: Mapping[str, Any], frames: FrameSpec) -> dict[str, Array]:
-    """The arrays of a frame; shapes are left to ``observe``. Raises ProtocolError: something is no array."""
-    return read_arrays(obs, {key: spec.dtype for key, spec in frames.specs.items()})
+def read_arrays(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> dict[str, Array]:
+    """The arrays of an observation, by key, of the specified dtypes where they are lists; shapes are left to others.
 
-
-def read_arrays(obs: Mapping[str, Any], dtypes: Mapping[str, str]) -> dict[str, Array]:
-    """The arrays of an observation, by key, of these dtypes where they are lists; of other keys nothing is read.
+    Of other keys nothing is read.
 
     Raises:
         ProtocolError: something is no array.
     """
-    return {key: _array(key, one, dtypes[key]) if key in dtypes else np.zeros(0) for key, one in obs.items()}
+    return {key: _array(key, one, specs[key].dtype) if key in specs else np.zeros(0) for key, one in obs.items()}
 
 
 def _array(key: str, value: Any, dtype: str) -> Array:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import partial
 
 import numpy as np
 import torch
@@ -24,38 +23,13 @@ from ttscompile.core.spec import FP32, FloatArray
 from ttscompile.ir.pieces import BLOCKS
 from ttscompile.runtimes.backend import Call, fitting
 from ttscompile.runtimes.inpainting import MaskedUpdates
-from ttscompile.runtimes.instructions import Instructions, instructions_of
+from ttscompile.runtimes.instructions import Instructions, by_plan, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 
-from .devices import device_of, exact_arithmetic, narrow_type
+from .devices import exact_arithmetic, narrow_type
 from .network import Parts, Placed
 from .sampler import Advance
 from .workspace import Workspace
-
-
-class TorchBackends:
-    """Opens backends on views of one artifact, which share its constants on the device.
-
-    Args:
-        threads: of arithmetic on the CPU, during calls alone: torch's setting is as it was between them.
-        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``; as torch calls it.
-        capture: how lines are captured; None for CUDA graphs on CUDA, and not at all elsewhere.
-
-    Raises:
-        RuntimeUnavailableError: torch does not have the device.
-    """
-
-    def __init__(self, threads: int = 1, device: str = "cpu", capture: Capture | None = None) -> None:
-        self._threads, self._capture = threads, capture
-        self._placed = Placed(device_of(device))
-
-    def __call__(self, view: View) -> TorchBackend:
-        """The backend for a view, within its ``reading``.
-
-        Raises:
-            RuntimeUnavailableError: the device does not have the precision of its blocks.
-        """
-        return TorchBackend(view, self._placed, self._threads, self._capture)
 
 
 class TorchBackend:
@@ -63,9 +37,9 @@ class TorchBackend:
 
     Args:
         view: of an artifact; its blocks have their products in fp32, bf16 or fp16.
-        placed: constants of the artifact, where to compute.
-        threads: see ``TorchBackends``.
-        capture: see ``TorchBackends``.
+        placed: constants of the artifact, where to compute; those of other views are shared.
+        threads: of arithmetic on the CPU, during calls alone: torch's setting is as it was between them.
+        capture: how lines are captured; None for CUDA graphs on CUDA, and not at all elsewhere.
 
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
@@ -138,9 +112,7 @@ class TorchBackend:
     def other_steps(self, plans: Sequence[Instructions]) -> FloatArray:
         """See ``Backend.other_steps``."""
         with self._settings():
-            streams: dict[Instructions, list[int]] = {}
-            for s, plan in enumerate(plans):
-                streams.setdefault(plan, []).append(s)
+            streams = by_plan(plans)
             if len(streams) == 1:
                 self._run(self.workspace, plans[0], self._whole)
             else:
@@ -162,10 +134,15 @@ class TorchBackend:
         keep = self._call.keep
         for cell in (*np.flatnonzero(plan.rollout).tolist(), *_kept(plan, keep)):
             work.entry(cell)
-        line = partial(work.call, plan, keep, self._advance)
+
+        def line() -> None:
+            if whole:
+                work.network.prologue()
+            work.call(plan, keep, self._advance)
+
         key = work.streams, whole, plan, keep.tobytes(), self._advance
         matrix = not self._pruned and plan not in self._named
-        self._lines.run(None if matrix else key, partial(_after, work.network.prologue, line) if whole else line)
+        self._lines.run(None if matrix else key, line)
 
     def _advance_of(self, call: Call) -> Advance:
         """The sampler's steps with the correction of a call; made once for each, and once for its prefixes."""
@@ -192,11 +169,6 @@ class TorchBackend:
         finally:
             if before != self._threads:
                 torch.set_num_threads(before)
-
-
-def _after(first: Line, then: Line) -> None:
-    first()
-    then()
 
 
 def _kept(plan: Instructions, keep: BoolArray) -> list[int]:

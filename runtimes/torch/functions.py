@@ -57,23 +57,12 @@ def packs(value: Any, weight: Any) -> bool:
     return there and fits and weight.ndim == 2 and value.ndim > 1 and value.numel() > 0 < weight.numel()
 
 
-def packed_weight(value: Tensor, weight: Tensor) -> Tensor:
-    """A weight as it is read for every value of this shape."""
-    result: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight, value.numel() // value.shape[-1])
-    return result
-
-
 def half_weight(weight: Tensor, bias: Tensor | None) -> Any:
     """A weight that half precision holds as it is, with its bias; None for any other, and where FBGEMM is not."""
     usable = HALF_LINEAR is not None and torch.backends.quantized.engine in ("x86", "fbgemm")
     if not usable or not torch.equal(weight.half().float(), weight):
         return None
     return torch.ops.quantized.linear_prepack_fp16(weight, bias)
-
-
-def gelu_kind(node: Node) -> str:
-    """``approximate`` of a node of gelu: "none" or "tanh"."""
-    return str(dict(node.kwargs).get("approximate", "none"))
 
 
 Function = Callable[..., tuple[Tensor, ...]]
@@ -200,9 +189,8 @@ class _Writer:
         """What does the same as a node on a packed weight: its arguments, and the function; None if nothing does."""
         before = self._packed_nodes.get(next(node.refs(), ""))
         if node.op == GELU and before is not None and before.args[3] == "none" and self._readers[before.name] == 1:
-            return self._with_packed(
-                replace(before, name=node.name, args=(*before.args[:3], "gelu", (), gelu_kind(node)))
-            )
+            kind = str(dict(node.kwargs).get("approximate", "none"))  # or "tanh"
+            return self._with_packed(replace(before, name=node.name, args=(*before.args[:3], "gelu", (), kind)))
         if node.op != LINEAR or node.kwargs or not isinstance(node.args[0], Ref) or not isinstance(node.args[1], Ref):
             return None
         value, weight = (self._values[each.name] for each in node.args[:2] if isinstance(each, Ref))
@@ -214,7 +202,8 @@ class _Writer:
         if half is not None and HALF_LINEAR is not None:
             self.fix(name, half)
             return replace(node, args=(node.args[0], Ref(name))), HALF_LINEAR
-        self.fix(name, packed_weight(value, weight))
+        rows = value.numel() // value.shape[-1]  # for which the library lays it out
+        self.fix(name, torch.ops.mkldnn._reorder_linear_weight(weight, rows))
         return self._with_packed(replace(node, args=(node.args[0], Ref(name), bias, "none", (), "")))
 
     def _with_packed(self, node: Node) -> tuple[Node, Callable[..., Any]]:

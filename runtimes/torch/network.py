@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from ttscompile.artifact.view import View
-from ttscompile.errors import ArtifactError
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import FRAMES, LoopPiece
-from ttscompile.ir.program import Binding, frame_values
+from ttscompile.ir.program import frame_values
+from ttscompile.runtimes.contexts import ContextValues
 
 from . import devices
 from .functions import Function, write_function
@@ -53,9 +53,9 @@ class Parts:
         form, _ = idle_form(self.pieces, values)
         self.idle = None if form is None else IdleSteps(form, placed.device)
 
-    def tensor(self, kind: TensorType, streams: int, *before: int) -> Tensor:
-        """Zeros of a type, with other axes before its own."""
-        return torch.zeros((*before, *kind.at(streams)), dtype=getattr(torch, kind.dtype), device=self.device)
+    def zeros(self, shape: tuple[int, ...], dtype: str) -> Tensor:
+        """Zeros on the device."""
+        return torch.zeros(shape, dtype=getattr(torch, dtype), device=self.device)
 
 
 class StreamsNetwork:
@@ -68,19 +68,15 @@ class StreamsNetwork:
 
     Attributes:
         idle: see ``loop.Network``.
-        values: contexts by name; those that differ from step to step ``[K, ...]``.
+        contexts: what they read.
     """
 
     def __init__(self, parts: Parts, obs: Mapping[str, Tensor], streams: int) -> None:
         self._parts, self._obs, self.streams = parts, obs, streams
         manifest, pieces = parts.manifest, parts.pieces
         self._steps, self.idle = manifest.steps, parts.idle
-        self.values: dict[str, Tensor] = {}
-        for name, context in manifest.contexts.items():
-            before = () if context.binding is Binding.CONDITION else (self._steps,)
-            self.values[name] = parts.tensor(context.type, streams, *before)
-            if context.binding is Binding.TABLE:  # one row of a batch of one, for all streams
-                self.values[name].copy_(devices.placed(pieces.tables[name], parts.device))
+        tables = {name: devices.placed(table, parts.device) for name, table in pieces.tables.items()}
+        self.contexts = ContextValues(manifest, streams, torch, parts.zeros, tables)
         self._once: dict[str, Function] = {}
         seen = frame_values(pieces, self._write_and_run, obs)
         order = [*obs, *seen]
@@ -88,11 +84,12 @@ class StreamsNetwork:
         self._step: Function | None = None
         self.prologue()
         if pieces.step is not None:
-            self._step = self._written(pieces.step, self._step_inputs(pieces.step), self._steps * streams)
+            reads = self.contexts.for_step_piece(pieces.step.inputs)
+            self._step = self._written(pieces.step, reads, self._steps * streams)
             self.prologue()
         (horizon, dimensions), kind = manifest.spec.sample, manifest.blocks[0].type
         sample = torch.zeros((dimensions, streams, horizon), device=parts.device).permute(1, 2, 0)
-        stream = parts.tensor(kind, streams)
+        stream = parts.zeros(kind.at(streams), kind.dtype)
         self._stem, self._stem_reads = self._loop_piece(pieces.stem, sample)
         self._tail, self._tail_reads = self._loop_piece(pieces.tail, stream)
         with self._narrow():
@@ -104,7 +101,7 @@ class StreamsNetwork:
         self._first, _ = zip(*first, strict=True)
         self._pruner = None
         if pieces.pruner is not None:
-            self._pruner_reads = [self.values[name] for name in pieces.pruner.inputs]
+            self._pruner_reads = [self.contexts.values[name] for name in pieces.pruner.inputs]
             self._pruner = self._written(pieces.pruner, self._pruner_reads, streams)
         self._contiguous = self._stem(sample, *self._stem_reads[0])[0].is_contiguous()
 
@@ -112,17 +109,11 @@ class StreamsNetwork:
         """Everything that the observation decides before the loop."""
         seen = frame_values(self._parts.pieces, self._run_once, self._obs)
         made = self._condition(*self._obs.values(), *seen.values())
-        for name, value in zip(self._parts.pieces.condition.outputs, made, strict=True):
-            if name in self.values:  # a network that ignores the condition has values that nobody reads
-                self.values[name].copy_(value)
+        self.contexts.keep(zip(self._parts.pieces.condition.outputs, made, strict=True))
         step = self._parts.pieces.step
-        if self._step is None or step is None:
-            return
-        for name, value in zip(step.outputs, self._step(*self._step_inputs(step)), strict=True):
-            axis = self._axis(name)
-            front = value.movedim(axis, 0)  # from [..., K * B, ...] to [K, ..., B, ...]
-            split = front.reshape(self._steps, self.streams, *front.shape[1:])
-            self.values[name].copy_(split.movedim(1, axis + 1))
+        if self._step is not None and step is not None:
+            made = self._step(*self.contexts.for_step_piece(step.inputs))
+            self.contexts.keep_steps(zip(step.outputs, made, strict=True))
 
     def _write_and_run(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         graph = self._parts.pieces.once()[name]
@@ -135,9 +126,8 @@ class StreamsNetwork:
 
     def condition(self) -> Tensor:
         """What a correction reads: the features, one row of numbers a stream, ``[B, N]``."""
-        contexts = self._parts.manifest.contexts
-        rows = [self.values[n].movedim(contexts[n].type.batch_axis or 0, 0) for n in self._parts.manifest.features]
-        return torch.cat([row.reshape(self.streams, -1) for row in rows], 1)
+        features: Tensor = self.contexts.features()
+        return features
 
     def logits(self) -> Tensor:
         """The pruner, float32 ``[B, K, blocks, 4]``."""
@@ -162,18 +152,6 @@ class StreamsNetwork:
     def tail(self, stream: Tensor, k: int) -> Tensor:
         """See ``loop.Network``."""
         return self._tail(stream, *self._tail_reads[k])[0]
-
-    def take(self, other: StreamsNetwork, index: Tensor) -> None:
-        """The contexts of some streams of another network."""
-        for name, context in self._parts.manifest.contexts.items():
-            axis = context.type.batch_axis
-            if context.binding is Binding.TABLE:
-                continue
-            if axis is not None:
-                before = context.binding is not Binding.CONDITION
-                self.values[name].copy_(other.values[name].index_select(axis + before, index))
-            else:
-                self.values[name].copy_(other.values[name])
 
     def _narrow(self) -> AbstractContextManager[object]:
         parts = self._parts
@@ -204,30 +182,6 @@ class StreamsNetwork:
     ) -> tuple[Function, list[tuple[Tensor, ...]]]:
         """The function of a piece, with the stream first, and its contexts at each step."""
         contexts = list(piece.contexts)
-        reads = [tuple(self._at(name, k) for name in contexts) for k in range(self._steps)]
+        reads = [tuple(self.contexts.at(name, k) for name in contexts) for k in range(self._steps)]
         order = [piece.stream, *contexts]
         return self._written(piece.graph, [value, *reads[0]], self.streams, narrow, order, weights), reads
-
-    def _at(self, name: str, k: int) -> Tensor:
-        stepwise = self._parts.manifest.contexts[name].binding is not Binding.CONDITION
-        return self.values[name][k] if stepwise else self.values[name]
-
-    def _step_inputs(self, graph: Graph) -> list[Tensor]:
-        """What the step piece reads, with a batch of K * B, step-major."""
-        found = []
-        for name in graph.inputs:
-            context, value = self._parts.manifest.contexts[name], self.values[name]
-            if context.binding is not Binding.CONDITION:
-                found.append(torch.cat(list(value), self._axis(name)))
-            elif context.type.batch_axis is None:
-                found.append(value)
-            else:
-                found.append(torch.cat([value] * self._steps, context.type.batch_axis))
-        return found
-
-    def _axis(self, name: str) -> int:
-        axis = self._parts.manifest.contexts[name].type.batch_axis
-        if axis is None:
-            problem = f"step value {name!r} has no axis for the streams"
-            raise ArtifactError(f"{problem}. Convert the checkpoint again.")
-        return axis

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +11,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.core.lattice import BoolArray
-from ttscompile.core.spec import FloatArray
-from ttscompile.errors import ObservationError
-from ttscompile.runtimes.backend import Call, fill_initial, fill_offset, hold_known
+from ttscompile.runtimes.backend import Call, fill_initial, fill_offset, hold_known, stream_type
 from ttscompile.runtimes.instructions import Instructions
 
 from .loop import denoise
@@ -32,7 +31,7 @@ class Inlet:
         self._host = self.tensor
         if device.type != "cpu":
             self._host = torch.zeros(shape, dtype=self.tensor.dtype, pin_memory=device.type == "cuda")
-        self.array: npt.NDArray[np.generic] = self._host.numpy()
+        self.array: npt.NDArray[Any] = self._host.numpy()
 
     def send(self) -> None:
         """Copy what was written."""
@@ -50,10 +49,7 @@ class Workspace:
 
     def __init__(self, parts: Parts, streams: int) -> None:
         spec, device = parts.manifest.spec, parts.device
-        self._kind = parts.manifest.blocks[0].type
-        if self._kind.batch_axis is None and streams > 1:
-            problem = f"this policy's residual stream has type {self._kind}, without an axis for the streams"
-            raise ObservationError(f"{problem}; found {streams} streams. Call it with one stream at a time.")
+        self._kind = stream_type(parts.manifest, streams)
         self._parts, self.streams, self._sampler = parts, streams, spec.sampler
         (horizon, dimensions), steps = spec.sample, spec.sampler.steps
         self._horizon = horizon
@@ -69,7 +65,7 @@ class Workspace:
     def entry(self, cell: int) -> Tensor:
         """An entry of the rollout cache; a new one holds zeros."""
         if cell not in self.rollout:
-            self.rollout[cell] = self._parts.tensor(self._kind, self.streams)
+            self.rollout[cell] = self._parts.zeros(self._kind.at(self.streams), self._kind.dtype)
         return self.rollout[cell]
 
     def load(self, call: Call) -> None:
@@ -77,8 +73,8 @@ class Workspace:
         known = call.known
         for key, value in call.obs.items():
             np.copyto(self._obs[key].array, value)
-        fill_initial(_floats(self._initial), call.noise, known)
-        offset, free = _floats(self._offset)[..., : self._horizon], _floats(self._free)
+        fill_initial(self._initial.array, call.noise, known)
+        offset, free = self._offset.array[..., : self._horizon], self._free.array
         fill_offset(offset, self._sampler, call.noise, call.correction)
         free.fill(1)
         if known is not None:
@@ -113,7 +109,7 @@ class Workspace:
 
     def take(self, whole: Workspace, index: Tensor, plan: Instructions) -> None:
         """What some streams of a batch have before the loop: inputs, contexts, and residuals that a plan reads."""
-        self.network.take(whole.network, index)
+        self.network.contexts.take(whole.network.contexts, index)
         self._initial.tensor.copy_(whole._initial.tensor[index])
         self._offset.tensor.copy_(whole._offset.tensor[:, :, index])
         self._free.tensor.copy_(whole._free.tensor)
@@ -125,8 +121,3 @@ class Workspace:
         whole.result[index] = self.result
         for cell in cells:
             whole.entry(cell).index_copy_(self._kind.batch_axis or 0, index, self.rollout[cell])
-
-
-def _floats(inlet: Inlet) -> FloatArray:
-    array: FloatArray = inlet.array  # type: ignore[assignment]  # it was made of float32
-    return array

@@ -17,7 +17,7 @@ def rollout_nbytes(runtime: Runtime) -> int:
     """Bytes of the rollout cache."""
     assert isinstance(runtime.backend, OnnxBackend)
     assert runtime.backend.workspace is not None
-    return sum(entry.nbytes for entry in runtime.backend.workspace.rollout.entries.values())
+    return sum(entry.nbytes for entry in runtime.backend.workspace.rollout.values())
 
 
 def _arrays(value: object, seen: set[int]) -> list[np.ndarray]:

@@ -15,7 +15,6 @@ from ttscompile.core.lattice import PlanArray, dense_plan, uniform_plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.onnxruntime.decode import decode_first, decode_rest
-from ttscompile.runtimes.onnxruntime.workspace import RolloutStore
 from ttscompile.runtimes.plans import LoweringCache
 
 from .literal import Episode, Toy
@@ -35,7 +34,7 @@ class FakeIdle:
 
 
 class FakeWorkspace:
-    """The interface of ``Workspace`` over a numpy block function: a stream is a vector, several are a batch.
+    """The interface of ``Workspace`` over a numpy block function: a stream is a vector, and all follow one plan.
 
     Args:
         rng: of the policy's weights.
@@ -43,7 +42,7 @@ class FakeWorkspace:
     """
 
     def __init__(self, rng: np.random.Generator, steps: int, groups: tuple[int, ...], streams: int, axis: int) -> None:
-        self.steps, self.groups, self.streams, self.axis = steps, groups, streams, axis
+        self.groups, self.streams, self.axis = groups, streams, axis
         blocks = len(groups)
         self._w = rng.standard_normal((blocks, 4, 4)) / 2
         self._c = rng.standard_normal((steps, blocks, streams, 1, 4))
@@ -53,8 +52,8 @@ class FakeWorkspace:
         self.sample = [np.zeros((streams, 3, 4), np.float32) for _ in range(2)]
         self.current = np.full((blocks, *shape), np.nan, np.float32)
         self.table = np.full((blocks, *shape), np.nan, np.float32)
-        self.rollout = RolloutStore(shape, axis)
-        self.runs: list[tuple[int, int, tuple[int, ...]]] = []
+        self.rollout: dict[int, np.ndarray] = {}
+        self.runs: list[tuple[int, int]] = []
         self.dense: list[int] = []
         self.idle = FakeIdle(shape) if rng.random() < 0.8 else None
         self.idled: list[int] = []
@@ -73,6 +72,9 @@ class FakeWorkspace:
         np.moveaxis(self.fresh, self.axis, 0)[:] = 0.5 * self.x
         self.stream[:] = np.nan
 
+    def entry(self, cell: int) -> np.ndarray:
+        return self.rollout.setdefault(cell, np.full(self.stream.shape, np.nan, np.float32))
+
     def sums(self, count: int) -> np.ndarray:
         return np.full((count, *self.stream.shape), np.nan, np.float32)
 
@@ -82,15 +84,6 @@ class FakeWorkspace:
         for b in range(len(self.groups)):
             self.run(k, b)
             self.stream += self.current[b]
-
-    def run_dense_some(self, k: int, streams: list[int]) -> list[np.ndarray]:
-        h = np.moveaxis(self.fresh, self.axis, 0)[streams].astype(np.float64)
-        residuals = []
-        for b in range(len(self.groups)):
-            self.runs.append((k, b, tuple(streams)))
-            residuals.append(np.stack([self.toy(s).block(h[i], k, b) for i, s in enumerate(streams)]))
-            h = h + residuals[-1]
-        return [h, *residuals]
 
     def enter_idle(self, k: int) -> None:
         assert self.idle is not None
@@ -107,13 +100,10 @@ class FakeWorkspace:
         self.stream[:] = np.nan
 
     def run(self, k: int, b: int) -> None:
-        everyone = list(range(self.streams))
-        np.moveaxis(self.current[b], self.axis, 0)[:] = self.run_some(k, b, everyone)
-
-    def run_some(self, k: int, b: int, streams: list[int]) -> np.ndarray:
-        self.runs.append((k, b, tuple(streams)))
-        h = np.moveaxis(self.stream, self.axis, 0)
-        return np.stack([self.toy(s).block(h[s], k, b) for s in streams]).astype(np.float32)
+        self.runs.append((k, b))
+        own, h = np.moveaxis(self.current[b], self.axis, 0), np.moveaxis(self.stream, self.axis, 0)
+        for s in range(self.streams):
+            own[s] = self.toy(s).block(h[s], k, b)
 
     def advance(self, k: int) -> None:
         now, then = k % 2, (k + 1) % 2
@@ -130,41 +120,35 @@ class FakeWorkspace:
     groups=st.lists(st.integers(0, 2), min_size=1, max_size=7).map(tuple),
     streams=st.integers(1, 4),
     axis=st.integers(0, 1),
-    shared=st.booleans(),
     computed=st.floats(0, 1),
 )
 def test_instructions_do_what_section_2_says(
-    seed: int, steps: int, groups: tuple[int, ...], streams: int, axis: int, shared: bool, computed: float
+    seed: int, steps: int, groups: tuple[int, ...], streams: int, axis: int, computed: float
 ) -> None:
     rng = np.random.default_rng(seed)
     work = FakeWorkspace(rng, steps, groups, streams, axis)
     cache = LoweringCache(partial(instructions_of, groups=groups))
     episodes = [Episode(work.toy(s)) for s in range(streams)]
-    written = np.zeros((streams, steps, len(groups)), np.bool_)
+    written = np.zeros((steps, len(groups)), np.bool_)
     keep = rng.random((steps, len(groups))) < rng.choice([0.0, 0.5, 1.0])
     for _ in range(3):
-        plans = np.stack([random_plan(rng, steps, groups, cells, computed) for cells in written])
-        if shared:
-            plans = np.repeat(plans[:1], streams, axis=0)
+        plan = random_plan(rng, steps, groups, written, computed)
         work.x = rng.standard_normal((streams, 3, 4))
         if rng.random() < 0.5:  # many steps in a row without a computed block
-            plans[:, rng.random(steps) < 0.8] = T
-            plans[:, 0] = C
+            plan[rng.random(steps) < 0.8] = T
+            plan[0] = C
         for log in (work.runs, work.dense, work.idled):
             log.clear()
         decode_first(work, keep)  # type: ignore[arg-type]
-        decode_rest(work, [cache.lower(plan) for plan in plans], keep)  # type: ignore[arg-type]
-        expected = [episode.call(work.x[s], plans[s]) for s, episode in enumerate(episodes)]
+        decode_rest(work, cache.lower(plan), keep)  # type: ignore[arg-type]
+        expected = [episode.call(work.x[s], plan) for s, episode in enumerate(episodes)]
         # Residual and stream are rounded for each block, three values for each step; weights of norm up to four.
         terms = 4**2 * steps * (2 * len(groups) + 3)
         assert_equal_but_for_rounding(work.sample[steps % 2], np.stack(expected), terms)
-        ran = sorted((s, k, b) for k, b, some in work.runs for s in some)
-        assert ran == sorted(map(tuple, np.argwhere(plans == C).tolist()))  # nothing else, and nothing twice
-        assert len(work.runs) == np.count_nonzero((plans == C).any(axis=0))  # together where several compute
-        some = (plans == C).any(axis=(0, 2))
-        assert set(work.dense) == set(np.flatnonzero((plans == C).all(axis=(0, 2))))
-        assert not some[work.idled].any()
-        written |= (plans == C) & keep
+        assert work.runs == list(map(tuple, np.argwhere(plan == C).tolist()))  # nothing else, and nothing twice
+        assert work.dense == np.flatnonzero((plan == C).all(axis=1)).tolist()
+        assert not (plan == C)[work.idled].any()
+        written |= (plan == C) & keep
 
 
 def sums(lowered: Instructions) -> list[list[tuple[str, int]]]:

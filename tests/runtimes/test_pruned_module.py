@@ -24,7 +24,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.ir.program import Program
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.torch.pruned_call import PrunedCall, Rollout
+from ttscompile.runtimes.torch.module import PrunedCall, Rollout
 
 from .agreement import call_terms
 from .pruners import calibrated, random_pruner

@@ -26,7 +26,8 @@ from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir.pieces import FRAMES, INDEX
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.load import open_policy
-from ttscompile.runtimes.onnxruntime.backend import OnnxBackends
+from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
+from ttscompile.runtimes.onnxruntime.sessions import Sessions
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.tokens import TokenTower, sizes_of, token_towers
 
@@ -91,7 +92,7 @@ def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) ->
     reuse = TokenReuse(threshold, refresh)
     view = view_of(artifact, reusing(artifact, reuse))
     with view.artifact.reading():
-        backend = OnnxBackends()(view)
+        backend = OnnxBackend(view, Sessions(1), {})
     (tower,) = token_towers(backend._manifest, reuse, backend._run, backend._renew).values()
     return tower
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Enum, Graph, Ref
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.instructions import instructions_of
-from ttscompile.runtimes.torch.backend import Line, Lines, TorchBackend, TorchBackends
+from ttscompile.runtimes.torch.backend import Line, Lines, TorchBackend
 from ttscompile.runtimes.torch.functions import HALF_LINEAR, write_function
 from ttscompile.runtimes.torch.loop import denoise
 from ttscompile.runtimes.torch.network import Parts, Placed, StreamsNetwork
@@ -110,7 +111,10 @@ def calibrated(make_artifact: MakeArtifact) -> Artifact:
 
 
 def both(artifact: Artifact, lines: list[Line]) -> list[Runtime]:
-    return [Runtime(artifact, TorchBackends(capture=replaying(lines))), open_runtime(artifact, "reference")]
+    return [
+        Runtime(artifact, partial(TorchBackend, placed=Placed(torch.device("cpu")), capture=replaying(lines))),
+        open_runtime(artifact, "reference"),
+    ]
 
 
 @pytest.mark.slow
@@ -370,7 +374,7 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     network.prologue()
     initial = torch.zeros((2, horizon, channels), device=device)
     offset = torch.zeros((5, channels, 2, horizon), device=device).unbind()
-    entry = parts.tensor(manifest.blocks[0].type, 2)
+    entry = parts.zeros(manifest.blocks[0].type.at(2), "float32")
     rollout = dict.fromkeys(np.flatnonzero(lowered.rollout).tolist(), entry)
     read, _ = advance.of_condition(network.condition())
     assert advance.jumps

@@ -14,8 +14,9 @@ from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.torch.backend import TorchBackends, cuda_graphs
+from ttscompile.runtimes.torch.backend import TorchBackend, cuda_graphs
 from ttscompile.runtimes.torch.devices import device_of, exact_arithmetic
+from ttscompile.runtimes.torch.network import Placed
 
 from .agreement import random_inputs
 from .conftest import MakeArtifact
@@ -85,7 +86,7 @@ def test_a_call_on_another_gpu_makes_it_the_current_one(
     toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entered: list[torch.device] = []
-    backend = TorchBackends()(view_of(toy_artifact))
+    backend = TorchBackend(view_of(toy_artifact), Placed(torch.device("cpu")))
     monkeypatch.setattr(torch.cuda, "device", lambda device: entered.append(device) or nullcontext())
     with backend._settings():
         assert entered == []

@@ -5,6 +5,8 @@ A short run is part of every test run; ``pytest tests/runtimes/executor -m soak`
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
@@ -13,7 +15,6 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, ExecutorError, ObservationError, WorkerDeadError
 from ttscompile.runtimes.executor import ExecutorSettings
-from ttscompile.runtimes.executor.statistics import Counts
 
 from .simulation import TA, FakeClock, ScriptedPolicy, World, workers
 
@@ -171,7 +172,7 @@ class Schedule(RuleBasedStateMachine):
         return HEALTHY * round(self.world.hz / HZ)
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> SimpleNamespace:
         """Without the percentiles of ``statistics()``, which would be half of the time that this takes."""
         return self.world.executor._state.recorder.counts
 

@@ -80,7 +80,7 @@ def seen(value: float) -> dict[str, Any]:
 def drained(shadow: Shadow) -> Shadow:
     """Once nothing waits for the compiled policy."""
     limit = time.monotonic() + 20
-    while shadow._due:
+    while shadow._waiting:
         assert time.monotonic() < limit
         time.sleep(1e-3)
     return shadow

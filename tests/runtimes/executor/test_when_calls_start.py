@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count, pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from ttscompile.runtimes.executor import ExecutorSettings, Feasibility
 from ttscompile.runtimes.executor.feasibility import LatencyWindow
 from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.executor.state import ExecutorState, Job
-from ttscompile.runtimes.executor.statistics import Counts
 
 from .simulation import Facts, World
 
@@ -49,7 +49,7 @@ class Loop:
     took: dict[int, float] = field(default_factory=dict)
 
     # C901: its functions are the events
-    def run(self, chunks: int = 12) -> tuple[list[Job], Counts, Feasibility]:  # noqa: C901
+    def run(self, chunks: int = 12) -> tuple[list[Job], SimpleNamespace, Feasibility]:  # noqa: C901
         """Calls, counts, and the arithmetic of the first plan."""
         plans = tuple(self.latency)
         spec, chunk = ObservationSpec((2, 1)), ChunkSpec(1, 1, 1 + self.horizon)
@@ -59,7 +59,7 @@ class Loop:
         windows = {plan: LatencyWindow(given.latency_window) for plan in plans}
         for plan, seconds in self.latency.items():
             windows[plan].add(seconds)
-        state = ExecutorState(given, resolved, None, plans, windows)
+        state = ExecutorState(resolved, None, plans, windows)
         calls: list[Job] = []
         job: Job | None = None
         rng, order = np.random.default_rng(0), count()

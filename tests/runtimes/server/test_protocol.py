@@ -13,19 +13,19 @@ from hypothesis import strategies as st
 from ttscompile import ObservationSpec
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import FrameSpec
-from ttscompile.runtimes.server.protocol import read_frame, read_request
+from ttscompile.runtimes.server.protocol import read_arrays, read_request
 
 
 def test_requests_are_read_and_frames_converted() -> None:
     request = read_request('{"id": 1, "method": "observe", "obs": {"image": [[255, 0]]}, "t": 2}')
     assert (request.id, request.method, request.params["t"]) == (1, "observe", 2)
     frames = FrameSpec.of({"image": ObservationSpec((2, 1, 2), dtype="uint8")}, 2)
-    image = read_frame(request.params["obs"], frames)["image"]
+    image = read_arrays(request.params["obs"], frames.specs)["image"]
     assert (image.dtype, image.tolist()) == (np.uint8, [[255, 0]])
     for wrong in ([[256, 0]], [[-1, 0]], [[1.5, 0]], [["1", 0]], [[10**30, 0]]):
         with pytest.raises(ProtocolError, match="image"):
-            read_frame({"image": wrong}, frames)
-    beyond = read_frame({"obs": [1e300]}, FrameSpec.of({"obs": ObservationSpec((1, 1))}, 1))["obs"]
+            read_arrays({"image": wrong}, frames.specs)
+    beyond = read_arrays({"obs": [1e300]}, {"obs": ObservationSpec((1, 1))})["obs"]
     assert beyond.tolist() == [np.inf]  # without a warning; ``observe`` refuses it
 
 
@@ -33,13 +33,13 @@ def test_a_mask_is_of_true_and_false() -> None:
     """LeRobot's language policies have one; 0 and 1 mean the same, and other numbers nothing."""
     frames = FrameSpec.of({"mask": ObservationSpec((3,), dtype="bool", window=False)}, 1)
     for given_as in ([True, False, True], [1, 0, 1], [1, False, True]):
-        mask = read_frame({"mask": given_as}, frames)["mask"]
+        mask = read_arrays({"mask": given_as}, frames.specs)["mask"]
         assert (mask.dtype, mask.tolist()) == (np.bool_, [True, False, True])
     for wrong in ([2, 0, 1], [-1, 0, 1], [0.5, 0.0, 1.0], ["true", "false", "true"]):
         with pytest.raises(ProtocolError, match="mask"):
-            read_frame({"mask": wrong}, frames)
+            read_arrays({"mask": wrong}, frames.specs)
     with pytest.raises(ProtocolError, match="numbers that are float32"):
-        read_frame({"obs": [True, False]}, FrameSpec.of({"obs": ObservationSpec((2,), window=False)}, 1))
+        read_arrays({"obs": [True, False]}, {"obs": ObservationSpec((2,), window=False)})
 
 
 JSON = st.recursive(
@@ -69,4 +69,4 @@ def test_any_parameters_are_taken_or_a_protocol_error(method: str, params: dict,
     with suppress(ProtocolError):
         request = read_request(message)
         if method == "observe":
-            read_frame(request.params["obs"], FRAMES)
+            read_arrays(request.params["obs"], FRAMES.specs)
