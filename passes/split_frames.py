@@ -216,9 +216,7 @@ def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
 
 def _form(graph: Graph) -> str:
     """Equal for graphs that differ in the names of their values alone; weights have theirs."""
-    names = {name: f"%{i}" for i, name in enumerate((*graph.inputs, *(node.name for node in graph.nodes)))}
-    nodes = [replace(n.renamed(lambda v: names.get(v, v)), name=names[n.name], source="") for n in graph.nodes]
-    return "\n".join([*map(str, graph.inputs.values()), *map(str, nodes), *(names[name] for name in graph.outputs)])
+    return str(graph.renamed({name: f"%{i}" for i, name in enumerate((*graph.inputs, *graph.producers()))}))
 
 
 def _together(group: list[_Tower]) -> tuple[str, ...]:
@@ -242,10 +240,7 @@ def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
 
 def _reading_all(group: list[_Tower]) -> Graph:
     """The tower of a group with its inputs called as the rows that it reads."""
-    tower, names = group[0].graph, dict(zip(group[0].entries, _together(group), strict=True))
-    nodes = tuple(node.renamed(lambda name: names.get(name, name)) for node in tower.nodes)
-    inputs = {names[entry]: tower.inputs[entry] for entry in group[0].entries}
-    return replace(tower, inputs=inputs, nodes=nodes)
+    return group[0].graph.renamed(dict(zip(group[0].entries, _together(group), strict=True)))
 
 
 def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:

@@ -18,6 +18,7 @@ from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..errors import ArtifactError
 from ..ir.pieces import ADVANCE, PRUNER, of_loop
 from ..ir.program import Binding, Program
+from ..ir.verify import verify_pieces
 from ..measure.versions import VERSION
 from . import records, tensors
 from .bind import LoweredPieces, Place, bind, places_of, store_pieces
@@ -95,6 +96,7 @@ def write_artifact(
     Raises:
         ArtifactError: ``directory`` is something else than an artifact, or cannot be written; or program and models do
             not fit each other. Nothing is changed then.
+        PassError: the program's parts do not fit each other (``ir.verify``).
     """
     target = Path(os.path.realpath(directory))
     require_replaceable(target)
@@ -234,17 +236,19 @@ def _fill(
     golden: Golden | None,
     loop: str,
 ) -> Manifest:
+    verify_pieces(program)
     graphs = program.pieces.graphs()
-    values = records.constants(program, graphs)
+    read = sorted({name for graph in graphs.values() for name in graph.constants})
+    values: dict[str, npt.NDArray[Any]] = {name: program.weights[name] for name in read}
     contexts = records.context_records(program)
     requires = records.requirements(models)
     files = {name: f"{_file_name(name, program)}.onnx" for name in models}
 
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
-    read = [name for name, context in contexts.items() if context.binding is Binding.TABLE]
+    own_rows = [name for name, context in contexts.items() if context.binding is Binding.TABLE]
     loops = {ORIGINAL: program.pieces.tables, **program.pieces.loop_tables}
-    tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in read}
+    tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in own_rows}
     tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
     pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()

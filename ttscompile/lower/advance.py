@@ -10,8 +10,6 @@ Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficie
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from ..core.correction import HISTORY as HISTORY_ENTRIES
 from ..core.correction import groups_of
 from ..core.spec import PolicySpec, SamplerTable
@@ -110,11 +108,8 @@ def _moved(piece: LoopPiece, prefix: str, stream: str, taken: set[str]) -> tuple
     """The nodes of a piece under new names, reading ``stream``; and the new name of its result."""
     renamed = {name: name for name in piece.graph.constants} | {piece.stream: stream}
     renamed |= {name: advance_context(prefix, name) for name in piece.contexts}
-    nodes = []
-    for node in piece.graph.nodes:
-        renamed[node.name] = _fresh(f"{prefix}.{node.name}", taken)
-        nodes.append(replace(node.renamed(renamed.__getitem__), name=renamed[node.name]))
-    return nodes, renamed[piece.result]
+    renamed |= {node.name: _fresh(f"{prefix}.{node.name}", taken) for node in piece.graph.nodes}
+    return list(piece.graph.renamed(renamed).nodes), renamed[piece.result]
 
 
 class _Update:

@@ -7,13 +7,15 @@ quarter of the bytes; then it is what ``precision`` makes of a matrix product. `
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from onnx import ModelProto, NodeProto, helper, shape_inference
+from onnx import ModelProto, NodeProto, shape_inference
+
+from .graph_writer import GraphWriter
 
 Array = npt.NDArray[Any]
 
@@ -98,47 +100,29 @@ def convolution_of(
     return Convolution(node.input[0], node.input[1], matrix, bias, pads, places, result)
 
 
-def integer_convolution(
-    node: NodeProto, of: Convolution, integers: str, scales: str, keep: Callable[[str, Array], str]
-) -> list[NodeProto]:
-    """The nodes that take the place of ``node``.
+def integer_convolution(w: GraphWriter, node: NodeProto, of: Convolution, integers: str, scales: str) -> None:
+    """Write the nodes that take the place of ``node``.
 
     Args:
         node: the convolution.
         of: what it convolves.
         integers: name of the constant int8 ``[kernel * C, O]``.
         scales: name of the constant float32 ``[O]``.
-        keep: stores a small constant under a name, and gives the name.
     """
-    axes, own = len(of.sizes), f"{node.name}."
-    kernel = len(of.matrix)
-    u8, scale, zero = (own + name for name in ("u8", "scale", "zero"))
-    last = own + "last"
-    nodes = [
-        helper.make_node("DynamicQuantizeLinear", [of.x], [u8, scale, zero], f"{own}0"),
-        helper.make_node("Transpose", [u8], [last], f"{own}1", perm=[0, *range(2, 2 + axes), 1]),
-    ]
+    axes, kernel, places = len(of.sizes), len(of.matrix), int(np.prod(of.sizes))
+    pixels, scale, zero = w.ops("DynamicQuantizeLinear", [of.x], 3)
+    pixels = w.op("Transpose", pixels, perm=[0, *range(2, 2 + axes), 1])
     if any(of.pads):
-        edges = np.array([0, *of.pads[:axes], 0, 0, *of.pads[axes:], 0])
-        nodes.append(helper.make_node("Pad", [last, keep(own + "edges", edges), zero], [own + "padded"], f"{own}2"))
-        last = own + "padded"
+        pixels = w.op("Pad", pixels, w.constant([0, *of.pads[:axes], 0, 0, *of.pads[axes:], 0]), zero)
     if of.places is not None:
-        channels = kernel // (of.places.size // int(np.prod(of.sizes)))
-        pixels = keep(own + "pixels", np.array([0, -1, channels]))
-        nodes.append(helper.make_node("Reshape", [last, pixels], [own + "all"], f"{own}3"))
-        places = keep(own + "places", of.places)
-        nodes.append(helper.make_node("Gather", [own + "all", places], [own + "seen"], f"{own}4", axis=1))
-        last = own + "seen"
-    rows = keep(own + "rows", np.array([0, int(np.prod(of.sizes)), kernel]))
-    inputs = [own + "each", integers, scale, scales, zero, *(["", of.bias] if of.bias else [])]
-    shape = keep(own + "shape", np.array([0, of.matrix.shape[1], *of.sizes]))
-    return [
-        *nodes,
-        helper.make_node("Reshape", [last, rows], [own + "each"], f"{own}5"),
-        helper.make_node(INTEGER_PRODUCT, inputs, [own + "made"], f"{own}6", domain=DOMAIN),
-        helper.make_node("Transpose", [own + "made"], [own + "turned"], f"{own}7", perm=[0, 2, 1]),
-        helper.make_node("Reshape", [own + "turned", shape], list(node.output), f"{own}8"),
-    ]
+        channels = kernel // (of.places.size // places)
+        pixels = w.op("Reshape", pixels, w.constant([0, -1, channels]))
+        pixels = w.op("Gather", pixels, w.constant(of.places, np.int32), axis=1)
+    rows = w.op("Reshape", pixels, w.constant([0, places, kernel]))
+    bias = ["", of.bias] if of.bias else []
+    made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, *bias, domain=DOMAIN)
+    turned = w.op("Transpose", made, perm=[0, 2, 1])
+    w.ops("Reshape", [turned, w.constant([0, of.matrix.shape[1], *of.sizes])], node.output)
 
 
 def _seen(

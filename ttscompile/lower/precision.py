@@ -22,6 +22,7 @@ from ..core.spec import FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
+from .graph_writer import GraphWriter
 from .integer_attention import HEADS, attention_of, integer_attention
 from .integer_convolution import (
     DOMAIN,
@@ -199,27 +200,21 @@ def quantize_model(
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
     matrices, shapes = _matrices(model, known), shapes_of(model, size)
     constants: dict[str, Array] = {}
-    small: list[TensorProto] = []
-
-    def keep(name: str, value: Array) -> str:
-        small.append(numpy_helper.from_array(value, name))
-        return name
-
-    nodes: list[NodeProto] = []
+    w = GraphWriter()
     for node in model.graph.node:
         product = _product(node, known, matrices)
-        if product is not None and _rows(shapes.get(product.x, ())) < least_rows:
-            nodes.append(node)
-        elif product is not None:
-            nodes.append(_integer_product(node, product, constants))
+        if product is not None and _rows(shapes.get(product.x, ())) >= least_rows:
+            made = _integers(product.matrix.name, product.matrix.value, constants)
+            bias = ["", product.bias] if product.bias else []
+            w.ops(DYNAMIC_PRODUCT, [product.x, *made, *bias], node.output, domain=DOMAIN)
         elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
-            integers, scales = _integers(convolution.weight, convolution.matrix, constants)
-            nodes += integer_convolution(node, convolution, integers, scales, keep)
+            made = _integers(convolution.weight, convolution.matrix, constants)
+            integer_convolution(w, node, convolution, *made)
         elif (attention := attention_of(node, _attributes(node), shapes, size > 1)) is not None:
-            nodes += integer_attention(node, attention, keep)
+            integer_attention(w, node, attention)
         else:
-            nodes.append(node)
-    nodes = live_nodes(nodes, {value.name for value in model.graph.output})
+            w.nodes.append(node)
+    nodes = live_nodes(w.nodes, {value.name for value in model.graph.output})
     quantized = ModelProto()
     quantized.CopyFrom(model)
     if not constants:
@@ -228,7 +223,7 @@ def quantize_model(
     kept = [tensor for tensor in model.graph.initializer if tensor.name in read]
     types = {name: helper.np_dtype_to_tensor_dtype(value.dtype) for name, value in constants.items()}
     added = [TensorProto(name=n, dims=value.shape, data_type=types[n]) for n, value in constants.items()]
-    for field, values in (("node", nodes), ("initializer", [*added, *kept, *small])):
+    for field, values in (("node", nodes), ("initializer", [*added, *kept, *w.initializers])):
         quantized.graph.ClearField(field)
         getattr(quantized.graph, field).extend(values)
     quantized.opset_import.append(helper.make_opsetid(DOMAIN, _DOMAIN_VERSION))
@@ -288,13 +283,6 @@ def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str,
 
 def _rows(shape: Sequence[int]) -> int:
     return math.prod(shape[:-1]) if shape else 0
-
-
-def _integer_product(node: NodeProto, product: _Product, constants: dict[str, Array]) -> NodeProto:
-    """The node that takes the place of ``node``; its constants go into ``constants``."""
-    name, scale = _integers(product.matrix.name, product.matrix.value, constants)
-    inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
-    return NodeProto(name=node.name, op_type=DYNAMIC_PRODUCT, domain=DOMAIN, input=inputs, output=node.output)
 
 
 def _integers(constant: str, matrix: Array, constants: dict[str, Array]) -> tuple[str, str]:

@@ -78,13 +78,8 @@ def structural_key(graph: Graph) -> str:
     names = {name: f"i{i}" for i, name in enumerate(graph.inputs)}
     names |= {name: f"c{i}" for i, name in enumerate(graph.constants)}
     names |= {node.name: f"n{i}" for i, node in enumerate(graph.nodes)}
-    canonical = Graph(
-        inputs={names[n]: t for n, t in graph.inputs.items()},
-        constants={names[n]: t for n, t in graph.constants.items()},
-        nodes=tuple(replace(n.renamed(names.__getitem__), name=names[n.name], source="") for n in graph.nodes),
-        outputs=tuple(names[n] for n in graph.outputs),
-    )
-    return repr(canonical)
+    graph = graph.renamed(names)
+    return repr(replace(graph, nodes=tuple(replace(node, source="") for node in graph.nodes)))
 
 
 def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
