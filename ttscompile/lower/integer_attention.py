@@ -120,7 +120,7 @@ def _head(w: GraphWriter, of: Attention, sizes: Sequence[tuple[int, int]]) -> Gr
         mean = w.op("MatMul", w.constant(np.full((1, of.keys), 1 / of.keys), np.float32), x)
         rest = w.op("Sub", x, mean)
         step = w.op("Mul", w.op("ReduceMax", w.op("Abs", rest), *axes, keepdims=0), number(1 / LARGEST_FACTOR))
-        scale = w.op("Max", step, number(np.finfo(np.float32).tiny))
+        scale = w.op("Max", step, number(float(np.finfo(np.float32).tiny)))
         return w.op("QuantizeLinear", rest, scale, output_dtype=TensorProto.INT8, **attributes), scale, mean
 
     keys, scales, _ = centred(key, last, axis=0)

@@ -29,7 +29,7 @@ from .advance import advances
 from .idle import lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
-from .onnx_model import flatten_attention, name_model, only
+from .onnx_model import name_model, only
 from .translations import TRANSLATIONS
 
 OPSET = 23
@@ -112,7 +112,7 @@ def _export(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
     its size. If that fails they go one by one, so that the message can name the piece.
     """
     try:
-        joint = flatten_attention(_run_exporter(list(graphs.values())))
+        joint = _run_exporter(list(graphs.values()))
     except Exception as error:  # torch.export and the exporter raise whatever their machinery raises
         if len(graphs) > 1:
             return {name: _export({name: graph})[name] for name, graph in graphs.items()}

@@ -108,7 +108,7 @@ class _Chains:
     def numbers(self, samples: Array, outs: Array) -> tuple[Array, Array]:
         """A chain of constants ``[K]``, without its noise: what each step says of x0, and what comes out."""
         each = [torch.from_numpy(values)[:, None, None, None] * self._ones for values in (samples, outs)]
-        _, meant, made = self.run(*each, [0] * self.steps, 0 * self._ones.float())
+        _, meant, made = self.run(each[0], each[1], [0] * self.steps, 0 * self._ones.float())
         # Adding zero turns -0.0 into 0.0, so that a table reads well and its bytes do not depend on a sign of nothing.
         added = 0.0 if self.multistep else self._added
         return meant[:, 0, 0, 0].numpy() + 0.0, made[:, 0, 0, 0].numpy() - added + 0.0
