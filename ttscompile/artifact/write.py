@@ -36,7 +36,7 @@ from .files import (
 )
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
-from .load import Artifact, load_artifact, plan_of, read_manifest, require_artifact_path, table_prefix
+from .load import Artifact, load_artifact, read_manifest, require_artifact_path, table_prefix
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
 from .stores import (
     BlockWeights,
@@ -188,15 +188,17 @@ def update_plans(
                     for name in manifest.weights
                 },
                 manifest=manifest,
-                plans=_named_plans(manifest, plans),
+                plans={
+                    DENSE: artifact.plans[DENSE],
+                    **{name: replace(plans[name], repair=True) for name in manifest.plans},
+                },
                 pruner=pruners.pop(ORIGINAL, artifact.pruner),
                 loop_pruners={**artifact.loop_pruners, **pruners},
             )
             manifest = store_arrays(
                 directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after))
             )
-            content = encode(identified(manifest))
-            manifest = decode(content)  # refuses what nobody could load
+            manifest, content = finished(manifest)
             replace_file(directory / MANIFEST, content)
         except OSError as error:
             raise ArtifactError(
@@ -222,12 +224,6 @@ def _store_named(
     return replace(manifest, starts={n: one for n, one in {**manifest.starts, **starts}.items() if n in loops})
 
 
-def _named_plans(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, Plan]:
-    """The plans of an artifact, as they will be when it is loaded again."""
-    dense = plan_of(PlanRecord("all"), manifest, None, None, None)
-    return {DENSE: dense, **{name: replace(plans[name], repair=True) for name in manifest.plans}}
-
-
 def _fill(
     folder: Path,
     program: Program,
@@ -242,7 +238,9 @@ def _fill(
     values: dict[str, npt.NDArray[Any]] = {name: program.weights[name] for name in read}
     contexts = records.context_records(program)
     requires = records.requirements(models)
-    files = {name: f"{_file_name(name, program)}.onnx" for name in models}
+    # The names of loops need not be names of files.
+    numbered = {of_loop(ADVANCE, of): f"{ADVANCE}_{i:02d}" for i, of in enumerate(program.spec.loops, start=1)}
+    files = {name: f"{numbered.get(name, name)}.onnx" for name in models}
 
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
@@ -278,7 +276,7 @@ def _fill(
     }
     write_synced(folder / PROGRAM, dump_compact(document))
 
-    manifest = identified(
+    manifest, content = finished(
         Manifest(
             schema_version=SCHEMA_VERSION,
             ttscompile_version=VERSION,
@@ -303,8 +301,6 @@ def _fill(
             tokens=records.tokens_records(program),
         )
     )
-    content = encode(manifest)
-    decode(content)  # refuses what nobody could load
     write_synced(folder / MANIFEST, content)
     return manifest
 
@@ -318,10 +314,11 @@ def require_unzipped(path: str | os.PathLike[str]) -> Path:
     return directory
 
 
-def identified(manifest: Manifest) -> Manifest:
-    """The manifest with the identities of what it describes."""
+def finished(manifest: Manifest) -> tuple[Manifest, bytes]:
+    """The manifest with the identities of what it describes, and its bytes; refuses what nobody could load."""
     identity, model_identity = identities(manifest)
-    return replace(manifest, identity=identity, model_identity=model_identity)
+    content = encode(replace(manifest, identity=identity, model_identity=model_identity))
+    return decode(content), content
 
 
 def require_replaceable(directory: str | os.PathLike[str]) -> None:
@@ -363,14 +360,6 @@ def locked(directory: Path) -> Iterator[None]:
         except OSError as error:  # no permission; a file system without locks
             raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error
         yield
-
-
-def _file_name(piece: str, program: Program) -> str:
-    """Of a piece; the names of loops need not be names of files."""
-    for i, loop in enumerate(program.spec.loops, start=1):
-        if piece == of_loop(ADVANCE, loop):
-            return f"{ADVANCE}_{i:02d}"
-    return piece
 
 
 def _remove_stale(directory: Path) -> None:

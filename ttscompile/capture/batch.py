@@ -42,6 +42,8 @@ def _node(left: Node, right: Node) -> Node:
     where = f"%{left.name} ({left.source})"
     if (left.name, left.op) != (right.name, right.op):
         raise CaptureError(f"{where} is {left.op} for a batch of {BATCHES[0]} and {right.op} for another.{REMEDY}")
+    if len(left.types) != len(right.types):
+        raise CaptureError(f"{where} gives {len(left.types)} values or {len(right.types)}, by the batch size.{REMEDY}")
     return Node(
         left.name,
         left.op,
