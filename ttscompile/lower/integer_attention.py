@@ -14,7 +14,6 @@ for constants. ``docs/decisions.md`` has the figures.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,38 +36,24 @@ _PLAIN = {"is_causal": 0, "qk_matmul_output_mode": 0, "softcap": 0.0}
 """Attributes that change what is computed, and their values where they do not."""
 
 
-@dataclass(frozen=True)
-class Attention:
-    """An attention that can be done in integers.
+def integer_attention(
+    w: GraphWriter,
+    node: NodeProto,
+    attributes: Mapping[str, Any],
+    shapes: Mapping[str, Sequence[int]],
+    any_queries: bool = False,
+) -> bool:
+    """Write what a node attends to with integers, if they can do that, and are faster; whether they are.
 
-    Attributes:
-        inputs: names of query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` in float32.
-        flat: they are as above, as is the result; else ``[B, heads, tokens, C]``.
-        queries: T; zero if only a run says it, and then B is one.
-        keys: S.
-        channels: C of query and key, and of value.
-    """
-
-    inputs: tuple[str, str, str]
-    flat: bool
-    heads: int
-    queries: int
-    keys: int
-    channels: tuple[int, int]
-    scale: float
-
-
-def attention_of(
-    node: NodeProto, attributes: Mapping[str, Any], shapes: Mapping[str, Sequence[int]], any_queries: bool = False
-) -> Attention | None:
-    """What a node attends to, if integers can do that, and are faster.
+    Query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` are in float32, or ``[B, heads, tokens, C]``, as is
+    the result.
 
     Args:
         shapes: of values, zero for a size that is not known.
         any_queries: the shapes are of one case of many: a run has one row, and any number of queries.
     """
     if node.op_type != "Attention" or any(node.input[3:]) or len(node.output) != 1:
-        return None
+        return False
     known = {*_PLAIN, "q_num_heads", "kv_num_heads", "scale"}
     plain = all(attributes.get(name, value) == value for name, value in _PLAIN.items()) and known.issuperset(attributes)
     given = [tuple(shapes.get(name, ())) for name in node.input[:3]]
@@ -77,60 +62,54 @@ def attention_of(
         counts = (attributes.get("q_num_heads", 0), *[attributes.get("kv_num_heads", 0)] * 2)
         given = [(b, n, t, c // n) if n else () for n, (b, t, c) in zip(counts, given, strict=True)]
     if not plain or any(len(shape) != 4 or 0 in shape[1:] for shape in given):
-        return None
+        return False
     (batch, heads, queries, channels), (_, others, keys, _), (_, _, _, last) = given
     if others != heads or min(queries, keys) < FEWEST or (any_queries and batch != 1):
-        return None
-    inputs = (node.input[0], node.input[1], node.input[2])
-    scale = attributes.get("scale", channels**-0.5)
-    return Attention(inputs, flat, heads, 0 if any_queries else queries, keys, (channels, last), scale)
-
-
-def integer_attention(w: GraphWriter, node: NodeProto, of: Attention) -> None:
-    """Write the nodes that take the place of ``node``."""
-    sizes = (of.queries, of.channels[0]), (of.keys, of.channels[0]), (of.keys, of.channels[1])
-    batch, queries = (-1, of.queries) if of.queries else (1, -1)
+        return False
+    batch, queries = (1, -1) if any_queries else (-1, queries)
+    sizes = (queries, channels), (keys, channels), (keys, last)
 
     def reshaped(x: str, *shape: int) -> str:
         return w.op("Reshape", x, w.constant(shape))
 
     parts = []
-    for x, (tokens, channels) in zip(of.inputs, sizes, strict=True):
-        if of.flat:
-            x = w.op("Transpose", reshaped(x, batch, tokens or -1, of.heads, channels), perm=[0, 2, 1, 3])
-        parts.append(reshaped(x, -1 if of.queries else of.heads, tokens or -1, channels))
-    result = w.op(HEADS, *parts, body=_head(w.inner(), of, sizes), num_scan_inputs=3)
-    shape = [batch, of.heads, queries, of.channels[1]]
-    if of.flat:
+    for x, (tokens, width) in zip(node.input[:3], sizes, strict=True):
+        if flat:
+            x = w.op("Transpose", reshaped(x, batch, tokens, heads, width), perm=[0, 2, 1, 3])
+        parts.append(reshaped(x, heads if any_queries else -1, tokens, width))
+    head = _head(w.inner(), sizes, attributes.get("scale", channels**-0.5))
+    result, shape = w.op(HEADS, *parts, body=head, num_scan_inputs=3), [batch, heads, queries, last]
+    if flat:
         result = w.op("Transpose", reshaped(result, *shape), perm=[0, 2, 1, 3])
-        shape = [batch, queries, of.heads * of.channels[1]]
+        shape = [batch, queries, heads * last]
     w.ops("Reshape", [result, w.constant(shape)], node.output)
+    return True
 
 
-def _head(w: GraphWriter, of: Attention, sizes: Sequence[tuple[int, int]]) -> GraphProto:
-    """One head, ``[tokens, channels]`` each."""
+def _head(w: GraphWriter, sizes: Sequence[tuple[int, int]], scale: float) -> GraphProto:
+    """One head: query, key and value of these tokens and channels, -1 for tokens that only a run knows."""
     query, key, value = (w.fresh(name) for name in ("query", "key", "value"))
-    last = w.constant([-1])
+    last, tokens = w.constant([-1]), sizes[1][0]
 
     def number(value: float) -> str:
         return w.constant(value, np.float32)
 
     def centred(x: str, *axes: str, **attributes: Any) -> tuple[str, str, str]:
         """``x``, less its mean over tokens, as integers; their scale or, along ``axes``, scales; and the mean."""
-        mean = w.op("MatMul", w.constant(np.full((1, of.keys), 1 / of.keys), np.float32), x)
+        mean = w.op("MatMul", w.constant(np.full((1, tokens), 1 / tokens), np.float32), x)
         rest = w.op("Sub", x, mean)
         step = w.op("Mul", w.op("ReduceMax", w.op("Abs", rest), *axes, keepdims=0), number(1 / LARGEST_FACTOR))
-        scale = w.op("Max", step, number(float(np.finfo(np.float32).tiny)))
-        return w.op("QuantizeLinear", rest, scale, output_dtype=TensorProto.INT8, **attributes), scale, mean
+        own = w.op("Max", step, number(float(np.finfo(np.float32).tiny)))
+        return w.op("QuantizeLinear", rest, own, output_dtype=TensorProto.INT8, **attributes), own, mean
 
     keys, scales, _ = centred(key, last, axis=0)
-    values, scale, mean = centred(value)
-    turned, factor = w.op("Transpose", keys, perm=[1, 0]), w.op("Mul", scales, number(of.scale))
+    values, one, mean = centred(value)
+    turned, factor = w.op("Transpose", keys, perm=[1, 0]), w.op("Mul", scales, number(scale))
     shares = w.op("Softmax", w.op(DYNAMIC_PRODUCT, query, turned, factor, domain=DOMAIN), axis=-1)
     step = w.op("Mul", w.op("ReduceMax", shares, last, keepdims=0), number(1 / 255))
     integers = w.op("QuantizeLinear", shares, step, axis=0, output_dtype=TensorProto.UINT8)
-    made = w.op(INTEGER_PRODUCT, integers, values, number(1), scale, domain=DOMAIN)
+    made = w.op(INTEGER_PRODUCT, integers, values, number(1), one, domain=DOMAIN)
     result = w.op("Add", w.op("Mul", made, w.op("Unsqueeze", step, last)), mean)
-    given = zip((query, key, value), sizes, strict=True)
-    inputs = [tensor(name, np.float32, [tokens or "T", channels]) for name, (tokens, channels) in given]
-    return w.graph("head", [tensor(result, np.float32, [of.queries or "T", of.channels[1]])], inputs)
+    shapes = [[count if count > 0 else "T", width] for count, width in (*sizes, (sizes[0][0], sizes[2][1]))]
+    inputs = [tensor(name, np.float32, shape) for name, shape in zip((query, key, value), shapes, strict=False)]
+    return w.graph("head", [tensor(result, np.float32, shapes[-1])], inputs)

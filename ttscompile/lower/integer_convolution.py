@@ -7,8 +7,7 @@ quarter of the bytes; then it is what ``precision`` makes of a matrix product. `
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,29 +34,6 @@ as fast as in fp32 with onnxruntime 1.31, AVX-512 VNNI, one thread: 0.4 for 3 x 
 3.2 for 512 x 512."""
 
 
-@dataclass(frozen=True, eq=False)
-class Convolution:
-    """A convolution that can be done in integers.
-
-    Attributes:
-        x: name of the float32 input ``[N, C, *sizes]``.
-        weight: name of the constant ``[O, C, *kernel]``.
-        matrix: its value as float32 ``[kernel * C, O]``.
-        bias: name of a constant ``[O]``; empty if there is none.
-        pads: before each axis of ``sizes``, and then after each.
-        places: which pixels each place of the result sees, of the padded ones, int32 ``[places * kernel]``; None where
-            they are all of them in order.
-    """
-
-    x: str
-    weight: str
-    matrix: Array
-    bias: str
-    pads: tuple[int, ...]
-    places: npt.NDArray[np.int32] | None
-    sizes: tuple[int, ...]
-
-
 def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
     """Shapes of values where B is ``size``; zero for a size that is not known."""
     alone = ModelProto()
@@ -75,19 +51,32 @@ def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
     }
 
 
-def convolution_of(
-    node: NodeProto, attributes: Mapping[str, Any], known: Mapping[str, Array], shapes: Mapping[str, Sequence[int]]
-) -> Convolution | None:
-    """What a node convolves, if integers can do that, and are faster; ``known`` has the values of constants by name."""
+def integer_convolution(
+    w: GraphWriter,
+    node: NodeProto,
+    attributes: Mapping[str, Any],
+    known: Mapping[str, Array],
+    shapes: Mapping[str, Sequence[int]],
+    store: Callable[[str, Array], tuple[str, str]],
+) -> bool:
+    """Write what a node convolves with integers, if they can do that, and are faster; whether they are.
+
+    Args:
+        node: reads ``[N, C, *sizes]`` in float32, and a constant ``[O, C, *kernel]``.
+        known: values of constants, by name.
+        shapes: of values, zero for a size that is not known.
+        store: keeps a matrix ``[kernel * C, O]`` that was made of a constant as integers, and gives the names of these
+            and of their scales ``[O]``.
+    """
     weight = known.get(node.input[1]) if node.op_type == "Conv" else None
     bias = node.input[2] if len(node.input) > 2 else ""
     sizes = tuple(shapes.get(node.input[0], ())[2:]) if node.input else ()
     if weight is None or weight.dtype != np.float32 or (bias and bias not in known) or not sizes or 0 in sizes:
-        return None
+        return False
     out, channels, *kernel = weight.shape
     plain = attributes.get("group", 1) == 1 and attributes.get("auto_pad", b"NOTSET") in (b"NOTSET", "NOTSET")
     if not plain or out * channels < LEAST or len(sizes) != len(kernel):
-        return None
+        return False
     axes, ones = len(sizes), [1] * len(sizes)
     pads = tuple(attributes.get("pads", [0] * 2 * axes))
     strides, dilations = attributes.get("strides", ones), attributes.get("dilations", ones)
@@ -95,34 +84,20 @@ def convolution_of(
     spans = zip(padded, kernel, strides, dilations, strict=True)
     result = tuple((size - spread * (taps - 1) - 1) // step + 1 for size, taps, step, spread in spans)
     seen = _seen(padded, kernel, strides, dilations, result)
-    matrix = np.moveaxis(weight, (0, 1), (-1, -2)).reshape(-1, out)
-    places = None if np.array_equal(seen, np.arange(np.prod(padded))) else seen
-    return Convolution(node.input[0], node.input[1], matrix, bias, pads, places, result)
-
-
-def integer_convolution(w: GraphWriter, node: NodeProto, of: Convolution, integers: str, scales: str) -> None:
-    """Write the nodes that take the place of ``node``.
-
-    Args:
-        node: the convolution.
-        of: what it convolves.
-        integers: name of the constant int8 ``[kernel * C, O]``.
-        scales: name of the constant float32 ``[O]``.
-    """
-    axes, kernel, places = len(of.sizes), len(of.matrix), int(np.prod(of.sizes))
-    pixels, scale, zero = w.ops("DynamicQuantizeLinear", [of.x], 3)
+    matrix, places = np.moveaxis(weight, (0, 1), (-1, -2)).reshape(-1, out), int(np.prod(result))
+    integers, scales = store(node.input[1], matrix)
+    pixels, scale, zero = w.ops("DynamicQuantizeLinear", [node.input[0]], 3)
     pixels = w.op("Transpose", pixels, perm=[0, *range(2, 2 + axes), 1])
-    if any(of.pads):
-        pixels = w.op("Pad", pixels, w.constant([0, *of.pads[:axes], 0, 0, *of.pads[axes:], 0]), zero)
-    if of.places is not None:
-        channels = kernel // (of.places.size // places)
+    if any(pads):
+        pixels = w.op("Pad", pixels, w.constant([0, *pads[:axes], 0, 0, *pads[axes:], 0]), zero)
+    if not np.array_equal(seen, np.arange(np.prod(padded))):  # else all of them in order
         pixels = w.op("Reshape", pixels, w.constant([0, -1, channels]))
-        pixels = w.op("Gather", pixels, w.constant(of.places, np.int32), axis=1)
-    rows = w.op("Reshape", pixels, w.constant([0, places, kernel]))
-    bias = ["", of.bias] if of.bias else []
-    made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, *bias, domain=DOMAIN)
+        pixels = w.op("Gather", pixels, w.constant(seen, np.int32), axis=1)
+    rows = w.op("Reshape", pixels, w.constant([0, places, len(matrix)]))
+    made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, *(["", bias] if bias else []), domain=DOMAIN)
     turned = w.op("Transpose", made, perm=[0, 2, 1])
-    w.ops("Reshape", [turned, w.constant([0, of.matrix.shape[1], *of.sizes])], node.output)
+    w.ops("Reshape", [turned, w.constant([0, out, *result])], node.output)
+    return True
 
 
 def _seen(

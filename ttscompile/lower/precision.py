@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,12 +23,11 @@ from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
 from .graph_writer import GraphWriter
-from .integer_attention import HEADS, attention_of, integer_attention
+from .integer_attention import HEADS, integer_attention
 from .integer_convolution import (
     DOMAIN,
     DYNAMIC_PRODUCT,
     INTEGER_PRODUCT,
-    convolution_of,
     integer_convolution,
     shapes_of,
 )
@@ -58,21 +57,8 @@ MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 """Terms of a sum of products that an int32 holds whatever their values."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Matrix:
-    """A constant float32 matrix ``[rows, columns]``, and the constant that it was made of."""
-
-    name: str
-    value: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Product:
-    """``x @ matrix + bias``."""
-
-    x: str  # name of the float32 input
-    matrix: _Matrix
-    bias: str  # name of a constant [columns]; empty if there is none
+Matrices = Mapping[str, tuple[str, Array]]
+"""Constant float32 matrices ``[rows, columns]`` by the names of their values, each with the name of its constant."""
 
 
 def parts_to_lower(
@@ -200,19 +186,14 @@ def quantize_model(
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
     matrices, shapes = _matrices(model, known), shapes_of(model, size)
     constants: dict[str, Array] = {}
-    w = GraphWriter()
+    w, store = GraphWriter(), partial(_integers, constants)
     for node in model.graph.node:
-        product = _product(node, known, matrices)
-        if product is not None and _rows(shapes.get(product.x, ())) >= least_rows:
-            made = _integers(product.matrix.name, product.matrix.value, constants)
-            bias = ["", product.bias] if product.bias else []
-            w.ops(DYNAMIC_PRODUCT, [product.x, *made, *bias], node.output, domain=DOMAIN)
-        elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
-            made = _integers(convolution.weight, convolution.matrix, constants)
-            integer_convolution(w, node, convolution, *made)
-        elif (attention := attention_of(node, _attributes(node), shapes, size > 1)) is not None:
-            integer_attention(w, node, attention)
-        else:
+        attributes = _attributes(node)
+        if not (
+            _integer_product(w, node, known, matrices, shapes, least_rows, store)
+            or integer_convolution(w, node, attributes, known, shapes, store)
+            or integer_attention(w, node, attributes, shapes, size > 1)
+        ):
             w.nodes.append(node)
     nodes = live_nodes(w.nodes, {value.name for value in model.graph.output})
     quantized = ModelProto()
@@ -242,50 +223,53 @@ def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np
     return np.clip(np.rint(matrix / scale), -LARGEST, LARGEST).astype(np.int8), scale
 
 
-def _matrices(model: ModelProto, known: Mapping[str, Array]) -> dict[str, _Matrix]:
+def _matrices(model: ModelProto, known: Mapping[str, Array]) -> Matrices:
     """The constants by the names of their values, and what transpositions and reshapes make of them."""
     shapes = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer if t.raw_data or t.int64_data}
-    found = {name: _Matrix(name, value) for name, value in known.items() if value.dtype == np.float32}
+    found = {name: (name, value) for name, value in known.items() if value.dtype == np.float32}
     for node in model.graph.node:
         before = found.get(node.input[0]) if node.input else None
         if before is None:
             continue
+        constant, value = before
         if node.op_type == "Transpose":
-            value = before.value.transpose(_attributes(node).get("perm"))
+            found[node.output[0]] = constant, value.transpose(_attributes(node).get("perm"))
         elif node.op_type == "Reshape" and node.input[1] in shapes:
-            value = before.value.reshape(shapes[node.input[1]])
-        else:
-            continue
-        found[node.output[0]] = _Matrix(before.name, value)
+            found[node.output[0]] = constant, value.reshape(shapes[node.input[1]])
     return found
 
 
-def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str, _Matrix]) -> _Product | None:
-    """What a node multiplies, if it is a product by a constant matrix that can be done in integers."""
-    attributes = _attributes(node)
+def _integer_product(
+    w: GraphWriter,
+    node: NodeProto,
+    known: Mapping[str, Array],
+    matrices: Matrices,
+    shapes: Mapping[str, Sequence[int]],
+    least_rows: int,
+    store: Callable[[str, Array], tuple[str, str]],
+) -> bool:
+    """Write a product by a constant matrix with integers, if it has as many rows; whether it is one."""
+    attributes, flip, bias = _attributes(node), False, ""
     if node.op_type == "Gemm":
         if attributes.get("transA", 0) or attributes.get("alpha", 1.0) != 1 or attributes.get("beta", 1.0) != 1:
-            return None
+            return False
         flip, bias = bool(attributes.get("transB", 0)), node.input[2] if len(node.input) > 2 else ""
-    elif node.op_type == "MatMul":
-        flip, bias = False, ""
-    else:
-        return None
-    x, matrix = node.input[0], matrices.get(node.input[1])
-    if x in matrices or matrix is None or matrix.value.ndim != 2:
-        return None
-    value = matrix.value.T if flip else matrix.value
-    rows, columns = value.shape
-    if not 0 < rows <= MOST_ROWS or (bias and (bias not in known or known[bias].shape != (columns,))):
-        return None
-    return _Product(x, replace(matrix, value=value), bias)
+    if node.op_type not in ("Gemm", "MatMul") or node.input[0] in matrices or node.input[1] not in matrices:
+        return False
+    x, (constant, value) = node.input[0], matrices[node.input[1]]
+    value = value.T if flip else value
+    if value.ndim != 2 or not 0 < len(value) <= MOST_ROWS:
+        return False
+    if bias and (bias not in known or known[bias].shape != value.shape[1:]):
+        return False
+    shape = shapes.get(x, ())
+    if (math.prod(shape[:-1]) if shape else 0) < least_rows:
+        return False
+    w.ops(DYNAMIC_PRODUCT, [x, *store(constant, value), *(["", bias] if bias else [])], node.output, domain=DOMAIN)
+    return True
 
 
-def _rows(shape: Sequence[int]) -> int:
-    return math.prod(shape[:-1]) if shape else 0
-
-
-def _integers(constant: str, matrix: Array, constants: dict[str, Array]) -> tuple[str, str]:
+def _integers(constants: dict[str, Array], constant: str, matrix: Array) -> tuple[str, str]:
     """Names of the integers and the scales of a matrix, which go into ``constants``.
 
     No two products share them: onnxruntime 1.31 cannot load such a model where it has to make the integers unsigned
