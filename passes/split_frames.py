@@ -78,7 +78,8 @@ class SplitFrames(Pass[Program, Program]):
         for group in groups:
             _require_apart(self, group[0].graph, program.weights)
         frames, condition = _rows_graph(graph, groups), _rest(graph, groups)
-        towers = tuple(_reading_all(group) for group in groups)
+        called = (dict(zip(group[0].entries, _together(group), strict=True)) for group in groups)
+        towers = tuple(group[0].graph.renamed(names) for group, names in zip(groups, called, strict=True))
         pieces = replace(program.pieces, frames=frames, condition=condition, towers=towers)
         return PassResult(replace(program, pieces=pieces), (*map(_note, groups), *declined.values()))
 
@@ -236,11 +237,6 @@ def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
                 type_ = replace(types[entry], shape=(Batch(len(group) * group[0].rows), *row))
                 nodes.append(Node(name, "aten.cat.default", (parts, 0), (), (type_,)))
     return Graph(graph.inputs, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
-
-
-def _reading_all(group: list[_Tower]) -> Graph:
-    """The tower of a group with its inputs called as the rows that it reads."""
-    return group[0].graph.renamed(dict(zip(group[0].entries, _together(group), strict=True)))
 
 
 def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:
