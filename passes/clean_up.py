@@ -12,7 +12,7 @@ from ttscompile.ir.dataflow import reaching
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType
 from ttscompile.ir.operations import Movement, operation
-from ttscompile.ir.program import Phase
+from ttscompile.ir.program import Phase, mapped
 
 from .base import Pass, PassResult
 
@@ -41,7 +41,7 @@ class CleanUp(Pass[AnyPhase, AnyPhase]):
     def call(self, program: AnyPhase) -> PassResult[AnyPhase]:
         """Clean the denoiser, and the pieces if there are any."""
         weights = dict(program.weights)
-        new = program.mapped(lambda graph: clean_graph(graph, weights))
+        new = mapped(program, lambda graph: clean_graph(graph, weights))
         before, after = program.graphs(), new.graphs()
         used = {name for graph in after.values() for name in graph.constants}
         kept = {name: value for name, value in weights.items() if name in used}

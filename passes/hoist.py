@@ -15,7 +15,7 @@ from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
-from ttscompile.ir.program import Binding, Cut, Pieces, Program
+from ttscompile.ir.program import Binding, Cut, Pieces, Program, mapped
 from ttscompile.ir.rows import crossing_inputs, unfold
 
 from .base import Pass, PassResult
@@ -45,7 +45,7 @@ class Hoist(Pass[Cut, Program]):
         inputs = input_bindings(spec)
         prologue, renamed = _name_inputs(program.prologue)
         known = bindings(prologue, inputs)
-        loop = program.loop.mapped(lambda graph: _sink(_rename_contexts(graph, renamed), prologue, known))
+        loop = mapped(program.loop, lambda graph: _sink(graph.renamed(renamed), prologue, known))
         at = {b: [n for n in loop.contexts if known[n] is b] for b in Binding}
         step, boundary, prologue = _step_graph(prologue, at[Binding.STEP], known)
         types, known = prologue.types(), bindings(prologue, inputs)
@@ -104,14 +104,6 @@ def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
     nodes = [node.renamed(lambda name: renamed.get(name, name)) for node in prologue.nodes]
     outputs = tuple(renamed.get(name, name) for name in prologue.outputs)
     return replace(prologue, nodes=(*copies, *nodes), outputs=outputs), renamed
-
-
-def _rename_contexts(piece: Graph, renamed: Mapping[str, str]) -> Graph:
-    def rename(name: str) -> str:
-        return renamed.get(name, name)
-
-    inputs = {rename(name): type_ for name, type_ in piece.inputs.items()}
-    return replace(piece, inputs=inputs, nodes=tuple(node.renamed(rename) for node in piece.nodes))
 
 
 def _step_graph(

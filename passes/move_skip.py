@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ttscompile.core.spec import PolicySpec
 from ttscompile.ir.graph import Graph, Ref
 from ttscompile.ir.program import Captured
 
@@ -41,13 +40,10 @@ class MoveSkip(Pass[Captured, Captured]):
             raise self.fail("the prediction is not the sample plus something of its type.")
         nodes = tuple(node for node in graph.nodes if node.name not in graph.outputs)
         moved = replace(graph, nodes=nodes, outputs=(inside,))
+        loops = {name: table.with_skip() for name, table in spec.loops.items()}
+        added = replace(spec, sampler=spec.sampler.with_skip(), loops=loops)
         note = f"the sampler's table adds %{spec.sample_argument} to the prediction, which is %{inside} now"
-        return PassResult(replace(program, denoiser=moved, spec=_with_skips(spec), unmoved=spec), (note,))
-
-
-def _with_skips(spec: PolicySpec) -> PolicySpec:
-    loops = {name: table.with_skip() for name, table in spec.loops.items()}
-    return replace(spec, sampler=spec.sampler.with_skip(), loops=loops)
+        return PassResult(replace(program, denoiser=moved, spec=added, unmoved=spec), (note,))
 
 
 def _network(graph: Graph, sample: str) -> str | None:

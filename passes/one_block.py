@@ -47,13 +47,10 @@ class OneBlock(Pass[Captured, Captured]):
             f"{sample}.{name}" for name in ("stream", "taken", "residual", "updated", "prediction")
         )
 
-        def own(node: Node) -> Node:
-            return node.renamed(lambda name: taken if name == sample else name)
-
         nodes = (
             Node(stream, _PAD, (Ref(sample), (0, width), 0.0), (), (wide,)),
             Node(taken, "aten.slice.Tensor", (Ref(stream), last, 0, width), (), (type_,)),
-            *map(own, graph.nodes),
+            *graph.renamed({sample: taken}).nodes,
             Node(residual, _PAD, (Ref(made if made != sample else taken), (width, 0), 0.0), (), (wide,)),
             Node(updated, "aten.add.Tensor", (Ref(stream), Ref(residual)), (), (wide,)),
             Node(prediction, "aten.slice.Tensor", (Ref(updated), last, width, 2 * width), (), (type_,)),

@@ -78,7 +78,8 @@ class SplitFrames(Pass[Program, Program]):
         for group in groups:
             _require_apart(self, group[0].graph, program.weights)
         frames, condition = _rows_graph(graph, groups), _rest(graph, groups)
-        towers = tuple(_reading_all(group) for group in groups)
+        called = (dict(zip(group[0].entries, _together(group), strict=True)) for group in groups)
+        towers = tuple(group[0].graph.renamed(names) for group, names in zip(groups, called, strict=True))
         pieces = replace(program.pieces, frames=frames, condition=condition, towers=towers)
         return PassResult(replace(program, pieces=pieces), (*map(_note, groups), *declined.values()))
 
@@ -216,9 +217,7 @@ def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
 
 def _form(graph: Graph) -> str:
     """Equal for graphs that differ in the names of their values alone; weights have theirs."""
-    names = {name: f"%{i}" for i, name in enumerate((*graph.inputs, *(node.name for node in graph.nodes)))}
-    nodes = [replace(n.renamed(lambda v: names.get(v, v)), name=names[n.name], source="") for n in graph.nodes]
-    return "\n".join([*map(str, graph.inputs.values()), *map(str, nodes), *(names[name] for name in graph.outputs)])
+    return str(graph.renamed({name: f"%{i}" for i, name in enumerate((*graph.inputs, *graph.producers()))}))
 
 
 def _together(group: list[_Tower]) -> tuple[str, ...]:
@@ -238,14 +237,6 @@ def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
                 type_ = replace(types[entry], shape=(Batch(len(group) * group[0].rows), *row))
                 nodes.append(Node(name, "aten.cat.default", (parts, 0), (), (type_,)))
     return Graph(graph.inputs, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
-
-
-def _reading_all(group: list[_Tower]) -> Graph:
-    """The tower of a group with its inputs called as the rows that it reads."""
-    tower, names = group[0].graph, dict(zip(group[0].entries, _together(group), strict=True))
-    nodes = tuple(node.renamed(lambda name: names.get(name, name)) for node in tower.nodes)
-    inputs = {names[entry]: tower.inputs[entry] for entry in group[0].entries}
-    return replace(tower, inputs=inputs, nodes=nodes)
 
 
 def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:

@@ -16,9 +16,9 @@ from tests.artifact.updates import PLAN, update
 from tests.hostile.forged import forge, rehash
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.artifact import load_artifact
-from ttscompile.artifact.codec import decode, encode, identities
+from ttscompile.artifact.codec import identities
 from ttscompile.artifact.stores import BlockWeights
-from ttscompile.artifact.write import identified, update_plans
+from ttscompile.artifact.write import finished, update_plans
 from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError
 from ttscompile.runtimes.random_calls import random_calls
@@ -87,7 +87,7 @@ def test_every_file_but_the_record_of_the_original_is_covered(trained: Path, one
 def test_what_is_covered_field_by_field(trained: Path) -> None:
     """All that an action depends on; and what people are told is not."""
     manifest = load_artifact(trained).manifest
-    assert identities(decode(encode(identified(manifest)))) == (manifest.identity, manifest.model_identity)
+    assert identities(finished(manifest)[0]) == (manifest.identity, manifest.model_identity)
     plan = manifest.plans["mine"]
     acting = {
         "weights": replace(manifest, plans={"mine": replace(plan, weights="original")}),

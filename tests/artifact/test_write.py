@@ -15,11 +15,11 @@ from tests.artifact.tiny import STEPS, tiny_models, tiny_program, write_tiny
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import condition_flops
-from ttscompile.errors import ArtifactError
+from ttscompile.errors import ArtifactError, PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node
 from ttscompile.ir.pieces import LoopPiece
-from ttscompile.ir.program import Binding, Program
+from ttscompile.ir.program import Binding, Program, mapped
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -49,7 +49,7 @@ def test_round_trip(written: Path) -> None:
     for name, value in stored.items():
         assert value.tobytes() == program.weights[name].tobytes()
     assert all(name.startswith("pruner.") for name in artifact.pruner)
-    found, expected = artifact.pieces, pieces.mapped(without_sources)
+    found, expected = artifact.pieces, mapped(pieces, without_sources)
     for name, graph in expected.graphs().items():
         assert artifact.graph(name) == graph
     for name in ("condition", "step", "stem", "tail", "pruner"):
@@ -305,22 +305,22 @@ def broken(program: Program, **pieces: Any) -> Program:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda p: replace(p, weights={}), "its value is none"),
+        (lambda p: replace(p, weights={}), "constant %.* has no value"),
         (
             lambda p: replace(p, weights={**p.weights, "tail.weight": np.zeros((2, 16))}),
-            r"its value is float64\[2, 16\]",
+            r"constant %tail.weight is float64\[2, 16\]",
         ),
-        (lambda p: replace(p, blocks=p.blocks[:1]), "1 blocks and 2 block graphs"),
-        (lambda p: broken(p, bindings={}), "'memory' .* has no binding"),
-        (lambda p: broken(p, bindings={**p.pieces.bindings, "memory": Binding.STEP}), "binding step, and nothing"),
-        (lambda p: broken(p, bindings={**p.pieces.bindings, "memory": Binding.LOOP}), "binding loop, and nothing"),
-        (lambda p: broken(p, tables={**p.pieces.tables, "time": np.zeros((2, 1, 1, 16), np.float32)}), "'time'"),
-        (lambda p: broken(p, step=None), "'modulation' .* binding step"),
+        (lambda p: replace(p, blocks=p.blocks[:1]), "2 block graphs for 1 rows"),
+        (lambda p: broken(p, bindings={}), "nothing provides its context %position"),
+        (lambda p: broken(p, bindings={**p.pieces.bindings, "memory": Binding.STEP}), "provides its context %memory"),
+        (lambda p: broken(p, bindings={**p.pieces.bindings, "memory": Binding.LOOP}), "provides its context %memory"),
+        (lambda p: broken(p, tables={**p.pieces.tables, "time": np.zeros((2, 1, 1, 16), np.float32)}), "%time"),
+        (lambda p: broken(p, step=None), "nothing provides its context %modulation"),
     ],
 )
 def test_programs_that_do_not_fit(tmp_path: Path, edit: Any, message: str) -> None:
     models = tiny_models(tiny_program())
-    with pytest.raises(ArtifactError, match=message):
+    with pytest.raises(PassError, match=message):
         write_artifact(edit(tiny_program()), models, tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
 

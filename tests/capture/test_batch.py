@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -32,6 +34,10 @@ def test_what_depends_on_the_batch_otherwise_is_refused() -> None:
         unify_batch(graph(5, 6), graph(7, 8))
     with pytest.raises(CaptureError, match="has the argument True or False"):
         unify_batch(graph(5, True), graph(7, False))
+    left, right = (graph(size) for size in (5, 7))
+    several = tuple(replace(node, types=node.types * 2) for node in right.nodes)
+    with pytest.raises(CaptureError, match="%y .* gives 1 values or 2, by the batch size"):
+        unify_batch(left, replace(right, nodes=several))
 
 
 class Branches(nn.Module):

@@ -18,7 +18,7 @@ from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.samplers.multistep import set_timesteps
+from ttscompile.samplers.table import set_timesteps
 
 Build = Callable[..., dict[str, Any]]
 Save = Callable[[dict[str, Any]], Path]

@@ -29,8 +29,7 @@ from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import TOLERANCE, MaskedUpdates, known_samples, noise_levels, prefix_refusal
 from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.samplers.flow import flow_matching_table
-from ttscompile.samplers.multistep import set_timesteps
-from ttscompile.samplers.table import sampler_table
+from ttscompile.samplers.table import sampler_table, set_timesteps
 
 from .agreement import call_terms, random_inputs
 from .conftest import MakeArtifact

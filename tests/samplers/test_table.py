@@ -17,8 +17,7 @@ from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepSchedu
 from tests.rounding import amplified, assert_equal_but_for_rounding, bound
 from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import SpecError
-from ttscompile.samplers.multistep import set_timesteps
-from ttscompile.samplers.table import sampler_table
+from ttscompile.samplers.table import sampler_table, set_timesteps
 
 BETAS: dict[str, Any] = {"num_train_timesteps": 50, "beta_schedule": "squaredcos_cap_v2"}
 

@@ -19,7 +19,7 @@ from ttscompile.artifact.files import describe
 from ttscompile.artifact.golden import GoldenPlan, load_golden, load_golden_plans
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import MANIFEST
-from ttscompile.artifact.write import identified
+from ttscompile.artifact.write import finished
 from ttscompile.core.lattice import Source
 from ttscompile.lower.precision import quantize_matrix
 from ttscompile.runtimes import open_runtime
@@ -86,7 +86,7 @@ def changed(directory: Path, change: Callable[[dict[str, Any]], None]) -> Rung:
     change(arrays)
     path.write_bytes(tensors.serialize(arrays))
     manifest = replace(manifest, files={**manifest.files, path.name: describe(path)})
-    (directory / MANIFEST).write_bytes(codec.encode(identified(manifest)))
+    (directory / MANIFEST).write_bytes(finished(manifest)[1])
     artifact = load_artifact(directory)
     rung = check_precision(artifact, load_golden(artifact), open_runtime(artifact))
     assert rung is not None

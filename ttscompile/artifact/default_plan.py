@@ -9,11 +9,10 @@ from typing import Any
 
 from ..errors import ArtifactError
 from . import records
-from .codec import decode, encode
 from .files import replace_file
 from .load import Artifact, read_manifest
 from .manifest import MANIFEST, Manifest
-from .write import identified, locked, require_unzipped
+from .write import finished, locked, require_unzipped
 
 
 def choose_default(
@@ -42,10 +41,9 @@ def choose_default(
         own = manifest.plans[name]
         plans = {**manifest.plans, name: own if precision is None else replace(own, precision=precision)}
         told = records.calibration_record(record)
-        content = encode(identified(replace(manifest, plans=plans, default_plan=name, calibration=told)))
-        decode(content)
+        manifest, content = finished(replace(manifest, plans=plans, default_plan=name, calibration=told))
         try:
             replace_file(directory / MANIFEST, content)
         except OSError as error:
             raise ArtifactError(f"{directory}: cannot be updated: {error}. It is as it was.") from error
-    return decode(content)
+    return manifest

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.correction import Correction
 from ..core.envelope import Envelope
-from ..core.lattice import PlanArray, check_schedule, dense_plan
+from ..core.lattice import check_schedule, dense_plan
 from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
 from ..core.spec import BF16, FP16, FP32, INT8
@@ -42,7 +41,7 @@ from .codec import MAX_MANIFEST_BYTES, decode, identities
 from .corrections import ENVELOPE, PREFIX, read_corrections, read_envelope
 from .files import Folder, Stamp, check_file, read_file
 from .graph_json import graph_from_json
-from .manifest import MANIFEST, Manifest, PlanRecord, abbreviated
+from .manifest import MANIFEST, Manifest, abbreviated
 from .onnx_files import check_models
 from .requires import check_runtime, check_size
 from .strict_json import REMEDY, Value, parse
@@ -324,7 +323,7 @@ def _tables(
 
 
 def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
-    stored = _optional(directory, manifest.stores.plans)
+    stored, blocks = _optional(directory, manifest.stores.plans), len(manifest.blocks)
     where = directory / (manifest.stores.plans or MANIFEST)
     schedules = {name: array for name, array in stored.items() if not name.startswith((PREFIX, ENVELOPE))}
     expected = sorted(name for name, plan in manifest.plans.items() if plan.kind == "schedule")
@@ -332,34 +331,22 @@ def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
         raise ArtifactError(f"{where}: expected schedules {expected}; found {sorted(schedules)}. {REMEDY}")
     for name, cells in schedules.items():
         try:
-            check_schedule(name, cells, manifest.steps_of(manifest.plans[name].loop), len(manifest.blocks))
+            check_schedule(name, cells, manifest.steps_of(manifest.plans[name].loop), blocks)
         except IllegalPlanError as error:
             raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
     corrections = read_corrections(stored, manifest, str(where))
-    plans = {DENSE: Plan(cells=dense_plan(manifest.steps, len(manifest.blocks)), repair=True)}
+    plans = {DENSE: Plan(cells=dense_plan(manifest.steps, blocks), repair=True)}
     # A plan may name another one that does not begin with a chunk: those come first.
     for name, record in sorted(manifest.plans.items(), key=lambda item: item[1].otherwise is not None):
-        otherwise = None if record.otherwise is None else plans[record.otherwise]
-        plans[name] = plan_of(record, manifest, schedules.get(name), corrections.get(name), otherwise)
+        computed = record.kind == "all"
+        plans[name] = Plan(
+            loop=record.loop,
+            cells=dense_plan(manifest.steps_of(record.loop), blocks) if computed else schedules.get(name),
+            correction=corrections.get(name),
+            weights=record.weights,
+            precision=record.precision,
+            tokens=record.tokens,
+            otherwise=None if record.otherwise is None else plans[record.otherwise],
+            repair=True,
+        )
     return MappingProxyType({name: plans[name] for name in (DENSE, *manifest.plans)})
-
-
-def plan_of(
-    record: PlanRecord,
-    manifest: Manifest,
-    schedule: PlanArray | None,
-    correction: Correction | None,
-    otherwise: Plan | None,
-) -> Plan:
-    """The plan of a record, with its cells."""
-    cells = dense_plan(manifest.steps_of(record.loop), len(manifest.blocks)) if record.kind == "all" else schedule
-    return Plan(
-        loop=record.loop,
-        cells=cells,
-        correction=correction,
-        weights=record.weights,
-        precision=record.precision,
-        tokens=record.tokens,
-        otherwise=otherwise,
-        repair=True,
-    )

@@ -1,4 +1,4 @@
-"""From a compiled program, its ONNX models and its plans to the records of the manifest; checks that they fit."""
+"""From a sound program, its ONNX models and its plans to the records of the manifest; checks that they fit it."""
 
 from __future__ import annotations
 
@@ -8,21 +8,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core.correction import condition_flops, numbers_of
 from ..core.lattice import check_schedule, plan_flops, sparsity
-from ..core.plan import DENSE, ORIGINAL, Plan, Variant
+from ..core.plan import DENSE, Plan, Variant
 from ..core.spec import SamplerTable
 from ..core.update import update_flops
 from ..errors import ArtifactError
 from ..ir import pieces as names
 from ..ir.flops import frames_flops, graph_flops
-from ..ir.graph import Graph
 from ..ir.joint import join
 from ..ir.layers import layers_graph
-from ..ir.program import Binding, Program
-from . import tensors
+from ..ir.program import Program
 from .bind import REPORT, interface
 from .codec import check_record, plan_fault
 from .manifest import PLAN_NAME, BlockRecord, ContextRecord, FlopsRecord, Manifest, PieceRecord, PlanRecord, Requires
@@ -40,35 +37,11 @@ MAX_OPSET, MAX_IR = 23, 11
 PRUNER_PREFIX = "pruner."
 
 
-def constants(program: Program, graphs: Mapping[str, Graph]) -> dict[str, npt.NDArray[Any]]:
-    """Values of the constants of these graphs, by name.
-
-    Raises:
-        ArtifactError: a constant without a value, or with a value of another type.
-    """
-    found: dict[str, npt.NDArray[Any]] = {}
-    for piece, graph in graphs.items():
-        for name, kind in graph.constants.items():
-            value = program.weights.get(name)
-            if value is None or value.shape != kind.at(1) or str(value.dtype) != kind.dtype:
-                shown = "none" if value is None else f"{value.dtype}{list(value.shape)}"
-                raise ArtifactError(f"{piece}: constant {name!r} is {kind}; its value is {shown}. {REPORT}")
-            found[name] = value
-    return dict(sorted(found.items()))
-
-
 def block_records(program: Program) -> tuple[BlockRecord, ...]:
-    """The block table; FLOPs are those of the pieces, which is what is left after hoisting.
-
-    Raises:
-        ArtifactError: table and pieces differ in number.
-    """
-    graphs = [piece.graph for piece in program.pieces.blocks]
-    if len(graphs) != len(program.blocks):
-        raise ArtifactError(f"the program has {len(program.blocks)} blocks and {len(graphs)} block graphs. {REPORT}")
+    """The block table; FLOPs are those of the pieces, which is what is left after hoisting."""
     return tuple(
-        BlockRecord(kind=b.kind, type=b.type, group=b.group, flops=graph_flops(graph), reason=b.reason)
-        for b, graph in zip(program.blocks, graphs, strict=True)
+        BlockRecord(kind=b.kind, type=b.type, group=b.group, flops=graph_flops(piece.graph), reason=b.reason)
+        for b, piece in zip(program.blocks, program.pieces.blocks, strict=True)
     )
 
 
@@ -105,37 +78,12 @@ def tokens_records(program: Program) -> dict[str, TokensRecord]:
 
 
 def context_records(program: Program) -> dict[str, ContextRecord]:
-    """Binding and type of every context, in order of first use.
-
-    Raises:
-        ArtifactError: a context without binding, value or table, or of two types.
-    """
-    pieces = program.pieces
-    readers = {name: piece.contexts for name, piece in pieces.loop.items()}
-    computed = {Binding.TABLE: set(pieces.tables), Binding.CONDITION: set(pieces.condition.outputs)}
-    if pieces.step is not None:
-        readers = {names.STEP: dict(pieces.step.inputs), **readers}
-        computed[Binding.STEP] = set(pieces.step.outputs)
-    if pieces.pruner is not None:  # it reads the features, and so may corrections
-        readers[names.PRUNER] = dict(pieces.pruner.inputs)
-    records: dict[str, ContextRecord] = {}
-    for piece, contexts in readers.items():
-        for name, kind in contexts.items():
-            binding, known = pieces.bindings.get(name), records.get(name)
-            if known is not None and known.type != kind:
-                raise ArtifactError(f"{piece}: context {name!r} is {kind} here and {known.type} elsewhere. {REPORT}")
-            if binding is None or name not in computed.get(binding, ()):
-                shown = "no binding" if binding is None else f"the binding {binding.value}"
-                raise ArtifactError(
-                    f"{piece}: context {name!r} : {kind} has {shown}, and nothing computes it. {REPORT}"
-                )
-            if binding is Binding.TABLE:
-                for loop, sampler in {ORIGINAL: program.spec.sampler, **program.spec.loops}.items():
-                    rows = (pieces.tables if loop == ORIGINAL else pieces.loop_tables[loop])[name]
-                    wanted = {name: (kind.dtype, (sampler.steps, *kind.at(1)))}
-                    tensors.check_arrays("table", {name: rows}, wanted, piece, REPORT)
-            records[name] = ContextRecord(binding=binding, type=kind)
-    return records
+    """Binding and type of every context, in order of first use; the pruner reads features, and so may corrections."""
+    pieces, readers = program.pieces, [piece.contexts for piece in program.pieces.loop.values()]
+    readers[:0] = [] if pieces.step is None else [dict(pieces.step.inputs)]
+    readers += [] if pieces.pruner is None else [dict(pieces.pruner.inputs)]
+    types = {name: kind for contexts in readers for name, kind in contexts.items()}
+    return {name: ContextRecord(binding=pieces.bindings[name], type=kind) for name, kind in types.items()}
 
 
 def piece_records(

@@ -18,6 +18,7 @@ from ..core.plan import DENSE, FULL, ORIGINAL, Plan
 from ..errors import ArtifactError
 from ..ir.pieces import ADVANCE, PRUNER, of_loop
 from ..ir.program import Binding, Program
+from ..ir.verify import verify_pieces
 from ..measure.versions import VERSION
 from . import records, tensors
 from .bind import LoweredPieces, Place, bind, places_of, store_pieces
@@ -35,7 +36,7 @@ from .files import (
 )
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
-from .load import Artifact, load_artifact, plan_of, read_manifest, require_artifact_path, table_prefix
+from .load import Artifact, load_artifact, read_manifest, require_artifact_path, table_prefix
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
 from .stores import (
     BlockWeights,
@@ -95,6 +96,7 @@ def write_artifact(
     Raises:
         ArtifactError: ``directory`` is something else than an artifact, or cannot be written; or program and models do
             not fit each other. Nothing is changed then.
+        PassError: the program's parts do not fit each other (``ir.verify``).
     """
     target = Path(os.path.realpath(directory))
     require_replaceable(target)
@@ -186,15 +188,17 @@ def update_plans(
                     for name in manifest.weights
                 },
                 manifest=manifest,
-                plans=_named_plans(manifest, plans),
+                plans={
+                    DENSE: artifact.plans[DENSE],
+                    **{name: replace(plans[name], repair=True) for name in manifest.plans},
+                },
                 pruner=pruners.pop(ORIGINAL, artifact.pruner),
                 loop_pruners={**artifact.loop_pruners, **pruners},
             )
             manifest = store_arrays(
                 directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after))
             )
-            content = encode(identified(manifest))
-            manifest = decode(content)  # refuses what nobody could load
+            manifest, content = finished(manifest)
             replace_file(directory / MANIFEST, content)
         except OSError as error:
             raise ArtifactError(
@@ -220,12 +224,6 @@ def _store_named(
     return replace(manifest, starts={n: one for n, one in {**manifest.starts, **starts}.items() if n in loops})
 
 
-def _named_plans(manifest: Manifest, plans: Mapping[str, Plan]) -> dict[str, Plan]:
-    """The plans of an artifact, as they will be when it is loaded again."""
-    dense = plan_of(PlanRecord("all"), manifest, None, None, None)
-    return {DENSE: dense, **{name: replace(plans[name], repair=True) for name in manifest.plans}}
-
-
 def _fill(
     folder: Path,
     program: Program,
@@ -234,17 +232,21 @@ def _fill(
     golden: Golden | None,
     loop: str,
 ) -> Manifest:
+    verify_pieces(program)
     graphs = program.pieces.graphs()
-    values = records.constants(program, graphs)
+    read = sorted({name for graph in graphs.values() for name in graph.constants})
+    values: dict[str, npt.NDArray[Any]] = {name: program.weights[name] for name in read}
     contexts = records.context_records(program)
     requires = records.requirements(models)
-    files = {name: f"{_file_name(name, program)}.onnx" for name in models}
+    # The names of loops need not be names of files.
+    numbered = {of_loop(ADVANCE, of): f"{ADVANCE}_{i:02d}" for i, of in enumerate(program.spec.loops, start=1)}
+    files = {name: f"{numbered.get(name, name)}.onnx" for name in models}
 
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
-    read = [name for name, context in contexts.items() if context.binding is Binding.TABLE]
+    own_rows = [name for name, context in contexts.items() if context.binding is Binding.TABLE]
     loops = {ORIGINAL: program.pieces.tables, **program.pieces.loop_tables}
-    tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in read}
+    tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in own_rows}
     tensors.write(folder / WEIGHTS, {**stored, **tables})
     places = places_of(folder / WEIGHTS, stored)
     pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()
@@ -274,7 +276,7 @@ def _fill(
     }
     write_synced(folder / PROGRAM, dump_compact(document))
 
-    manifest = identified(
+    manifest, content = finished(
         Manifest(
             schema_version=SCHEMA_VERSION,
             ttscompile_version=VERSION,
@@ -299,8 +301,6 @@ def _fill(
             tokens=records.tokens_records(program),
         )
     )
-    content = encode(manifest)
-    decode(content)  # refuses what nobody could load
     write_synced(folder / MANIFEST, content)
     return manifest
 
@@ -314,10 +314,11 @@ def require_unzipped(path: str | os.PathLike[str]) -> Path:
     return directory
 
 
-def identified(manifest: Manifest) -> Manifest:
-    """The manifest with the identities of what it describes."""
+def finished(manifest: Manifest) -> tuple[Manifest, bytes]:
+    """The manifest with the identities of what it describes, and its bytes; refuses what nobody could load."""
     identity, model_identity = identities(manifest)
-    return replace(manifest, identity=identity, model_identity=model_identity)
+    content = encode(replace(manifest, identity=identity, model_identity=model_identity))
+    return decode(content), content
 
 
 def require_replaceable(directory: str | os.PathLike[str]) -> None:
@@ -359,14 +360,6 @@ def locked(directory: Path) -> Iterator[None]:
         except OSError as error:  # no permission; a file system without locks
             raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error
         yield
-
-
-def _file_name(piece: str, program: Program) -> str:
-    """Of a piece; the names of loops need not be names of files."""
-    for i, loop in enumerate(program.spec.loops, start=1):
-        if piece == of_loop(ADVANCE, loop):
-            return f"{ADVANCE}_{i:02d}"
-    return piece
 
 
 def _remove_stale(directory: Path) -> None:

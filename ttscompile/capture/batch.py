@@ -1,8 +1,9 @@
 """The batch as a symbol, found by comparing two graphs of one module that were captured with different batch sizes.
 
-torch.export reasons about a symbolic batch and gives up where it cannot prove something that is true:
-``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove. A size that is ``5 * c`` in
-one graph and ``7 * c`` in the other is ``c * B``; one that is equal in both is a number; anything else is refused.
+torch.export can reason about a symbolic batch, and gives up where it cannot prove something that is true:
+``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove, and both captures together
+take no longer. A size that is ``5 * c`` in one graph and ``7 * c`` in the other is ``c * B``; one that is equal in both
+is a number; anything else is refused.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ def _node(left: Node, right: Node) -> Node:
     where = f"%{left.name} ({left.source})"
     if (left.name, left.op) != (right.name, right.op):
         raise CaptureError(f"{where} is {left.op} for a batch of {BATCHES[0]} and {right.op} for another.{REMEDY}")
+    if len(left.types) != len(right.types):
+        raise CaptureError(f"{where} gives {len(left.types)} values or {len(right.types)}, by the batch size.{REMEDY}")
     return Node(
         left.name,
         left.op,

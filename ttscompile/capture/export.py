@@ -1,8 +1,10 @@
-"""Capture one evaluation of a denoiser as a graph: ``torch.export``, ATen level, weights lifted, batch symbolic."""
+"""Capture one evaluation of a denoiser as a graph: ``torch.export``, ATen level, weights lifted, batch symbolic.
+
+It is captured with two batch sizes, and ``batch`` finds the batch among the numbers.
+"""
 
 from __future__ import annotations
 
-import inspect
 import logging
 import operator
 import re
@@ -24,11 +26,8 @@ from ..core.spec import PolicySpec
 from ..errors import CaptureError
 from ..frontends.copies import sharing_copy
 from ..ir.evaluate import evaluator, without_stack_traces
-from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, Size, TensorType
+from ..ir.graph import GETITEM, Argument, Enum, Graph, Node, Ref, TensorType
 from .batch import BATCHES, REMEDY, unify_batch
-
-EXAMPLE_STREAMS = 3
-"""Batch size of the example inputs; neither 0 nor 1, which torch.export would specialise on."""
 
 _TORCH = PurePath(torch.__file__).parent
 _ADVICE = re.compile(r"\s*\n(?:Caused by: \(|For more information, run with|The error above occurred when calling)")
@@ -58,20 +57,14 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
             or what the module computes for a stream depends on the others, or on how many there are.
     """
     module = sharing_copy(module)
-    try:
-        graph, weights = _Converter(*_traced(module, spec, EXAMPLE_STREAMS, symbolic=True)).convert(spec)
-    except CaptureError as error:
-        # torch.export cannot prove everything that is true of a symbolic batch; with numbers there is nothing to prove.
-        try:
-            (left, weights), (right, others) = (
-                _Converter(*_traced(module, spec, streams, symbolic=False)).convert(spec) for streams in BATCHES
-            )
-        except CaptureError:
-            raise error from error.__cause__
-        graph = unify_batch(left, right)
-        differ = [name for name, value in weights.items() if not np.array_equal(value, others[name], equal_nan=True)]
-        if differ:
-            raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}") from None
+    (left, weights), (right, others) = (_Converter(*_traced(module, spec, n)).convert() for n in BATCHES)
+    graph = unify_batch(left, right)
+    found, expected = graph.types()[graph.outputs[0]], graph.inputs[spec.sample_argument]
+    if found != expected:
+        raise CaptureError(f"the module returns {found}; expected the type of its sample, {expected}.")
+    differ = [name for name, value in weights.items() if not np.array_equal(value, others[name], equal_nan=True)]
+    if differ:
+        raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}")
     _require_streams_alike(module, spec, graph, weights)
     return graph, weights
 
@@ -107,7 +100,7 @@ def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
 
 
 def _traced(
-    module: nn.Module, spec: PolicySpec, streams: int, symbolic: bool
+    module: nn.Module, spec: PolicySpec, streams: int
 ) -> tuple[torch.export.ExportedProgram, dict[str, torch.Tensor]]:
     examples = _examples(spec, streams)
     given = _as_arguments(examples, spec)
@@ -119,7 +112,7 @@ def _traced(
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
             # and about recurrent layers, which list their weights anew when they are copied
             warnings.filterwarnings("ignore", message=".*_flat_weights.*", category=UserWarning)
-            exported = _export(module, given, symbolic)
+            exported = torch.export.export(module, (), kwargs=given, strict=False)
             with without_stack_traces():  # each operation keeps the one that it was captured with
                 return exported.run_decompositions(dict(AS_CAT)), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
@@ -160,28 +153,6 @@ def _masks_as_given() -> Iterator[None]:
         layers._detect_is_causal_mask = detect
 
 
-class _ByPosition(nn.Module):
-    """A module that takes ``**observations``, with its inputs by position: torch.export gives keywords no shapes."""
-
-    def __init__(self, module: nn.Module, names: list[str]) -> None:
-        super().__init__()
-        self.module, self.names = module, names
-
-    def forward(self, *inputs: torch.Tensor) -> Any:
-        """Inputs in the order of ``names``."""
-        return self.module(**dict(zip(self.names, inputs, strict=True)))
-
-
-def _export(module: nn.Module, examples: Mapping[str, torch.Tensor], symbolic: bool) -> torch.export.ExportedProgram:
-    """The module's graph; the first axis of every input varies if it is symbolic."""
-    axes = {0: torch.export.Dim("B")} if symbolic else {}
-    each: Any = dict.fromkeys(examples, axes)
-    if any(p.kind is p.VAR_KEYWORD for p in inspect.signature(module.forward).parameters.values()):
-        inputs, shapes = tuple(examples.values()), (tuple(each.values()),)
-        return torch.export.export(_ByPosition(module, list(examples)), inputs, dynamic_shapes=shapes, strict=False)
-    return torch.export.export(module, (), kwargs=dict(examples), dynamic_shapes=each, strict=False)
-
-
 def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[str, torch.Tensor]:
     return {spec.arguments.get(name, name): value for name, value in inputs.items()}
 
@@ -198,17 +169,15 @@ def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
 
 
 class _Converter:
-    """From an exported program to ``Graph``; every symbolic size becomes a multiple of the batch size."""
+    """From an exported program to ``Graph``, all of whose sizes are numbers."""
 
     def __init__(self, exported: torch.export.ExportedProgram, examples: Mapping[str, torch.Tensor]) -> None:
         self.exported = exported
         self.examples = examples
-        self.symbolic = len(next(iter(examples.values()))) == EXAMPLE_STREAMS
         self.names: dict[torch.fx.Node, str] = {}
         self.taken: set[str] = set()
-        self.symbol: Any = None
 
-    def convert(self, spec: PolicySpec) -> tuple[Graph, Weights]:
+    def convert(self) -> tuple[Graph, Weights]:
         signature = self.exported.graph_signature
         kinds = {s.arg.name: s for s in signature.input_specs}
         inputs: dict[str, TensorType] = {}
@@ -218,12 +187,6 @@ class _Converter:
         state = {**self.exported.state_dict, **self.exported.constants}
         placeholders = [n for n in self.exported.graph.nodes if n.op == "placeholder"]
         users = [n for n in placeholders if kinds[n.name].kind is InputKind.USER_INPUT]
-        if self.symbolic:
-            size = users[0].meta["val"].shape[0]
-            if isinstance(size, int):
-                what = f"the module works for a batch of {size} only: its code fixes the size"
-                raise CaptureError(f"{what}. Take sizes from the inputs.")
-            self.symbol = size.node.expr
         for fx_node, key in zip(users, self.examples, strict=True):
             self.names[fx_node] = key
             inputs[key] = self._type(fx_node, fx_node.meta["val"])
@@ -242,19 +205,13 @@ class _Converter:
         for fx_node in self.exported.graph.nodes:
             if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:
                 nodes.append(node)
-        return Graph(inputs, constants, tuple(nodes), (self._output(spec, inputs),)), weights
+        return Graph(inputs, constants, tuple(nodes), (self._output(),)), weights
 
-    def _size(self, fx_node: torch.fx.Node, size: Any) -> Size:
+    def _size(self, fx_node: torch.fx.Node, size: Any) -> int:
         if isinstance(size, int):
             return size
-        expression = size.node.expr
-        if expression.is_Integer:
-            return int(expression)
-        multiple = expression / (self.symbol or 1)  # a number of streams has none; then this size depends on values
-        if not multiple.is_Integer:
-            what = f"size {expression} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
-            raise CaptureError(f"{what} Only the batch may vary; write the other sizes as numbers.")
-        return Batch(int(multiple))
+        what = f"size {size} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
+        raise CaptureError(f"{what} Only the batch may vary; write the other sizes as numbers.")
 
     def _type(self, fx_node: torch.fx.Node, value: Any) -> TensorType:
         return TensorType(tuple(self._size(fx_node, n) for n in value.shape), str(value.dtype).removeprefix("torch."))
@@ -315,7 +272,7 @@ class _Converter:
             return Enum("device", "cpu")  # the artifact runs where it is loaded
         raise CaptureError(f"%{fx_node.name} ({_source(fx_node)}) has an argument of type {type(argument).__name__}.")
 
-    def _output(self, spec: PolicySpec, inputs: Mapping[str, TensorType]) -> str:
+    def _output(self) -> str:
         outputs = self.exported.graph_signature.output_specs
         if mutated := [o.target for o in outputs if o.kind is not OutputKind.USER_OUTPUT]:
             what = f"the module changes its own buffers or inputs {mutated} when called; a denoiser must be pure"
@@ -325,9 +282,6 @@ class _Converter:
         if len(results) != 1 or not isinstance(results[0], torch.fx.Node):
             raise CaptureError(f"the module returns {len(results)} values; expected one tensor, the prediction.")
         result: torch.fx.Node = results[0]
-        found, expected = self._type(result, result.meta["val"]), inputs[spec.sample_argument]
-        if found != expected:
-            raise CaptureError(f"the module returns {found}; expected the type of its sample, {expected}.")
         return self.names[result]
 
 

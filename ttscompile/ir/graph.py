@@ -161,6 +161,16 @@ class Graph:
                 users[name].append(node)
         return users
 
+    def renamed(self, names: Mapping[str, str]) -> Graph:
+        """The same function with these values, by their names, called otherwise, wherever they are."""
+
+        def called(name: str) -> str:
+            return names.get(name, name)
+
+        inputs, constants = ({called(n): t for n, t in types.items()} for types in (self.inputs, self.constants))
+        nodes = tuple(replace(node.renamed(called), name=called(node.name)) for node in self.nodes)
+        return Graph(inputs, constants, nodes, tuple(map(called, self.outputs)))
+
     def __str__(self) -> str:
         lines = ["inputs    " + ", ".join(f"%{n} : {t}" for n, t in self.inputs.items())]
         lines += ["constants " + ", ".join(f"%{n} : {t}" for n, t in self.constants.items())]

@@ -15,7 +15,7 @@ Steps that compute all blocks have a graph of their own, in which nothing is bet
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from .graph import TensorType
@@ -56,10 +56,11 @@ def join(contexts: Iterable[Sequence[TensorType]]) -> Joint:
         for type_ in types:
             own.append((type_, sum(seen == type_ for seen, _ in own)))
         places.append(tuple(slots.setdefault(key, f"context.{len(slots)}") for key in own))
+    turns, depth = list(_turns(0, len(places))), max(len(places) - 1, 0).bit_length()
     return Joint(
         slots=tuple((name, type_) for (type_, _), name in slots.items()),
         places=tuple(places),
-        turns=_turns(len(places)),
+        turns=tuple((*own, *[False] * (depth - len(own))) for own in turns),
     )
 
 
@@ -68,14 +69,11 @@ def halves(first: int, stop: int) -> int:
     return (first + stop) // 2
 
 
-def _turns(count: int) -> tuple[tuple[bool, ...], ...]:
-    depth = max(count - 1, 0).bit_length()
-    found = []
-    for b in range(count):
-        first, stop, turns = 0, count, list[bool]()
-        while stop - first > 1:
-            middle = halves(first, stop)
-            turns.append(b < middle)
-            first, stop = (first, middle) if b < middle else (middle, stop)
-        found.append((*turns, *[False] * (depth - len(turns))))
-    return tuple(found)
+def _turns(first: int, stop: int) -> Iterator[tuple[bool, ...]]:
+    """The way to each of these blocks."""
+    if stop - first == 1:
+        yield ()
+    elif stop > first:
+        middle = halves(first, stop)
+        yield from ((True, *rest) for rest in _turns(first, middle))
+        yield from ((False, *rest) for rest in _turns(middle, stop))

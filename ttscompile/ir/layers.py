@@ -40,12 +40,7 @@ def layers_graph(program: Program) -> Graph | None:
     names = {result: layer for layer, result in layers(program).items()}
     if not names:
         return None
-    graph = program.pieces.blocks[0].graph
-    nodes = tuple(
-        replace(node.renamed(lambda name: names.get(name, name)), name=names.get(node.name, node.name))
-        for node in graph.nodes
-    )
-    return replace(graph, nodes=nodes, outputs=tuple(names.values()))
+    return replace(program.pieces.blocks[0].graph.renamed(names), outputs=tuple(names.values()))
 
 
 def _weights(graph: Graph, producers: dict[str, Node], node: Node) -> str | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -77,14 +77,6 @@ class Loop:
         """Every graph by name."""
         return {name: piece.graph for name, piece in self.loop.items()}
 
-    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
-        """With another graph in place of every one; inputs that carry the stream keep their names."""
-
-        def inside(piece: LoopPiece) -> LoopPiece:
-            return replace(piece, graph=function(piece.graph))
-
-        return replace(self, stem=inside(self.stem), blocks=tuple(map(inside, self.blocks)), tail=inside(self.tail))
-
 
 @dataclass(frozen=True)
 class Pieces(Loop):
@@ -139,23 +131,29 @@ class Pieces(Loop):
         towers = {frame_name(i): tower for i, tower in enumerate(self.towers)}
         return {**rows, **towers, CONDITION: self.condition}
 
-    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
-        """With another graph in place of every one; inputs that carry the stream keep their names."""
-        return replace(
-            super().mapped(function),
-            condition=function(self.condition),
-            step=None if self.step is None else function(self.step),
-            pruner=None if self.pruner is None else function(self.pruner),
-            frames=None if self.frames is None else function(self.frames),
-            towers=tuple(map(function, self.towers)),
-            tokens={name: function(graph) for name, graph in self.tokens.items()},
-            loop_pruners={name: function(graph) for name, graph in self.loop_pruners.items()},
-        )
-
     def in_loop(self, name: str) -> Self:
         """Those of one loop alone, as of the original."""
         tables, pruner = self.loop_tables.get(name, self.tables), self.loop_pruners.get(name, self.pruner)
         return replace(self, tables=tables, pruner=pruner, loop_tables={}, loop_pruners={})
+
+
+def mapped(record: Value, function: Callable[[Graph], Graph]) -> Value:
+    """A record of this module with another graph in place of each that it holds, of the same inputs and outputs."""
+    return cast(Value, _mapped(record, function))
+
+
+def _mapped(value: Any, function: Callable[[Graph], Graph]) -> Any:
+    match value:
+        case Graph():
+            return function(value)
+        case LoopPiece() | Loop() | Phase():
+            own = {each.name: getattr(value, each.name) for each in fields(value)}
+            return replace(value, **{name: _mapped(one, function) for name, one in own.items()})
+        case tuple():
+            return tuple(_mapped(one, function) for one in value)
+        case Mapping():
+            return {name: _mapped(one, function) for name, one in value.items()}
+    return value
 
 
 def frame_values(
@@ -196,10 +194,6 @@ class Phase:
         """Every graph by name."""
         return {DENOISER: self.denoiser}
 
-    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
-        """With another graph in place of every one, of the same names of inputs and outputs."""
-        return replace(self, denoiser=function(self.denoiser))
-
     @property
     def carried(self) -> dict[str, Any]:
         """Its fields, by name, for the phase that follows."""
@@ -232,10 +226,6 @@ class Cut(Phase):
         """Every graph by name."""
         return {**super().graphs(), PROLOGUE: self.prologue, **self.loop.graphs()}
 
-    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
-        """With another graph in place of every one, of the same names of inputs and outputs."""
-        return replace(super().mapped(function), prologue=function(self.prologue), loop=self.loop.mapped(function))
-
 
 @dataclass(frozen=True)
 class Program(Phase):
@@ -252,10 +242,6 @@ class Program(Phase):
     def graphs(self) -> dict[str, Graph]:
         """Every graph by name."""
         return {**super().graphs(), **self.pieces.graphs()}
-
-    def mapped(self, function: Callable[[Graph], Graph]) -> Self:
-        """With another graph in place of every one, of the same names of inputs and outputs."""
-        return replace(super().mapped(function), pieces=self.pieces.mapped(function))
 
     def in_loop(self, name: str) -> Program:
         """The program of one loop alone, as if it were the original. Raises SpecError: there is no such loop."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Mapping
 
 import numpy as np
 
+from ..core.spec import PolicySpec
 from ..errors import PassError
-from .graph import Graph, Node, TensorType
+from .graph import Batch, Graph, Node, TensorType
 from .pieces import PRUNER, STEM, STEP, TAIL, of_loop
-from .program import Binding, Block, Cut, Loop, Phase, Pieces, Program
+from .program import DENOISER, Binding, Block, Cut, Loop, Phase, Pieces, Program
 
 
 def verify_graph(graph: Graph, what: str) -> None:
@@ -38,18 +39,30 @@ def verify(program: Phase) -> None:
     expected = [spec.sample_argument, spec.timestep_argument, *spec.observations]
     if list(denoiser.inputs) != expected:
         raise PassError(f"denoiser: inputs {list(denoiser.inputs)}; expected {expected}.")
-    for what, graph in program.graphs().items():
+    match program:
+        case Program():
+            _verify_graphs({DENOISER: denoiser}, program)
+            verify_pieces(program)
+        case Cut(blocks=blocks, loop=loop):
+            _verify_graphs(program.graphs(), program)
+            _verify_loop(loop, blocks, spec)
+            _verify_contexts(_readers(loop), program.prologue.outputs)
+        case _:
+            _verify_graphs(program.graphs(), program)
+
+
+def verify_pieces(program: Program) -> None:
+    """Check what is left of a program once it is compiled: its pieces, and what they are given."""
+    _verify_graphs(program.pieces.graphs(), program)
+    _verify_loop(program.pieces, program.blocks, program.spec)
+    _verify_frames(program.pieces)
+    _verify_loops(program, _verify_bindings(program.pieces))
+
+
+def _verify_graphs(graphs: Mapping[str, Graph], program: Phase) -> None:
+    for what, graph in graphs.items():
         verify_graph(graph, what)
         _verify_constants(graph, what, program)
-    match program:
-        case Cut(blocks=blocks, loop=loop):
-            _verify_loop(loop, blocks, denoiser.inputs[spec.sample_argument])
-            _verify_contexts(_contexts(loop), program.prologue.outputs)
-        case Program(blocks=blocks, pieces=pieces):
-            _verify_loop(pieces, blocks, denoiser.inputs[spec.sample_argument])
-            _verify_bindings(pieces)
-            _verify_frames(pieces)
-            _verify_loops(program)
 
 
 def _verify_constants(graph: Graph, what: str, program: Phase) -> None:
@@ -62,13 +75,13 @@ def _verify_constants(graph: Graph, what: str, program: Phase) -> None:
             raise PassError(f"{what}: constant %{name} is {found}; its type says {type_}.")
 
 
-def _verify_loop(loop: Loop, blocks: tuple[Block, ...], sample: TensorType) -> None:
+def _verify_loop(loop: Loop, blocks: tuple[Block, ...], spec: PolicySpec) -> None:
     for i, block in enumerate(blocks):
         if block.index != i:
             raise PassError(f"block table: entry {i} calls itself block {block.index}.")
     if len(loop.blocks) != len(blocks):
         raise PassError(f"{len(loop.blocks)} block graphs for {len(blocks)} rows of the block table.")
-    stream = blocks[0].type
+    stream, sample = blocks[0].type, TensorType((Batch(), *spec.sample), "float32")
     for what, piece in loop.loop.items():
         flows_in, flows_out = sample if what == STEM else stream, sample if what == TAIL else stream
         if piece.graph.inputs.get(piece.stream) != flows_in:
@@ -79,41 +92,47 @@ def _verify_loop(loop: Loop, blocks: tuple[Block, ...], sample: TensorType) -> N
             raise PassError(f"{what}: gives {list(map(str, given))}; expected one {flows_out}.")
 
 
-def _contexts(loop: Loop) -> dict[str, Iterable[str]]:
+def _readers(loop: Loop) -> dict[str, Mapping[str, TensorType]]:
     return {what: piece.contexts for what, piece in loop.loop.items()}
 
 
-def _verify_contexts(readers: Mapping[str, Iterable[str]], given: Container[str]) -> None:
+def _verify_contexts(readers: Mapping[str, Mapping[str, TensorType]], given: Container[str]) -> dict[str, TensorType]:
+    """Type of every context."""
+    types = dict[str, TensorType]()
     for what, contexts in readers.items():
-        for name in contexts:
+        for name, type_ in contexts.items():
             if name not in given:
                 raise PassError(f"{what}: nothing provides its context %{name} when it is read.")
+            if types.setdefault(name, type_) != type_:
+                raise PassError(f"{what}: its context %{name} is {type_}; to another piece it is {types[name]}.")
+    return types
 
 
-def _verify_bindings(pieces: Pieces) -> None:
+def _verify_bindings(pieces: Pieces) -> dict[str, TensorType]:
+    """Type of every table."""
     step = () if pieces.step is None else pieces.step.outputs
     provided = {Binding.CONDITION: pieces.condition.outputs, Binding.TABLE: pieces.tables, Binding.STEP: step}
     given = {name for name, binding in pieces.bindings.items() if name in provided.get(binding, ())}
-    readers = _contexts(pieces) if pieces.step is None else {STEP: pieces.step.inputs, **_contexts(pieces)}
-    _verify_contexts(readers, given)
+    types = _verify_contexts(_readers(pieces) | ({} if pieces.step is None else {STEP: pieces.step.inputs}), given)
     for name in pieces.features:
         if name not in pieces.condition.outputs:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")
     if pieces.pruner is not None and tuple(pieces.pruner.inputs) != pieces.features:
         raise PassError(f"pruner: reads {list(pieces.pruner.inputs)}; its features are {list(pieces.features)}.")
+    return {name: type_ for name, type_ in types.items() if pieces.bindings[name] is Binding.TABLE}
 
 
-def _verify_loops(program: Program) -> None:
-    """Every further loop has the tables that the original has, and a pruner of as many steps."""
+def _verify_loops(program: Program, tables: Mapping[str, TensorType]) -> None:
+    """Every loop has rows of the tables for all of its steps, and a pruner of as many steps."""
     spec, pieces = program.spec, program.pieces
     if pieces.loop_tables.keys() != spec.loops.keys():
         raise PassError(f"tables of the loops {list(pieces.loop_tables)}; the policy has {list(spec.loops)}.")
-    for loop, sampler in spec.loops.items():
+    for loop, sampler in spec.all_loops.items():
         own = program.in_loop(loop)
-        for name, table in pieces.tables.items():
+        for name, type_ in tables.items():
             found = own.pieces.tables.get(name, np.zeros(0))
-            if (found.dtype, found.shape) != (table.dtype, (sampler.steps, *table.shape[1:])):
-                raise PassError(f"loop {loop}: the table of %{name} is {found.dtype}{list(found.shape)}.")
+            if (str(found.dtype), found.shape) != (type_.dtype, (sampler.steps, *type_.at(1))):
+                raise PassError(f"loop {loop}: the table of %{name} : {type_} is {found.dtype}{list(found.shape)}.")
         if (pruner := own.pieces.pruner) is not None:
             what = of_loop(PRUNER, loop)
             verify_graph(pruner, what)

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from ..core.correction import HISTORY as HISTORY_ENTRIES
 from ..core.correction import groups_of
-from ..core.spec import PolicySpec, SamplerTable
+from ..core.spec import PolicySpec
 from ..core.update import clips, columns, rows
 from ..errors import LoweringError
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
@@ -82,7 +82,7 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
     nodes, prediction = _moved(tail, TAIL, STREAM, taken)
     turned = inputs[SAMPLE]
     nodes.append(Node(PREDICTION, "aten.permute.default", (Ref(prediction), (2, 0, 1)), (), (turned,)))
-    nodes += _Update(taken, turned).nodes_for(spec)
+    nodes += _update(taken, turned, spec)
     following = _fresh("stem.sample", taken)
     nodes.append(Node(following, "aten.permute.default", (Ref(SAMPLE_NEXT), (1, 2, 0)), (), (stem.type,)))
     more, stream = _moved(stem, STEM, following, taken)
@@ -110,57 +110,42 @@ def _moved(piece: LoopPiece, prefix: str, stream: str, taken: set[str]) -> tuple
     """The nodes of a piece under new names, reading ``stream``; and the new name of its result."""
     renamed = {name: name for name in piece.graph.constants} | {piece.stream: stream}
     renamed |= {name: advance_context(prefix, name) for name in piece.contexts}
-    nodes = []
-    for node in piece.graph.nodes:
-        renamed[node.name] = _fresh(f"{prefix}.{node.name}", taken)
-        nodes.append(replace(node.renamed(renamed.__getitem__), name=renamed[node.name]))
-    return nodes, renamed[piece.result]
+    renamed |= {node.name: _fresh(f"{prefix}.{node.name}", taken) for node in piece.graph.nodes}
+    return list(piece.graph.renamed(renamed).nodes), renamed[piece.result]
 
 
-class _Update:
-    def __init__(self, taken: set[str], type_: TensorType) -> None:
-        self.taken = taken
-        self.type = type_
-        self.nodes: list[Node] = []
+def _update(taken: set[str], turned: TensorType, spec: PolicySpec) -> list[Node]:
+    """``sample_next`` and ``memory_next`` of the inputs and the prediction, which is of the type ``turned``."""
+    horizon, sampler = spec.sample[0], spec.sampler
+    nodes: list[Node] = []
 
-    def nodes_for(self, spec: PolicySpec) -> list[Node]:
-        """``sample_next`` and ``memory_next`` of the inputs and the prediction."""
-        (horizon, dimensions), sampler = spec.sample, spec.sampler
-        parts = [SAMPLE, PREDICTION, HISTORY]
-        if clips(sampler):
-            parts.append(self.denoised(sampler))
-        if sampler.memories:
-            parts.append(MEMORY)
+    def of_size(size: int) -> tuple[TensorType]:
+        return (replace(turned, shape=(*turned.shape[:2], size)),)
 
-        def of_size(size: int) -> TensorType:
-            return TensorType((dimensions, self.type.shape[1], size), "float32")
+    def write(name: str, op: str, args: tuple[Argument, ...], size: int = horizon) -> str:
+        nodes.append(Node(_fresh(name, taken), op, args, (), of_size(size)))
+        return nodes[-1].name
 
-        type_ = of_size(rows(sampler, horizon))
-        features = self.write("update.features", "aten.cat.default", (tuple(map(Ref, parts)), 2), type_)
-        stop = columns(sampler, horizon)
-        product = self.write("update.product", "aten.matmul.default", (Ref(features), Ref(UPDATE)), of_size(stop))
-        if sampler.memories:
-            arguments = (Ref(product), 2, horizon, stop)
-            self.nodes.append(Node(MEMORY_NEXT, "aten.slice.Tensor", arguments, (), (of_size(stop - horizon),)))
-            product = self.write("update.sample", "aten.slice.Tensor", (Ref(product), 2, 0, horizon))
-        self.nodes.append(Node(SAMPLE_NEXT, "aten.add.Tensor", (Ref(product), Ref(OFFSET)), (), (self.type,)))
-        return self.nodes
-
-    def denoised(self, sampler: SamplerTable) -> str:
-        """What the prediction says of the sample without noise, clipped."""
+    parts = [SAMPLE, PREDICTION, HISTORY]
+    if clips(sampler):  # what the prediction says of the sample without noise
         assert sampler.clip is not None
         terms = [
-            self.write("update.term", "aten.mul.Tensor", (Ref(value), Ref(column)))
+            write("update.term", "aten.mul.Tensor", (Ref(value), Ref(column)))
             for column, value in zip(X0_COLUMNS, (SAMPLE, PREDICTION), strict=True)
             if getattr(sampler, column).any()
         ]
-        total = terms[0] if len(terms) == 1 else self.write("update.sum", "aten.add.Tensor", tuple(map(Ref, terms)))
-        return self.write("update.denoised", "aten.clamp.default", (Ref(total), -sampler.clip, sampler.clip))
-
-    def write(self, name: str, op: str, args: tuple[Argument, ...], type_: TensorType | None = None) -> str:
-        name = _fresh(name, self.taken)
-        self.nodes.append(Node(name, op, args, (), (type_ or self.type,)))
-        return name
+        total = terms[0] if len(terms) == 1 else write("update.sum", "aten.add.Tensor", tuple(map(Ref, terms)))
+        parts.append(write("update.denoised", "aten.clamp.default", (Ref(total), -sampler.clip, sampler.clip)))
+    if sampler.memories:
+        parts.append(MEMORY)
+    read, made = rows(sampler, horizon), columns(sampler, horizon)
+    features = write("update.features", "aten.cat.default", (tuple(map(Ref, parts)), 2), read)
+    product = write("update.product", "aten.matmul.default", (Ref(features), Ref(UPDATE)), made)
+    if sampler.memories:
+        cut = (Ref(product), 2, horizon, made)
+        nodes.append(Node(MEMORY_NEXT, "aten.slice.Tensor", cut, (), of_size(made - horizon)))
+        product = write("update.sample", "aten.slice.Tensor", (Ref(product), 2, 0, horizon))
+    return [*nodes, Node(SAMPLE_NEXT, "aten.add.Tensor", (Ref(product), Ref(OFFSET)), (), (turned,))]
 
 
 def _fresh(name: str, taken: set[str]) -> str:

@@ -17,15 +17,19 @@ Weights = Mapping[str, npt.NDArray[Any]]
 
 
 class GraphWriter:
-    """Nodes and constants of one graph; ``inner`` opens a graph for the body of an If or a Loop.
+    """Nodes and constants of one graph; ``inner`` opens a graph for the body of an If, a Loop or a Scan.
 
     Names are unique over all graphs of a model, since a body sees the values of the graphs around it.
+
+    Attributes:
+        nodes: what was written.
+        initializers: its constants.
     """
 
     def __init__(self, names: Iterator[int] | None = None) -> None:
         self._names = count() if names is None else names
-        self._nodes: list[NodeProto] = []
-        self._initializers: list[TensorProto] = []
+        self.nodes: list[NodeProto] = []
+        self.initializers: list[TensorProto] = []
         self._constants: dict[tuple[str, tuple[int, ...], bytes], str] = {}
 
     def inner(self) -> GraphWriter:
@@ -42,28 +46,27 @@ class GraphWriter:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = name = self.fresh("constant")
-            self._initializers.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
+            self.initializers.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
         return self._constants[key]
 
     def default(self, name: str, value: Array, shape: Sequence[int | str] | None = None) -> ValueInfoProto:
         """An input of the model, and what it is if it is not given; of the value's shape if no other is said."""
-        self._initializers.append(numpy_helper.from_array(value, name))
+        self.initializers.append(numpy_helper.from_array(value, name))
         return tensor(name, value.dtype, value.shape if shape is None else shape)
 
     def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """A node of one output; its name."""
         return self.ops(kind, inputs, 1, **attributes)[0]
 
-    def ops(self, kind: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> list[str]:
-        """A node; the names of its outputs."""
-        made = [self.fresh(kind) for _ in range(outputs)]
-        self._nodes.append(helper.make_node(kind, list(inputs), made, name=self.fresh("node"), **attributes))
+    def ops(self, kind: str, inputs: Sequence[str], outputs: int | Sequence[str], **attributes: Any) -> list[str]:
+        """A node; the names of its outputs, which may be given."""
+        made = [self.fresh(kind) for _ in range(outputs)] if isinstance(outputs, int) else list(outputs)
+        self.nodes.append(helper.make_node(kind, list(inputs), made, name=self.fresh("node"), **attributes))
         return made
 
     def rename(self, value: str, name: str) -> str:
         """The value under a name of our choice, for an output of the model."""
-        self._nodes.append(helper.make_node("Identity", [value], [name], name=self.fresh("node")))
-        return name
+        return self.ops("Identity", [value], [name])[0]
 
     def choose(self, condition: str, then: GraphProto, otherwise: GraphProto) -> list[str]:
         """An If; the names of its outputs."""
@@ -87,7 +90,7 @@ class GraphWriter:
             copy.name = self.fresh("node")
             copy.input[:] = [names[value] if value else "" for value in node.input]
             copy.output[:] = [names[value] for value in node.output]
-            self._nodes.append(copy)
+            self.nodes.append(copy)
         return [names[value.name] for value in graph.output]
 
     def _weight(self, tensor: TensorProto, weights: Weights) -> str:
@@ -99,7 +102,7 @@ class GraphWriter:
             what = f"the model's initializer {tensor.name!r} {list(shape)} has no value among the program's weights"
             raise LoweringError(f"{what}. This is an error in ttscompile; please report it.")
         name = self.fresh(tensor.name)
-        self._initializers.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
+        self.initializers.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
         return name
 
     def body(self, name: str, *results: str) -> GraphProto:
@@ -108,7 +111,7 @@ class GraphWriter:
 
     def graph(self, name: str, outputs: Sequence[ValueInfoProto], inputs: Sequence[ValueInfoProto] = ()) -> GraphProto:
         """What was written, as a graph."""
-        return helper.make_graph(self._nodes, name, list(inputs), list(outputs), self._initializers)
+        return helper.make_graph(self.nodes, name, list(inputs), list(outputs), self.initializers)
 
 
 def tensor(name: str, dtype: npt.DTypeLike, shape: Sequence[int | str] | None = None) -> ValueInfoProto:

@@ -13,17 +13,14 @@ for constants. ``docs/decisions.md`` has the figures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from onnx import GraphProto, NodeProto, TensorProto, helper, numpy_helper
+from onnx import GraphProto, NodeProto, TensorProto
 
+from .graph_writer import GraphWriter, tensor
 from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT
-
-Array = npt.NDArray[Any]
 
 FEWEST = 256
 """Queries, and keys, from which on integers are faster. How many times as fast as in fp32, 12 heads of 64 channels,
@@ -39,38 +36,24 @@ _PLAIN = {"is_causal": 0, "qk_matmul_output_mode": 0, "softcap": 0.0}
 """Attributes that change what is computed, and their values where they do not."""
 
 
-@dataclass(frozen=True)
-class Attention:
-    """An attention that can be done in integers.
+def integer_attention(
+    w: GraphWriter,
+    node: NodeProto,
+    attributes: Mapping[str, Any],
+    shapes: Mapping[str, Sequence[int]],
+    any_queries: bool = False,
+) -> bool:
+    """Write what a node attends to with integers, if they can do that, and are faster; whether they are.
 
-    Attributes:
-        inputs: names of query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` in float32.
-        flat: they are as above, as is the result; else ``[B, heads, tokens, C]``.
-        queries: T; zero if only a run says it, and then B is one.
-        keys: S.
-        channels: C of query and key, and of value.
-    """
-
-    inputs: tuple[str, str, str]
-    flat: bool
-    heads: int
-    queries: int
-    keys: int
-    channels: tuple[int, int]
-    scale: float
-
-
-def attention_of(
-    node: NodeProto, attributes: Mapping[str, Any], shapes: Mapping[str, Sequence[int]], any_queries: bool = False
-) -> Attention | None:
-    """What a node attends to, if integers can do that, and are faster.
+    Query ``[B, T, heads * C]``, key and value ``[B, S, heads * C]`` are in float32, or ``[B, heads, tokens, C]``, as is
+    the result.
 
     Args:
         shapes: of values, zero for a size that is not known.
         any_queries: the shapes are of one case of many: a run has one row, and any number of queries.
     """
     if node.op_type != "Attention" or any(node.input[3:]) or len(node.output) != 1:
-        return None
+        return False
     known = {*_PLAIN, "q_num_heads", "kv_num_heads", "scale"}
     plain = all(attributes.get(name, value) == value for name, value in _PLAIN.items()) and known.issuperset(attributes)
     given = [tuple(shapes.get(name, ())) for name in node.input[:3]]
@@ -79,88 +62,54 @@ def attention_of(
         counts = (attributes.get("q_num_heads", 0), *[attributes.get("kv_num_heads", 0)] * 2)
         given = [(b, n, t, c // n) if n else () for n, (b, t, c) in zip(counts, given, strict=True)]
     if not plain or any(len(shape) != 4 or 0 in shape[1:] for shape in given):
-        return None
+        return False
     (batch, heads, queries, channels), (_, others, keys, _), (_, _, _, last) = given
     if others != heads or min(queries, keys) < FEWEST or (any_queries and batch != 1):
-        return None
-    inputs = (node.input[0], node.input[1], node.input[2])
-    scale = attributes.get("scale", channels**-0.5)
-    return Attention(inputs, flat, heads, 0 if any_queries else queries, keys, (channels, last), scale)
+        return False
+    batch, queries = (1, -1) if any_queries else (-1, queries)
+    sizes = (queries, channels), (keys, channels), (keys, last)
+
+    def reshaped(x: str, *shape: int) -> str:
+        return w.op("Reshape", x, w.constant(shape))
+
+    parts = []
+    for x, (tokens, width) in zip(node.input[:3], sizes, strict=True):
+        if flat:
+            x = w.op("Transpose", reshaped(x, batch, tokens, heads, width), perm=[0, 2, 1, 3])
+        parts.append(reshaped(x, heads if any_queries else -1, tokens, width))
+    head = _head(w.inner(), sizes, attributes.get("scale", channels**-0.5))
+    result, shape = w.op(HEADS, *parts, body=head, num_scan_inputs=3), [batch, heads, queries, last]
+    if flat:
+        result = w.op("Transpose", reshaped(result, *shape), perm=[0, 2, 1, 3])
+        shape = [batch, queries, heads * last]
+    w.ops("Reshape", [result, w.constant(shape)], node.output)
+    return True
 
 
-def integer_attention(node: NodeProto, of: Attention, keep: Callable[[str, Array], str]) -> list[NodeProto]:
-    """The nodes that take the place of ``node``; ``keep`` stores a small constant under a name, and gives the name."""
-    own = f"{node.name}."
-    sizes = (of.queries, of.channels[0]), (of.keys, of.channels[0]), (of.keys, of.channels[1])
-    result = (of.queries, of.channels[1])
-    batch, queries = (-1, of.queries) if of.queries else (1, -1)
-    nodes: list[NodeProto] = []
+def _head(w: GraphWriter, sizes: Sequence[tuple[int, int]], scale: float) -> GraphProto:
+    """One head: query, key and value of these tokens and channels, -1 for tokens that only a run knows."""
+    query, key, value = (w.fresh(name) for name in ("query", "key", "value"))
+    last, tokens = w.constant([-1]), sizes[1][0]
 
-    def reshape(x: str, y: str, *shape: int) -> None:
-        nodes.append(helper.make_node("Reshape", [x, keep(f"{own}{y}.shape", np.array(shape))], [y], f"{own}{y}"))
+    def number(value: float) -> str:
+        return w.constant(value, np.float32)
 
-    def turn(x: str, y: str) -> None:
-        nodes.append(helper.make_node("Transpose", [x], [y], f"{own}{y}", perm=[0, 2, 1, 3]))
+    def centred(x: str, *axes: str, **attributes: Any) -> tuple[str, str, str]:
+        """``x``, less its mean over tokens, as integers; their scale or, along ``axes``, scales; and the mean."""
+        mean = w.op("MatMul", w.constant(np.full((1, tokens), 1 / tokens), np.float32), x)
+        rest = w.op("Sub", x, mean)
+        step = w.op("Mul", w.op("ReduceMax", w.op("Abs", rest), *axes, keepdims=0), number(1 / LARGEST_FACTOR))
+        own = w.op("Max", step, number(float(np.finfo(np.float32).tiny)))
+        return w.op("QuantizeLinear", rest, own, output_dtype=TensorProto.INT8, **attributes), own, mean
 
-    parts = [own + name for name in ("query", "key", "value")]
-    for x, part, (tokens, channels) in zip(of.inputs, parts, sizes, strict=True):
-        if of.flat:
-            reshape(x, f"{part}.tokens", batch, tokens or -1, of.heads, channels)
-            turn(f"{part}.tokens", f"{part}.heads")
-        reshape(f"{part}.heads" if of.flat else x, part, -1 if of.queries else of.heads, tokens or -1, channels)
-    each, heads, rows = own + "each", own + "heads", own + "tokens"
-    nodes.append(helper.make_node(HEADS, parts, [each], each, body=_head(own, of, sizes, result), num_scan_inputs=3))
-    reshape(each, heads if of.flat else node.output[0], batch, of.heads, queries, of.channels[1])
-    if of.flat:
-        turn(heads, rows)
-        reshape(rows, node.output[0], batch, queries, of.heads * of.channels[1])
-    return nodes
-
-
-def _head(own: str, of: Attention, sizes: Sequence[tuple[int, int]], result: tuple[int, int]) -> GraphProto:
-    """One head, ``[tokens, channels]`` each. No name of it is one of the model's, nor that of another attention."""
-    nodes: list[NodeProto] = []
-    constants: dict[str, Array] = {
-        "mean": np.full((1, of.keys), 1 / of.keys, np.float32),
-        "channels": np.array([-1]),
-        "factor": np.array(1 / LARGEST_FACTOR, np.float32),
-        "share": np.array(1 / 255, np.float32),
-        "least": np.array(np.finfo(np.float32).tiny, np.float32),
-        "scale": np.array(of.scale, np.float32),
-        "one": np.array(1, np.float32),
-    }
-
-    def add(operation: str, inputs: str, output: str, domain: str = "", **attributes: Any) -> None:
-        given, made = ([f"{own}{name}" for name in names.split()] for names in (inputs, output))
-        nodes.append(helper.make_node(operation, given, made, made[0], domain=domain, **attributes))
-
-    def centre(x: str, axes: str, **attributes: Any) -> None:
-        """``x``, less its mean over tokens, as integers; and their scale or, along ``axes``, scales."""
-        add("MatMul", f"mean {x}", f"{x}.mean")
-        add("Sub", f"{x} {x}.mean", f"{x}.centred")
-        add("Abs", f"{x}.centred", f"{x}.sizes")
-        add("ReduceMax", f"{x}.sizes{axes}", f"{x}.largest", keepdims=0)
-        add("Mul", f"{x}.largest factor", f"{x}.step")
-        add("Max", f"{x}.step least", f"{x}.scale")
-        add("QuantizeLinear", f"{x}.centred {x}.scale", f"{x}.s8", output_dtype=TensorProto.INT8, **attributes)
-
-    centre("k", " channels", axis=0)
-    centre("v", "")
-    add("Transpose", "k.s8", "k.turned", perm=[1, 0])
-    add("Mul", "k.scale scale", "k.scaled")
-    add(DYNAMIC_PRODUCT, "q k.turned k.scaled", "scores", DOMAIN)
-    add("Softmax", "scores", "shares", axis=-1)
-    add("ReduceMax", "shares channels", "shares.largest", keepdims=0)
-    add("Mul", "shares.largest share", "shares.scale")
-    add("QuantizeLinear", "shares shares.scale", "shares.u8", axis=0, output_dtype=TensorProto.UINT8)
-    add(INTEGER_PRODUCT, "shares.u8 v.s8 one v.scale", "made", DOMAIN)
-    add("Unsqueeze", "shares.scale channels", "rows")
-    add("Mul", "made rows", "scaled")
-    add("Add", "scaled v.mean", "y")
-    inputs = [
-        helper.make_tensor_value_info(own + name, TensorProto.FLOAT, [tokens or "T", channels])
-        for name, (tokens, channels) in zip("qkv", sizes, strict=True)
-    ]
-    output = helper.make_tensor_value_info(own + "y", TensorProto.FLOAT, [result[0] or "T", result[1]])
-    kept = [numpy_helper.from_array(value, own + name) for name, value in constants.items()]
-    return helper.make_graph(nodes, "head", inputs, [output], kept)
+    keys, scales, _ = centred(key, last, axis=0)
+    values, one, mean = centred(value)
+    turned, factor = w.op("Transpose", keys, perm=[1, 0]), w.op("Mul", scales, number(scale))
+    shares = w.op("Softmax", w.op(DYNAMIC_PRODUCT, query, turned, factor, domain=DOMAIN), axis=-1)
+    step = w.op("Mul", w.op("ReduceMax", shares, last, keepdims=0), number(1 / 255))
+    integers = w.op("QuantizeLinear", shares, step, axis=0, output_dtype=TensorProto.UINT8)
+    made = w.op(INTEGER_PRODUCT, integers, values, number(1), one, domain=DOMAIN)
+    result = w.op("Add", w.op("Mul", made, w.op("Unsqueeze", step, last)), mean)
+    shapes = [[count if count > 0 else "T", width] for count, width in (*sizes, (sizes[0][0], sizes[2][1]))]
+    inputs = [tensor(name, np.float32, shape) for name, shape in zip((query, key, value), shapes, strict=False)]
+    return w.graph("head", [tensor(result, np.float32, shapes[-1])], inputs)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from onnx import ModelProto, NodeProto, helper, shape_inference
+from onnx import ModelProto, NodeProto, shape_inference
+
+from .graph_writer import GraphWriter
 
 Array = npt.NDArray[Any]
 
@@ -33,29 +34,6 @@ as fast as in fp32 with onnxruntime 1.31, AVX-512 VNNI, one thread: 0.4 for 3 x 
 3.2 for 512 x 512."""
 
 
-@dataclass(frozen=True, eq=False)
-class Convolution:
-    """A convolution that can be done in integers.
-
-    Attributes:
-        x: name of the float32 input ``[N, C, *sizes]``.
-        weight: name of the constant ``[O, C, *kernel]``.
-        matrix: its value as float32 ``[kernel * C, O]``.
-        bias: name of a constant ``[O]``; empty if there is none.
-        pads: before each axis of ``sizes``, and then after each.
-        places: which pixels each place of the result sees, of the padded ones, int32 ``[places * kernel]``; None where
-            they are all of them in order.
-    """
-
-    x: str
-    weight: str
-    matrix: Array
-    bias: str
-    pads: tuple[int, ...]
-    places: npt.NDArray[np.int32] | None
-    sizes: tuple[int, ...]
-
-
 def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
     """Shapes of values where B is ``size``; zero for a size that is not known."""
     alone = ModelProto()
@@ -73,19 +51,32 @@ def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
     }
 
 
-def convolution_of(
-    node: NodeProto, attributes: Mapping[str, Any], known: Mapping[str, Array], shapes: Mapping[str, Sequence[int]]
-) -> Convolution | None:
-    """What a node convolves, if integers can do that, and are faster; ``known`` has the values of constants by name."""
+def integer_convolution(
+    w: GraphWriter,
+    node: NodeProto,
+    attributes: Mapping[str, Any],
+    known: Mapping[str, Array],
+    shapes: Mapping[str, Sequence[int]],
+    store: Callable[[str, Array], tuple[str, str]],
+) -> bool:
+    """Write what a node convolves with integers, if they can do that, and are faster; whether they are.
+
+    Args:
+        node: reads ``[N, C, *sizes]`` in float32, and a constant ``[O, C, *kernel]``.
+        known: values of constants, by name.
+        shapes: of values, zero for a size that is not known.
+        store: keeps a matrix ``[kernel * C, O]`` that was made of a constant as integers, and gives the names of these
+            and of their scales ``[O]``.
+    """
     weight = known.get(node.input[1]) if node.op_type == "Conv" else None
     bias = node.input[2] if len(node.input) > 2 else ""
     sizes = tuple(shapes.get(node.input[0], ())[2:]) if node.input else ()
     if weight is None or weight.dtype != np.float32 or (bias and bias not in known) or not sizes or 0 in sizes:
-        return None
+        return False
     out, channels, *kernel = weight.shape
     plain = attributes.get("group", 1) == 1 and attributes.get("auto_pad", b"NOTSET") in (b"NOTSET", "NOTSET")
     if not plain or out * channels < LEAST or len(sizes) != len(kernel):
-        return None
+        return False
     axes, ones = len(sizes), [1] * len(sizes)
     pads = tuple(attributes.get("pads", [0] * 2 * axes))
     strides, dilations = attributes.get("strides", ones), attributes.get("dilations", ones)
@@ -93,52 +84,20 @@ def convolution_of(
     spans = zip(padded, kernel, strides, dilations, strict=True)
     result = tuple((size - spread * (taps - 1) - 1) // step + 1 for size, taps, step, spread in spans)
     seen = _seen(padded, kernel, strides, dilations, result)
-    matrix = np.moveaxis(weight, (0, 1), (-1, -2)).reshape(-1, out)
-    places = None if np.array_equal(seen, np.arange(np.prod(padded))) else seen
-    return Convolution(node.input[0], node.input[1], matrix, bias, pads, places, result)
-
-
-def integer_convolution(
-    node: NodeProto, of: Convolution, integers: str, scales: str, keep: Callable[[str, Array], str]
-) -> list[NodeProto]:
-    """The nodes that take the place of ``node``.
-
-    Args:
-        node: the convolution.
-        of: what it convolves.
-        integers: name of the constant int8 ``[kernel * C, O]``.
-        scales: name of the constant float32 ``[O]``.
-        keep: stores a small constant under a name, and gives the name.
-    """
-    axes, own = len(of.sizes), f"{node.name}."
-    kernel = len(of.matrix)
-    u8, scale, zero = (own + name for name in ("u8", "scale", "zero"))
-    last = own + "last"
-    nodes = [
-        helper.make_node("DynamicQuantizeLinear", [of.x], [u8, scale, zero], f"{own}0"),
-        helper.make_node("Transpose", [u8], [last], f"{own}1", perm=[0, *range(2, 2 + axes), 1]),
-    ]
-    if any(of.pads):
-        edges = np.array([0, *of.pads[:axes], 0, 0, *of.pads[axes:], 0])
-        nodes.append(helper.make_node("Pad", [last, keep(own + "edges", edges), zero], [own + "padded"], f"{own}2"))
-        last = own + "padded"
-    if of.places is not None:
-        channels = kernel // (of.places.size // int(np.prod(of.sizes)))
-        pixels = keep(own + "pixels", np.array([0, -1, channels]))
-        nodes.append(helper.make_node("Reshape", [last, pixels], [own + "all"], f"{own}3"))
-        places = keep(own + "places", of.places)
-        nodes.append(helper.make_node("Gather", [own + "all", places], [own + "seen"], f"{own}4", axis=1))
-        last = own + "seen"
-    rows = keep(own + "rows", np.array([0, int(np.prod(of.sizes)), kernel]))
-    inputs = [own + "each", integers, scale, scales, zero, *(["", of.bias] if of.bias else [])]
-    shape = keep(own + "shape", np.array([0, of.matrix.shape[1], *of.sizes]))
-    return [
-        *nodes,
-        helper.make_node("Reshape", [last, rows], [own + "each"], f"{own}5"),
-        helper.make_node(INTEGER_PRODUCT, inputs, [own + "made"], f"{own}6", domain=DOMAIN),
-        helper.make_node("Transpose", [own + "made"], [own + "turned"], f"{own}7", perm=[0, 2, 1]),
-        helper.make_node("Reshape", [own + "turned", shape], list(node.output), f"{own}8"),
-    ]
+    matrix, places = np.moveaxis(weight, (0, 1), (-1, -2)).reshape(-1, out), int(np.prod(result))
+    integers, scales = store(node.input[1], matrix)
+    pixels, scale, zero = w.ops("DynamicQuantizeLinear", [node.input[0]], 3)
+    pixels = w.op("Transpose", pixels, perm=[0, *range(2, 2 + axes), 1])
+    if any(pads):
+        pixels = w.op("Pad", pixels, w.constant([0, *pads[:axes], 0, 0, *pads[axes:], 0]), zero)
+    if not np.array_equal(seen, np.arange(np.prod(padded))):  # else all of them in order
+        pixels = w.op("Reshape", pixels, w.constant([0, -1, channels]))
+        pixels = w.op("Gather", pixels, w.constant(seen, np.int32), axis=1)
+    rows = w.op("Reshape", pixels, w.constant([0, places, len(matrix)]))
+    made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, *(["", bias] if bias else []), domain=DOMAIN)
+    turned = w.op("Transpose", made, perm=[0, 2, 1])
+    w.ops("Reshape", [turned, w.constant([0, out, *result])], node.output)
+    return True
 
 
 def _seen(

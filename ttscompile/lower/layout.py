@@ -76,10 +76,10 @@ class _Sinker:
                 self.views[node.name] = view
             else:
                 self.keep(node)
-        nodes = self.named_outputs()
-        read = {name for node in nodes for name in node.refs()} | set(self.graph.outputs)
+        names = self.named_outputs()
+        read = {name for node in self.nodes for name in node.refs()} | set(self.graph.outputs)
         constants = {n: t for n, t in self.graph.constants.items() if n in read}
-        return Graph(self.graph.inputs, constants, nodes, self.graph.outputs)
+        return Graph(self.graph.inputs, constants, tuple(self.nodes), self.graph.outputs).renamed(names)
 
     def moved(self, node: Node) -> _View | None:
         """The view that a moving operation makes; None for another operation or an inexpressible view."""
@@ -143,8 +143,8 @@ class _Sinker:
             self.types[node.name] = node.type
         self.nodes.append(node.renamed(self.compute_name))
 
-    def named_outputs(self) -> tuple[Node, ...]:
-        """The nodes, with outputs that were views computed and called by their names."""
+    def named_outputs(self) -> dict[str, str]:
+        """Compute outputs that were views; their names, by what is to be called so."""
         names: dict[str, str] = {}
         own = {node.name for node in self.graph.nodes} | set(self.graph.inputs) | set(self.graph.constants)
         for output in dict.fromkeys(self.graph.outputs):
@@ -155,10 +155,7 @@ class _Sinker:
                 self.nodes.append(Node(output, "aten.clone.default", (Ref(computed),), (), (self.types[computed],)))
             else:
                 names[computed] = output
-        return tuple(
-            replace(node.renamed(lambda name: names.get(name, name)), name=names.get(node.name, node.name))
-            for node in self.nodes
-        )
+        return names
 
     def type_of(self, name: str) -> TensorType:
         if name in self.views:

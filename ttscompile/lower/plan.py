@@ -79,15 +79,18 @@ def lower_plan(w: GraphWriter, plan: str, groups: Sequence[int], steps: int, tog
     gap = w.op("Add", w.op("Unsqueeze", starts, w.constant([1])), position)  # [K, N + 1]
     own_gap = w.op("Slice", gap, w.constant([0]), w.constant([count]), w.constant([1]))
 
-    # FORWARD reads the last computed block of its group: of this step, or the last of an earlier one.
-    before = np.array(
-        [[c + 1 if c < b and groups[c] == groups[b] else 0 for c in range(count)] for b in range(count)], np.int64
-    )
-    wide = w.op("Unsqueeze", ones, w.constant([1]))
-    nearest = w.op("ReduceMax", w.op("Mul", wide, w.constant(before)), w.constant([2]), keepdims=0)  # [K, N], + 1
-    earlier = w.op("Gather", _last_of_earlier_steps(w, ones, groups, steps), w.constant(_ranks(groups)), axis=1)
-    here = w.op("Greater", nearest, w.constant(0))
-    forward = w.op("Where", here, w.op("Add", nearest, w.constant(count - 1)), earlier)
+    # FORWARD reads the newest residual of its group: the last cell before it that is computed, group by group in the
+    # order of execution. Step 0 is dense, so that none of an earlier group is read.
+    cells = np.arange(steps * count).reshape(steps, count)
+    order = np.concatenate([cells[:, np.array(groups) == group].reshape(-1) for group in dict.fromkeys(groups)])
+    flags = w.op("Gather", w.op("Reshape", computed, w.constant([-1])), w.constant(order))
+    seen = w.op("CumSum", w.op("Cast", flags, to=INT64), w.constant(0), exclusive=1)
+    last = w.op("Max", w.op("Sub", seen, w.constant(1)), w.constant(0))
+    known = w.op("Gather", w.op("Compress", w.constant(order), flags), last)
+    newest = w.op("Gather", known, w.constant(np.argsort(order).reshape(steps, count)))
+    here = w.op("Equal", w.op("Div", newest, w.constant(count)), w.constant(np.arange(steps)[:, None]))
+    block = w.op("Mod", newest, w.constant(count))
+    forward = w.op("Where", here, w.op("Add", block, w.constant(count)), block)
     itself = w.constant(np.broadcast_to(np.arange(count), (steps, count)))
     column = w.op("Where", w.op("Equal", source, w.constant(1)), forward, itself)
     column = w.op("Where", rollout, w.op("Add", itself, w.constant(2 * count)), column)
@@ -135,30 +138,6 @@ def lower_plan(w: GraphWriter, plan: str, groups: Sequence[int], steps: int, tog
         same=same,
         any_of_group=w.op("Greater", w.op("ReduceMax", folded, w.constant([2]), keepdims=0), w.constant(0)),
     )
-
-
-def _last_of_earlier_steps(w: GraphWriter, ones: str, groups: Sequence[int], steps: int) -> str:
-    """For each step and FORWARD group its last block that was computed in an earlier step: int64 [K, groups].
-
-    Step 0 is dense, so that every group has one from step 1 on; row 0 is not read.
-    """
-    ranks = _ranks(groups)
-    members = np.zeros((max(ranks) + 1, 1, len(groups)), np.int64)
-    for b, rank in enumerate(ranks):
-        members[rank, 0, b] = b + 1
-    last = w.op("ReduceMax", w.op("Mul", ones, w.constant(members)), w.constant([2]), keepdims=0)  # [groups, K], + 1
-    flat = w.op("Reshape", last, w.constant([-1]))
-    some = w.op("Greater", flat, w.constant(0))
-    known = w.op("Compress", flat, some)
-    seen = w.op("CumSum", w.op("Cast", some, to=INT64), w.constant(0), exclusive=1)
-    latest = w.op("Gather", known, w.op("Max", w.op("Sub", seen, w.constant(1)), w.constant(0)))
-    table = w.op("Reshape", w.op("Sub", latest, w.constant(1)), w.constant([max(ranks) + 1, steps]))
-    return w.op("Transpose", table, perm=[1, 0])
-
-
-def _ranks(groups: Sequence[int]) -> list[int]:
-    numbers = {group: rank for rank, group in enumerate(dict.fromkeys(groups))}
-    return [numbers[group] for group in groups]
 
 
 def _shifted(w: GraphWriter, rows: str, steps: int) -> str:

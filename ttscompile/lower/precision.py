@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,12 +22,12 @@ from ..core.spec import FP32, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
-from .integer_attention import HEADS, attention_of, integer_attention
+from .graph_writer import GraphWriter
+from .integer_attention import HEADS, integer_attention
 from .integer_convolution import (
     DOMAIN,
     DYNAMIC_PRODUCT,
     INTEGER_PRODUCT,
-    convolution_of,
     integer_convolution,
     shapes_of,
 )
@@ -57,21 +57,8 @@ MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 """Terms of a sum of products that an int32 holds whatever their values."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Matrix:
-    """A constant float32 matrix ``[rows, columns]``, and the constant that it was made of."""
-
-    name: str
-    value: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Product:
-    """``x @ matrix + bias``."""
-
-    x: str  # name of the float32 input
-    matrix: _Matrix
-    bias: str  # name of a constant [columns]; empty if there is none
+Matrices = Mapping[str, tuple[str, Array]]
+"""Constant float32 matrices ``[rows, columns]`` by the names of their values, each with the name of its constant."""
 
 
 def parts_to_lower(
@@ -199,27 +186,16 @@ def quantize_model(
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
     matrices, shapes = _matrices(model, known), shapes_of(model, size)
     constants: dict[str, Array] = {}
-    small: list[TensorProto] = []
-
-    def keep(name: str, value: Array) -> str:
-        small.append(numpy_helper.from_array(value, name))
-        return name
-
-    nodes: list[NodeProto] = []
+    w, store = GraphWriter(), partial(_integers, constants)
     for node in model.graph.node:
-        product = _product(node, known, matrices)
-        if product is not None and _rows(shapes.get(product.x, ())) < least_rows:
-            nodes.append(node)
-        elif product is not None:
-            nodes.append(_integer_product(node, product, constants))
-        elif (convolution := convolution_of(node, _attributes(node), known, shapes)) is not None:
-            integers, scales = _integers(convolution.weight, convolution.matrix, constants)
-            nodes += integer_convolution(node, convolution, integers, scales, keep)
-        elif (attention := attention_of(node, _attributes(node), shapes, size > 1)) is not None:
-            nodes += integer_attention(node, attention, keep)
-        else:
-            nodes.append(node)
-    nodes = live_nodes(nodes, {value.name for value in model.graph.output})
+        attributes = _attributes(node)
+        if not (
+            _integer_product(w, node, known, matrices, shapes, least_rows, store)
+            or integer_convolution(w, node, attributes, known, shapes, store)
+            or integer_attention(w, node, attributes, shapes, size > 1)
+        ):
+            w.nodes.append(node)
+    nodes = live_nodes(w.nodes, {value.name for value in model.graph.output})
     quantized = ModelProto()
     quantized.CopyFrom(model)
     if not constants:
@@ -228,7 +204,7 @@ def quantize_model(
     kept = [tensor for tensor in model.graph.initializer if tensor.name in read]
     types = {name: helper.np_dtype_to_tensor_dtype(value.dtype) for name, value in constants.items()}
     added = [TensorProto(name=n, dims=value.shape, data_type=types[n]) for n, value in constants.items()]
-    for field, values in (("node", nodes), ("initializer", [*added, *kept, *small])):
+    for field, values in (("node", nodes), ("initializer", [*added, *kept, *w.initializers])):
         quantized.graph.ClearField(field)
         getattr(quantized.graph, field).extend(values)
     quantized.opset_import.append(helper.make_opsetid(DOMAIN, _DOMAIN_VERSION))
@@ -247,57 +223,53 @@ def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np
     return np.clip(np.rint(matrix / scale), -LARGEST, LARGEST).astype(np.int8), scale
 
 
-def _matrices(model: ModelProto, known: Mapping[str, Array]) -> dict[str, _Matrix]:
+def _matrices(model: ModelProto, known: Mapping[str, Array]) -> Matrices:
     """The constants by the names of their values, and what transpositions and reshapes make of them."""
     shapes = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer if t.raw_data or t.int64_data}
-    found = {name: _Matrix(name, value) for name, value in known.items() if value.dtype == np.float32}
+    found = {name: (name, value) for name, value in known.items() if value.dtype == np.float32}
     for node in model.graph.node:
         before = found.get(node.input[0]) if node.input else None
         if before is None:
             continue
+        constant, value = before
         if node.op_type == "Transpose":
-            value = before.value.transpose(_attributes(node).get("perm"))
+            found[node.output[0]] = constant, value.transpose(_attributes(node).get("perm"))
         elif node.op_type == "Reshape" and node.input[1] in shapes:
-            value = before.value.reshape(shapes[node.input[1]])
-        else:
-            continue
-        found[node.output[0]] = _Matrix(before.name, value)
+            found[node.output[0]] = constant, value.reshape(shapes[node.input[1]])
     return found
 
 
-def _product(node: NodeProto, known: Mapping[str, Array], matrices: Mapping[str, _Matrix]) -> _Product | None:
-    """What a node multiplies, if it is a product by a constant matrix that can be done in integers."""
-    attributes = _attributes(node)
+def _integer_product(
+    w: GraphWriter,
+    node: NodeProto,
+    known: Mapping[str, Array],
+    matrices: Matrices,
+    shapes: Mapping[str, Sequence[int]],
+    least_rows: int,
+    store: Callable[[str, Array], tuple[str, str]],
+) -> bool:
+    """Write a product by a constant matrix with integers, if it has as many rows; whether it is one."""
+    attributes, flip, bias = _attributes(node), False, ""
     if node.op_type == "Gemm":
         if attributes.get("transA", 0) or attributes.get("alpha", 1.0) != 1 or attributes.get("beta", 1.0) != 1:
-            return None
+            return False
         flip, bias = bool(attributes.get("transB", 0)), node.input[2] if len(node.input) > 2 else ""
-    elif node.op_type == "MatMul":
-        flip, bias = False, ""
-    else:
-        return None
-    x, matrix = node.input[0], matrices.get(node.input[1])
-    if x in matrices or matrix is None or matrix.value.ndim != 2:
-        return None
-    value = matrix.value.T if flip else matrix.value
-    rows, columns = value.shape
-    if not 0 < rows <= MOST_ROWS or (bias and (bias not in known or known[bias].shape != (columns,))):
-        return None
-    return _Product(x, replace(matrix, value=value), bias)
+    if node.op_type not in ("Gemm", "MatMul") or node.input[0] in matrices or node.input[1] not in matrices:
+        return False
+    x, (constant, value) = node.input[0], matrices[node.input[1]]
+    value = value.T if flip else value
+    if value.ndim != 2 or not 0 < len(value) <= MOST_ROWS:
+        return False
+    if bias and (bias not in known or known[bias].shape != value.shape[1:]):
+        return False
+    shape = shapes.get(x, ())
+    if (math.prod(shape[:-1]) if shape else 0) < least_rows:
+        return False
+    w.ops(DYNAMIC_PRODUCT, [x, *store(constant, value), *(["", bias] if bias else [])], node.output, domain=DOMAIN)
+    return True
 
 
-def _rows(shape: Sequence[int]) -> int:
-    return math.prod(shape[:-1]) if shape else 0
-
-
-def _integer_product(node: NodeProto, product: _Product, constants: dict[str, Array]) -> NodeProto:
-    """The node that takes the place of ``node``; its constants go into ``constants``."""
-    name, scale = _integers(product.matrix.name, product.matrix.value, constants)
-    inputs = [product.x, name, scale, "", product.bias] if product.bias else [product.x, name, scale]
-    return NodeProto(name=node.name, op_type=DYNAMIC_PRODUCT, domain=DOMAIN, input=inputs, output=node.output)
-
-
-def _integers(constant: str, matrix: Array, constants: dict[str, Array]) -> tuple[str, str]:
+def _integers(constants: dict[str, Array], constant: str, matrix: Array) -> tuple[str, str]:
     """Names of the integers and the scales of a matrix, which go into ``constants``.
 
     No two products share them: onnxruntime 1.31 cannot load such a model where it has to make the integers unsigned

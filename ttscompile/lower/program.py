@@ -29,7 +29,7 @@ from .advance import advances
 from .idle import lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
-from .onnx_model import flatten_attention, name_model, only
+from .onnx_model import name_model, only
 from .translations import TRANSLATIONS
 
 OPSET = 23
@@ -78,13 +78,8 @@ def structural_key(graph: Graph) -> str:
     names = {name: f"i{i}" for i, name in enumerate(graph.inputs)}
     names |= {name: f"c{i}" for i, name in enumerate(graph.constants)}
     names |= {node.name: f"n{i}" for i, node in enumerate(graph.nodes)}
-    canonical = Graph(
-        inputs={names[n]: t for n, t in graph.inputs.items()},
-        constants={names[n]: t for n, t in graph.constants.items()},
-        nodes=tuple(replace(n.renamed(names.__getitem__), name=names[n.name], source="") for n in graph.nodes),
-        outputs=tuple(names[n] for n in graph.outputs),
-    )
-    return repr(canonical)
+    graph = graph.renamed(names)
+    return repr(replace(graph, nodes=tuple(replace(node, source="") for node in graph.nodes)))
 
 
 def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
@@ -117,7 +112,7 @@ def _export(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
     its size. If that fails they go one by one, so that the message can name the piece.
     """
     try:
-        joint = flatten_attention(_run_exporter(list(graphs.values())))
+        joint = _run_exporter(list(graphs.values()))
     except Exception as error:  # torch.export and the exporter raise whatever their machinery raises
         if len(graphs) > 1:
             return {name: _export({name: graph})[name] for name, graph in graphs.items()}

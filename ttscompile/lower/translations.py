@@ -5,6 +5,7 @@
     conv1d       onnxruntime multiplies the weights by columns of the input, one a position. With few of them most of
                  its kernel's width is empty. Here few positions are rows, multiplied by the weights.
     index_copy   The exporter takes it apart into single numbers. Here whole rows are copied, along the first axis.
+    attention    The exporter transposes heads forward and back. Where they are only moved for it they stay here.
 
 ``docs/decisions.md`` has the figures.
 """
@@ -89,9 +90,57 @@ def index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
     return op.Transpose(index_copy(moved, 0, index, rows), perm=order)
 
 
+_HEADS_FORWARD = [0, 2, 1, 3]
+
+
+def attention(
+    query: Any,
+    key: Any,
+    value: Any,
+    attn_mask: Any = None,
+    dropout_p: float = 0.0,
+    is_causal: bool = False,
+    scale: float | None = None,
+    enable_gqa: bool = False,
+) -> Any:
+    """``aten.scaled_dot_product_attention``, of which dropout is off.
+
+    Before, on tensors of four axes::
+
+        q -> Transpose -+
+        k -> Transpose -+-> Attention -> Transpose -> y
+        v -> Transpose -+
+
+    After, on ``[batch, tokens, heads * channels]``, with the number of heads as an attribute::
+
+        q -> Reshape -+
+        k -> Reshape -+-> Attention -> Reshape -> y
+        v -> Reshape -+
+
+    Measured with onnxruntime 1.31, 1 thread, self-attention of width 256, 16 tokens, 4 heads: 0.129 ms before, 0.118
+    after. What transposes the result is written once more, and the exporter drops both.
+    """
+    given, options = (query, key, value), {"scale": scale, "is_causal": int(is_causal)}
+    before, heads = [_before_heads(each) for each in given], [each.shape[1] for each in given]
+    if None in before or not all(isinstance(count, int) for count in heads):
+        return op.Attention(*given, attn_mask, **options)[0]
+    flat = [op.Reshape(each, op.Constant(value_ints=[0, 0, -1])) for each in before]
+    made = op.Attention(*flat, attn_mask, q_num_heads=heads[0], kv_num_heads=heads[1], **options)
+    apart = op.Reshape(made[0], op.Constant(value_ints=[0, 0, heads[0], -1]))
+    return op.Transpose(apart, perm=_HEADS_FORWARD)
+
+
+def _before_heads(value: Any) -> Any:
+    """What a transposition of heads was made of; None if the value is of something else."""
+    made = value.producer()
+    moves = made is not None and made.op_type == "Transpose" and list(made.attributes["perm"].value) == _HEADS_FORWARD
+    return made.inputs[0] if moves else None
+
+
 TRANSLATIONS: Mapping[Any, Callable[..., Any]] = {
     torch.ops.aten.group_norm.default: group_norm,
     torch.ops.aten.conv1d.default: conv1d,
     torch.ops.aten.index_copy.default: index_copy,
+    torch.ops.aten.scaled_dot_product_attention.default: attention,
 }
 """As ``torch.onnx.export`` takes them."""

@@ -1,127 +1,221 @@
 """A diffusers scheduler as a table of numbers, found by probing its ``step``.
 
-The maths of DDPM and DDIM is not written down here a second time: every coefficient is measured on the scheduler
-itself, in float64, and the finished table is held against it on random inputs. Whatever does not have the form of
-``SamplerTable`` (dynamic thresholding, scaled inputs, learned variances) is refused. DPM-Solver++, which remembers, is
-measured in ``multistep``; flow matching needs no scheduler (``flow``).
+The maths of DDPM, DDIM and DPM-Solver++ is not written down here a second time: every coefficient is measured on the
+scheduler itself, in float64, and the finished table is held against it on random inputs. Whatever does not have the
+form of ``SamplerTable`` (dynamic thresholding, scaled inputs, learned variances) is refused. Flow matching needs no
+scheduler (``flow``).
+
+The scheduler is driven through whole chains. A multistep solver remembers what the network's outputs of the last steps
+meant for the sample (``model_outputs`` of the scheduler: predictions of the clean sample for DPM-Solver++, of the noise
+for DPM-Solver). So its step is linear in the sample, the output's meaning, and the meanings before, which become the
+memories of ``SamplerTable``. The inputs of its chains are pulses, one in four steps; what answers a pulse, and how many
+steps later, are the coefficients. Of any other scheduler all steps are probed at once, and what it does remember shows
+when the table is held against it. One operation of diffusers' own is not in float64: the step of a multistep solver
+rounds the sample to float32.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from ..core.coercion import integer
 from ..core.spec import SamplerTable
 from ..errors import SpecError
-from .multistep import multistep_table, set_timesteps
 
 _SHAPE = (2, 3, 4)  # of a probe; small, with no two sizes equal, so that a broadcast along the wrong axis shows
-_FAR = 2.0**30  # an input this large saturates any clip that is there; its inverse stays inside any
+_SMALL, _FAR = 2.0**-30, 2.0**30  # inside any clip that is there, and outside of it
+_PERIOD = 4  # steps between pulses; answers to a pulse must have died out by then
 _TOLERANCE = 1e-8  # of the largest term of a step; float64 leaves 1e-12, a wrong form leaves 1e-3 and more
+_TOLERANCE_OF_MULTISTEP = 1e-6  # which rounds the sample to float32
+
+Array = npt.NDArray[np.float64]
 
 
-_Row = tuple[tuple[float, float, float, float, float, float], float | None]
-"""One step of the loop in float64: ``SamplerTable.COLUMNS``, and the clip."""
+@dataclass(frozen=True)
+class _Rows:
+    """The columns of ``SamplerTable``, float64 ``[K]``; ``before`` is ``[K, S]``, of what earlier outputs meant."""
+
+    sample_to_x0: Array
+    out_to_x0: Array
+    x0_to_next: Array
+    sample_to_next: Array
+    out_to_next: Array
+    noise_to_next: Array
+    before: Array
+    clip: float | None
 
 
-class _Probe:
-    """Calls one scheduler's ``step`` on chosen inputs, in float64, with ``step_arguments`` (``eta``, say) added."""
+class _Chains:
+    """Drives a scheduler through all its K steps on given inputs; ``step_arguments`` go to every ``step``.
 
-    def __init__(self, scheduler: Any, step_arguments: Mapping[str, Any]) -> None:
-        self._scheduler, self._step_arguments = scheduler, dict(step_arguments)
-        self.name = type(scheduler).__name__
-
-    def __call__(
-        self, timestep: torch.Tensor, x: torch.Tensor, out: torch.Tensor, seed: int = 0
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """One step; gives ``x0`` and ``next``, or a SpecError in the scheduler's own words."""
-        generator = torch.Generator().manual_seed(seed)
-        try:
-            result = self._scheduler.step(out, timestep, x, generator=generator, **self._step_arguments)
-            x0, following = result.pred_original_sample, result.prev_sample
-        except Exception as error:
-            raise SpecError(
-                f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error} Use a DDPM, DDIM or"
-                f" DPMSolverMultistep scheduler; arguments given to step: {sorted(self._step_arguments)}."
-            ) from error
-        if x0 is None or not (torch.isfinite(x0).all() and torch.isfinite(following).all()):
-            raise SpecError(
-                f"sampler {self.name}: its step at timestep {int(timestep)} gives values that are not finite, or no"
-                " prediction of the clean sample. Check the betas (rescale_betas_zero_snr needs v_prediction)."
-            )
-        return x0, following
-
-    def fill(self, timestep: torch.Tensor, x: float, out: float) -> tuple[float, float]:
-        """One step from constant inputs without its noise; gives ``x0`` and ``next`` as numbers."""
-        zero = torch.zeros(_SHAPE, dtype=torch.float64)
-        _, noise = self(timestep, zero, zero)
-        x0, following = self(timestep, zero + x, zero + out)
-        # Adding zero turns -0.0 into 0.0, so that a table reads well and its bytes do not depend on a sign of nothing.
-        return float(x0.flatten()[0]) + 0.0, float((following - noise).flatten()[0]) + 0.0
-
-
-def _draw(seed: int) -> torch.Tensor:
-    return torch.randn(_SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def _probe_step(probe: _Probe, timestep: torch.Tensor) -> _Row:
-    """Measure one row.
-
-    x0 is read from the step's own ``pred_original_sample``. Where it is clipped, inputs far beyond the bound hold it
-    constant, so what is left of the change in ``next`` is the direct path; otherwise the two paths cannot be told
-    apart, need not be, and all of it is put on the direct one.
+    Attributes:
+        multistep: whether its outputs are remembered.
+        noise_to_next: what its steps add of their noise, ``[K]``.
     """
-    small = 1 / _FAR
-    sample_to_x0 = probe.fill(timestep, small, 0.0)[0] / small
-    out_to_x0 = probe.fill(timestep, 0.0, small)[0] / small
-    zero = torch.zeros(_SHAPE, dtype=torch.float64)
-    noise_to_next = float((probe(timestep, zero, zero)[1] / _draw(0)).flatten()[0]) + 0.0
-    if sample_to_x0 == out_to_x0 == 0:
-        raise SpecError(f"sampler {probe.name}: at timestep {int(timestep)} x0 depends on neither sample nor output.")
 
-    from_sample = abs(sample_to_x0) >= abs(out_to_x0)
-    gain = sample_to_x0 if from_sample else out_to_x0
-    x, out = _FAR * from_sample / gain, _FAR * (not from_sample) / gain
-    near, far = probe.fill(timestep, x, out)[0], probe.fill(timestep, 2 * x, 2 * out)[0]
-    if near != far:
-        sample_to_next, out_to_next = probe.fill(timestep, 1.0, 0.0)[1], probe.fill(timestep, 0.0, 1.0)[1]
-        return (sample_to_x0, out_to_x0, 0.0, sample_to_next, out_to_next, noise_to_next), None
-    clip = abs(near)
-    if clip == 0:
-        raise SpecError(f"sampler {probe.name}: at timestep {int(timestep)} x0 is clipped to zero.")
+    def __init__(self, scheduler: Any, steps: int, step_arguments: Mapping[str, Any]) -> None:
+        self._scheduler, self.steps, self._step_arguments = scheduler, steps, dict(step_arguments)
+        self.name, self.multistep = type(scheduler).__name__, _is_multistep(scheduler)
+        self._ones = torch.ones(steps, *_SHAPE, dtype=torch.float64)
+        _, _, made = self.run(0 * self._ones, 0 * self._ones, [0] * steps, self._ones.float())
+        self._added = made[:, 0, 0, 0].numpy()
+        self.noise_to_next = self._added / (1 if self.multistep else float(_draw(0).flatten()[0])) + 0.0
 
-    # Far enough out that a quarter of the way back along either input leaves x0 at its bound.
-    x, out = (8 * clip / gain, 0.0) if from_sample else (0.0, 8 * clip / gain)
-    delta = clip / abs(gain)
-    base = probe.fill(timestep, x, out)[1]
-    sample_to_next = (probe.fill(timestep, x + delta, out)[1] - base) / delta
-    out_to_next = (probe.fill(timestep, x, out + delta)[1] - base) / delta
-    x0_to_next = (base - sample_to_next * x - out_to_next * out) / clip
-    return (sample_to_x0, out_to_x0, x0_to_next, sample_to_next, out_to_next, noise_to_next), clip
+    def run(
+        self,
+        samples: torch.Tensor,
+        outs: torch.Tensor,
+        seeds: Sequence[int],
+        noise: torch.Tensor,
+        follow: bool = False,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """One chain, on samples and outputs float64 ``[K, ...]``.
+
+        A multistep solver is given the noise, float32 ``[K, ...]``; the others draw theirs with these seeds. With
+        ``follow`` only the first sample is used: each step starts from what the step before made. Gives the samples
+        that went into the steps, what each step says of the clean sample, or remembers; and the samples that came out.
+        """
+        set_timesteps(self._scheduler, self.steps)
+        given, meant = [], []
+        made: list[torch.Tensor] = []
+        for k, timestep in enumerate(self._scheduler.timesteps):
+            given.append(made[-1] if follow and k else samples[k])
+            own: Any = {"variance_noise": noise[k]} if self.multistep else {"generator": _generator(seeds[k])}
+            try:
+                result = self._scheduler.step(outs[k], timestep, given[-1], **own, **self._step_arguments)
+                x0 = self._scheduler.model_outputs[-1] if self.multistep else result.pred_original_sample
+                meant.append(x0.double())
+                made.append(result.prev_sample.double())
+            except Exception as error:
+                raise SpecError(
+                    f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error} Use a DDPM, DDIM or"
+                    f" DPMSolverMultistep scheduler; arguments given to step: {sorted(self._step_arguments)}."
+                ) from error
+            if not (torch.isfinite(meant[-1]).all() and torch.isfinite(made[-1]).all()):
+                raise SpecError(
+                    f"sampler {self.name}: its step at timestep {int(timestep)} gives values that are not finite."
+                    " Check the betas (rescale_betas_zero_snr needs v_prediction)."
+                )
+        return torch.stack(given), torch.stack(meant), torch.stack(made)
+
+    def numbers(self, samples: Array, outs: Array) -> tuple[Array, Array]:
+        """A chain of constants ``[K]``, without its noise: what each step says of x0, and what comes out."""
+        each = [torch.from_numpy(values)[:, None, None, None] * self._ones for values in (samples, outs)]
+        _, meant, made = self.run(each[0], each[1], [0] * self.steps, 0 * self._ones.float())
+        # Adding zero turns -0.0 into 0.0, so that a table reads well and its bytes do not depend on a sign of nothing.
+        added = 0.0 if self.multistep else self._added
+        return meant[:, 0, 0, 0].numpy() + 0.0, made[:, 0, 0, 0].numpy() - added + 0.0
 
 
-def _verify(
-    probe: _Probe, timestep: torch.Tensor, row: _Row, x: torch.Tensor, out: torch.Tensor, seed: int
-) -> torch.Tensor:
-    x0, following = probe(timestep, x, out, seed)
-    (sample_to_x0, out_to_x0, *to_next), clip = row
-    unclipped = sample_to_x0 * x + out_to_x0 * out
-    expected_x0 = unclipped if clip is None else unclipped.clamp(-clip, clip)
-    terms = [weight * term for weight, term in zip(to_next, (expected_x0, x, out, _draw(seed)), strict=True)]
-    expected = terms[0] + terms[1] + terms[2] + terms[3]
-    scale = max(1.0, float(unclipped.abs().max()), *(float(term.abs().max()) for term in terms))
-    error = max(float((x0 - expected_x0).abs().max()), float((following - expected).abs().max()))
-    if error > _TOLERANCE * scale:
-        raise SpecError(
-            f"sampler {probe.name} does not have the form next = p * clip(a * x + b * out) + q * x + r * out + n *"
-            f" noise at timestep {int(timestep)}: a random input is off by {error:.1e} (largest term {scale:.1e})."
-            " Use DDPM, DDIM or DPM-Solver++ (DPMSolverMultistepScheduler)."
-        )
-    return following
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _draw(seed: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.randn(_SHAPE, generator=_generator(seed), dtype=dtype)
+
+
+def set_timesteps(scheduler: Any, steps: int) -> None:
+    """Call the scheduler's ``set_timesteps``, without what numpy has to say about the way diffusers uses it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "__array__ implementation", DeprecationWarning)
+        scheduler.set_timesteps(steps)
+
+
+def _measure(chains: _Chains) -> _Rows:
+    steps, zero = chains.steps, np.zeros(chains.steps)
+    period, numbers = _PERIOD if chains.multistep else 1, np.arange(steps)
+    sample_to_x0, out_to_x0 = np.zeros((2, steps))
+    answers = np.zeros((2, steps, period))  # of the sample out of step k, to a pulse at step k - d: sample, output
+    for start in range(period):
+        here = numbers % period == start
+        since = (numbers - start) % period
+        heard = numbers >= start  # of steps before the first pulse there is nothing to say
+        for which, kept in enumerate((sample_to_x0, out_to_x0)):
+            pulse = np.where(here, _SMALL, 0.0)
+            meant, made = chains.numbers(*((pulse, zero) if which == 0 else (zero, pulse)))
+            kept[here] = meant[here] / _SMALL
+            answers[which, numbers[heard], since[heard]] = made[heard] / _SMALL
+    deaf = (out_to_x0 == 0) & ((sample_to_x0 == 0) | chains.multistep)
+    if deaf.any():
+        where = np.flatnonzero(deaf).tolist()
+        raise SpecError(f"sampler {chains.name}: at steps {where} the output has no effect on what it says of x0.")
+    from_sample = np.abs(sample_to_x0) >= np.abs(out_to_x0)
+    gain = np.where(from_sample, sample_to_x0, out_to_x0)
+    clip, before = _clip(chains, from_sample, gain), np.zeros((steps, period - 1))
+    if chains.multistep:
+        out_to_next, x0_to_next = zero, answers[1, :, 0] / out_to_x0
+        sample_to_next = answers[0, :, 0] - x0_to_next * sample_to_x0
+        for d in range(1, period):
+            before[d:, d - 1] = answers[1, d:, d] / out_to_x0[:-d]
+        scale = np.abs(x0_to_next).max() + np.abs(before).max()
+        used = np.flatnonzero((np.abs(before) > 1e-9 * scale).any(axis=0))
+        before = before[:, : used[-1] + 1 if len(used) else 0]
+    elif clip is None:
+        # The path through x0 and the direct one cannot be told apart, need not be, and all is put on the direct one.
+        x0_to_next = zero
+        sample_to_next, out_to_next = (chains.numbers(*given)[1] for given in ((zero + 1, zero), (zero, zero + 1)))
+    else:
+        # Inputs beyond the bound hold x0 constant, so that what is left of a change in ``next`` is the direct path. Far
+        # enough out a quarter of the way back along either input leaves x0 at its bound.
+        x, out = (np.where(which, 8 * clip / gain, 0.0) for which in (from_sample, ~from_sample))
+        delta, base = clip / np.abs(gain), chains.numbers(x, out)[1]
+        sample_to_next = (chains.numbers(x + delta, out)[1] - base) / delta
+        out_to_next = (chains.numbers(x, out + delta)[1] - base) / delta
+        x0_to_next = (base - sample_to_next * x - out_to_next * out) / clip
+    return _Rows(sample_to_x0, out_to_x0, x0_to_next, sample_to_next, out_to_next, chains.noise_to_next, before, clip)
+
+
+def _clip(chains: _Chains, from_sample: npt.NDArray[np.bool_], gain: Array) -> float | None:
+    """The bound on x0, at which inputs far beyond it leave x0, however far they are; None if there is none."""
+    x, out = (np.where(which, _FAR / gain, 0.0) for which in (from_sample, ~from_sample))
+    near, far = (np.abs(chains.numbers(times * x, times * out)[0]) for times in (1, 2))
+    if not (near == far).any():
+        return None
+    if not (near == far).all() or len(set(near.tolist())) > 1 or near[0] == 0:
+        found = sorted(set(near.tolist()))
+        raise SpecError(f"sampler {chains.name} clips x0 at {found}, to zero or not alike at every step.")
+    return float(near[0])
+
+
+def _verify(chains: _Chains, rows: _Rows) -> None:
+    """Hold the rows against the scheduler: a chain that feeds on itself, and inputs inside and outside of the clip."""
+    draw, shape = _generator(1), (chains.steps, *_SHAPE)
+    reach = torch.from_numpy((rows.clip or 1.0) / np.maximum(np.abs(rows.sample_to_x0), np.abs(rows.out_to_x0)))
+    seeds, kind = range(1000, 1000 + chains.steps), torch.float32 if chains.multistep else torch.float64
+    noise = torch.stack([_draw(seed, kind) for seed in seeds])
+    tolerance = _TOLERANCE_OF_MULTISTEP if chains.multistep else _TOLERANCE
+    for factor in (None, 0.01, 3.0):
+        samples, outs = (torch.randn(shape, generator=draw, dtype=torch.float64) for _ in range(2))
+        if factor is not None:
+            samples, outs = (factor * reach[:, None, None, None] * values for values in (samples, outs))
+        samples = samples.float().double()
+        given, meant, made = chains.run(samples, outs, seeds, noise, follow=factor is None)
+        kept = [torch.zeros(_SHAPE, dtype=torch.float64)] * rows.before.shape[1]
+        for k in range(chains.steps):
+            unclipped = rows.sample_to_x0[k] * given[k] + rows.out_to_x0[k] * outs[k]
+            x0 = unclipped if rows.clip is None else unclipped.clamp(-rows.clip, rows.clip)
+            terms = [rows.x0_to_next[k] * x0, rows.sample_to_next[k] * given[k], rows.out_to_next[k] * outs[k]]
+            terms += [rows.noise_to_next[k] * noise[k]]
+            terms += [weight * memory for weight, memory in zip(rows.before[k], kept, strict=True)]
+            expected = torch.stack(terms).sum(0)
+            scale = max(1.0, float(unclipped.abs().max()), *(float(term.abs().max()) for term in terms))
+            error = max(float((meant[k] - x0).abs().max()), float((made[k] - expected).abs().max()))
+            if not error <= tolerance * scale:
+                raise SpecError(
+                    f"sampler {chains.name} does not have the form next = p * clip(a * x + b * out) + q * x + r * out +"
+                    f" n * noise, with earlier clipped sums for a multistep solver: at step {k} a random input is off"
+                    f" by {error:.1e} (largest term {scale:.1e}). Use DDPM, DDIM or DPM-Solver++"
+                    " (DPMSolverMultistepScheduler without dynamic thresholding)."
+                )
+            kept = [x0, *kept][: len(kept)]
 
 
 def _refuse_known(scheduler: Any) -> None:
@@ -165,46 +259,44 @@ def sampler_table(
     Raises:
         SpecError: the scheduler refuses the settings, or its step is not of the form of ``SamplerTable``.
     """
-    steps = integer(steps, "steps", SpecError, 1)
-    probe = _Probe(scheduler, step_arguments or {})
+    steps, name_of = integer(steps, "steps", SpecError, 1), type(scheduler).__name__
     _refuse_known(scheduler)
     trained = scheduler.config.get("num_train_timesteps")
     if isinstance(trained, int) and steps > trained:
         limit = f"the policy was trained with {trained} timesteps, so expected as many at most"
-        raise SpecError(f"sampler {probe.name}: {steps} denoising steps are not possible; {limit}.")
+        raise SpecError(f"sampler {name_of}: {steps} denoising steps are not possible; {limit}.")
     try:
         set_timesteps(scheduler, steps)
     except Exception as error:
-        raise SpecError(f"sampler {probe.name}: {steps} denoising steps are not possible: {error}") from error
+        raise SpecError(f"sampler {name_of}: {steps} denoising steps are not possible: {error}") from error
     timesteps = torch.as_tensor(scheduler.timesteps)
     if timesteps.shape != (steps,):
         raise SpecError(
-            f"sampler {probe.name} has {len(timesteps)} timesteps for {steps} steps; use another number of steps or"
+            f"sampler {name_of} has {len(timesteps)} timesteps for {steps} steps; use another number of steps or"
             " timestep spacing, or another sampler: DDPM, DDIM, DPM-Solver++."
         )
-
-    x, out = _draw(1), _draw(2)
-    rescale = getattr(scheduler, "scale_model_input", None)
+    rescale, x = getattr(scheduler, "scale_model_input", None), _draw(1)
     if rescale is not None and not torch.equal(rescale(x, timesteps[0]), x):
-        raise SpecError(f"sampler {probe.name} rescales the sample before the network; use DDPM, DDIM or DPM-Solver++.")
+        raise SpecError(f"sampler {name_of} rescales the sample before the network; use DDPM, DDIM or DPM-Solver++.")
     if _is_multistep(scheduler):
-        return multistep_table(scheduler, steps, name or probe.name, step_arguments or {})
-    rows = [_probe_step(probe, timestep) for timestep in timesteps]
-    clips = {clip for _, clip in rows}
-    if len(clips) != 1:
-        raise SpecError(f"sampler {probe.name} clips x0 at {clips}, not alike at every step.")
-
-    # A chain in order of execution, from fresh timesteps: a scheduler that remembers earlier outputs fails here.
-    set_timesteps(scheduler, steps)
-    for k, (timestep, row) in enumerate(zip(timesteps, rows, strict=True)):
-        x = _verify(probe, timestep, row, x, _draw(100 + k), seed=1000 + k)
-    # And single steps, where x0 is inside its bound and where it is outside.
-    for k, (timestep, row) in enumerate(zip(timesteps, rows, strict=True)):
-        for factor in (0.01, 3.0):
-            (sample_to_x0, out_to_x0, *_), clip = row
-            reach = factor * (clip or 1.0) / max(abs(sample_to_x0), abs(out_to_x0))
-            _verify(probe, timestep, row, reach * _draw(2 * k), reach * out, seed=k)
-
-    numbers = np.array([row for row, _ in rows], dtype=np.float32)
-    columns = dict(zip(SamplerTable.COLUMNS, numbers.T.copy(), strict=True))
-    return SamplerTable(name=name or probe.name, timesteps=timesteps.numpy(), clip=clips.pop(), **columns)
+        distinct = len(set(torch.as_tensor(scheduler.sigmas[:-1]).tolist()))
+        if distinct != steps:
+            raise SpecError(
+                f"sampler {name or name_of}: {scheduler.config.timestep_spacing!r} timestep spacing gives {steps} steps"
+                f" only {distinct} different noise levels. Use fewer steps, or 'trailing' spacing."
+            )
+    chains = _Chains(scheduler, steps, step_arguments or {})
+    rows = _measure(chains)
+    _verify(chains, rows)
+    count = rows.before.shape[1]
+    shift = np.zeros((count, 3 + count))
+    shift[0:1, 0] = 1  # the newest memory is what the output meant
+    shift[range(1, count), range(3, 2 + count)] = 1
+    return SamplerTable(
+        name=name or name_of,
+        timesteps=timesteps.numpy(),
+        clip=rows.clip,
+        **{column: getattr(rows, column).astype(np.float32) for column in SamplerTable.COLUMNS},
+        memory_to_next=rows.before.astype(np.float32),
+        to_memory=np.tile(shift, (steps, 1, 1)).astype(np.float32),
+    )
