@@ -48,5 +48,5 @@ class Instruct:
     def _tokens(self, text: str) -> list[int]:
         """Of one text; the last is kept, since an episode has one."""
         if text not in self._made:
-            self._made = {text: self._tokenizer(self._told.line(text))[self._told.skipped :]}
+            self._made = {text: self._tokenizer.of_task(text, self._told, self._length)}
         return self._made[text]

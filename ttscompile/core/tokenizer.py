@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .coercion import Errors
+from .spec import Instruction
 
 TASK = "task"
 """The key of an instruction's text, as LeRobot has it."""
@@ -67,6 +68,14 @@ class Tokenizer:
             return list(self._tokenizer.encode(text).ids)
         except Exception as refused:
             raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
+
+    def of_task(self, text: str, told: Instruction, length: int) -> list[int]:
+        """The tokens that a policy observes of a task; too many are refused where words after the text would be cut."""
+        tokens = self(told.line(text))[told.skipped :]
+        if told.around and len(tokens) > length:
+            found = f"{len(tokens)} tokens, and the policy reads {length}"
+            raise self._error(f"the task {text!r:.100} has {found}. Use fewer words, or compile it in: convert --task.")
+        return tokens
 
 
 def padded(tokens: Sequence[Sequence[int]], length: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:

@@ -17,12 +17,12 @@ def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) ->
     return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
 
 
-def language_model_folder(name: str, folders: list[Path], kind: str) -> Path:
+def language_model_folder(name: str, folders: list[Path], kind: str, what: str = "language model") -> Path:
     """The folder of a language model whose ``model_type`` begins with ``kind``."""
     found = find_encoder(name, folders, kind)
     if found is None:
         raise CheckpointError(
-            f"the language model {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
+            f"the {what} {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
             f" config.json in {', '.join(dict.fromkeys(map(str, folders)))}. {NAME_FOLDER}"
         )
     return found
@@ -50,3 +50,17 @@ def task_tokens(
         found = f"token {max(tokens)}; the language model has {vocabulary}" if tokens else "no token at all"
         raise CheckpointError(f"{path}: it gives {found}. It belongs to another language model.")
     return tokens
+
+
+def before_images(tokens: list[int], image: int, places: int, folder: Path) -> tuple[tuple[int, ...], ...]:
+    """The tokens of a prompt before each of its images.
+
+    Args:
+        image: the token that stands for one.
+        places: of images that the prompt was written with.
+    """
+    at = [i for i, token in enumerate(tokens) if token == image]
+    if len(at) != places:
+        found = f"{len(at)} tokens {image} (image_token_id) in a prompt of {places} images; expected one for each"
+        raise CheckpointError(f"{folder}: its tokenizer makes {found}. It is of another model than its config.json.")
+    return tuple(tuple(tokens[start + 1 : end]) for start, end in zip([-1, *at], at, strict=False))

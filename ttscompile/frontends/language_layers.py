@@ -1,4 +1,4 @@
-"""Layers of the language models Llama, Gemma and Qwen2, for a prefix that is read once and an expert that reads it.
+"""Layers of the language models Llama, Gemma, Qwen2 and Qwen3, for a prefix that is read once and an expert that reads it.
 
 Attribute names are those under which the weights of transformers load. Keys and values are ``[B, heads, tokens,
 channels]`` with every head written out, so that what depends on the prefix alone is repeated once a call.
@@ -28,6 +28,7 @@ class LanguageConfig:
         epsilon: of the norms.
         gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
         biased: whether queries, keys and values have a bias, as in Qwen2.
+        normed: whether each head's queries and keys are normalised, as in Qwen3.
     """
 
     width: int
@@ -39,6 +40,7 @@ class LanguageConfig:
     epsilon: float = 1e-6
     gemma: bool = False
     biased: bool = False
+    normed: bool = False
 
 
 class Seen(NamedTuple):
@@ -49,11 +51,11 @@ class Seen(NamedTuple):
 
 
 class Norm(nn.Module):
-    """Root mean square normalisation."""
+    """Root mean square normalisation, of the whole width or of ``channels``."""
 
-    def __init__(self, config: LanguageConfig) -> None:
+    def __init__(self, config: LanguageConfig, channels: int | None = None) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.zeros(config.width))
+        self.weight = nn.Parameter(torch.zeros(channels or config.width))
         self.epsilon, self.offset = config.epsilon, 1.0 if config.gemma else 0.0
 
     def forward(self, x: Tensor) -> Tensor:
@@ -73,6 +75,8 @@ class Attention(nn.Module):
         self.k_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.v_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.o_proj = nn.Linear(queries, config.width, bias=False)
+        norms = [Norm(config, config.channels) if config.normed else nn.Identity() for _ in range(2)]
+        self.q_norm, self.k_norm = norms
 
     def split(self, x: Tensor) -> Tensor:
         """``[B, T, heads * channels]`` -> ``[B, heads, T, channels]``."""
@@ -117,9 +121,9 @@ class Layer(nn.Module):
         """The stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``."""
         attention = self.self_attn
         normed = self.input_layernorm(x)
-        keys = rotate(attention.split(attention.k_proj(normed)), turns)
+        keys = rotate(attention.k_norm(attention.split(attention.k_proj(normed))), turns)
         values = attention.split(attention.v_proj(normed))
-        queries = rotate(attention.split(attention.q_proj(normed)), turns)
+        queries = rotate(attention.q_norm(attention.split(attention.q_proj(normed))), turns)
         seen = Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
         x = x + attention.attend(queries, seen, mask)
         return x + self.mlp(self.post_attention_layernorm(x)), keys, values
@@ -167,9 +171,10 @@ class Rotation(NamedTuple):
 
 
 def rotation(positions: Tensor, channels: int, base: float = 10_000) -> Rotation:
-    """The rotary embedding of positions ``[B, T]``."""
+    """The rotary embedding of positions ``[B, T]``; of several axes, ``[B, T, channels / 2]``."""
     rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32))
-    angles = (positions[..., None].to(torch.float32) * rates)[:, None]
+    own = positions if positions.ndim == 3 else positions[..., None]
+    angles = (own.to(torch.float32) * rates)[:, None]
     return Rotation(angles.cos(), angles.sin())
 
 

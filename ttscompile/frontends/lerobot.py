@@ -13,7 +13,15 @@ from typing import Any
 from torch import nn
 
 from ..core.spec import PolicySpec
-from . import lerobot_act, lerobot_diffusion, lerobot_evo1, lerobot_multi_task_dit, lerobot_pi, lerobot_smolvla
+from . import (
+    lerobot_act,
+    lerobot_diffusion,
+    lerobot_evo1,
+    lerobot_groot,
+    lerobot_multi_task_dit,
+    lerobot_pi,
+    lerobot_smolvla,
+)
 from .families import LoadOptions
 from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
@@ -23,6 +31,7 @@ TYPES: Mapping[str, Callable[[Path, Mapping[str, Any], LoadOptions], tuple[nn.Mo
     "act": lerobot_act.load,
     "diffusion": lerobot_diffusion.load,
     "evo1": lerobot_evo1.load,
+    "groot": lerobot_groot.load,
     "multi_task_dit": lerobot_multi_task_dit.load,
     "pi0": lerobot_pi.load,
     "pi05": lerobot_pi.load,

@@ -22,7 +22,7 @@ from .clip import ACTIVATIONS
 from .encoded import EncodedDenoiser
 from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from .families import LoadOptions
-from .instruction import encoder_folders, language_model_folder, task_tokens
+from .instruction import before_images, encoder_folders, language_model_folder, task_tokens
 from .internvl import InternVitConfig, InternVLConfig, Prompt
 from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
@@ -77,7 +77,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     config = read_config(shared, model)
     vocabulary, views = config.language.vocabulary, _views(settings)
     told = Instruction(TOKENS, MASK, False, tuple(_IMAGE.format(i + 1) for i in range(views)))
-    between = _between(task_tokens(told.line(""), name, folder, None, vocabulary, ""), views, folder, model)
+    image = model.number("image_token_id", 151667, _MOST_VOCABULARY)
+    between = before_images(task_tokens(told.line(""), name, folder, None, vocabulary, ""), image, views, folder)
     told = replace(told, skipped=views + sum(map(len, between)))
     images = told.skipped + views * (config.language.image_tokens - 1)
     length = settings.number("max_text_length", 1024, MOST) - images
@@ -221,16 +222,6 @@ def _views(settings: Settings) -> int:
     if cameras > views:
         raise settings.refusal("max_views", f"{cameras} at least, as many as there are cameras", 3)
     return views
-
-
-def _between(tokens: list[int], views: int, folder: Path, model: Settings) -> tuple[tuple[int, ...], ...]:
-    """The tokens of a prompt before each of its images."""
-    image = model.number("image_token_id", 151667, _MOST_VOCABULARY)
-    at = [i for i, token in enumerate(tokens) if token == image]
-    if len(at) != views:
-        found = f"{len(at)} tokens {image} (image_token_id) in a prompt of {views} images; expected one for each"
-        raise CheckpointError(f"{folder}: its tokenizer makes {found}. It is of another model than its config.json.")
-    return tuple(tuple(tokens[start + 1 : end]) for start, end in zip([-1, *at], at, strict=False))
 
 
 def _chunk(settings: Settings, chunk: ChunkSpec) -> ChunkSpec:

@@ -5,7 +5,7 @@ Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,13 @@ _RENAME, _TOKENIZE, NORMALIZE = "rename_observations_processor", "tokenizer_proc
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
 PROMPT = "pi05_prepare_state_tokenizer_processor_step"
-_RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
+RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
 _PAD = ("evo1_pad_state_processor", "evo1_pad_action_processor")
 _CROP = "evo1_action_processor"
 """What it does is in the policy's configuration, which lerobot prefers to the step's own."""
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, _RELATIVE}),
-    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE, _CROP}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, RELATIVE[0]}),
+    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, RELATIVE[1], _CROP}),
 }
 _ONCE = frozenset({_RENAME, _TOKENIZE, NORMALIZE, _UNNORMALIZE})
 
@@ -148,10 +148,10 @@ class Processors:
 
 def read_processors(directory: Path, features: Features) -> Processors:
     """The pipelines of a policy that LeRobot saved, with these features."""
-    before, after = (_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
+    before, after = (read_steps(directory, name) for name in (PREPROCESSOR, POSTPROCESSOR))
     padded = any(step["registry_name"] in _PAD for step in before)
     return Processors(
-        renamed=_renamed(directory, before, features),
+        renamed=renamed_observations(directory, before, features),
         normalizers=_statistics(directory, before, NORMALIZE, features, padded),
         action=_statistics(directory, after, _UNNORMALIZE, features, padded).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
@@ -160,9 +160,13 @@ def read_processors(directory: Path, features: Features) -> Processors:
     )
 
 
-def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
-    """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order."""
-    path = directory / name
+def read_steps(directory: Path, name: str, only: Collection[str] | None = None) -> list[dict[str, Any]]:
+    """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order.
+
+    Args:
+        only: names that are known, of a policy that has steps of its own.
+    """
+    path, known = directory / name, _KNOWN_STEPS[name] if only is None else only
     if not path.is_file():
         raise CheckpointError(
             f"{path}: no such file. Policies saved by lerobot before 0.4 keep their statistics inside the weights:"
@@ -173,17 +177,17 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
         raise CheckpointError(f"{path}: has no list of steps; expected a pipeline that lerobot saved.")
     for step in steps:
         registered = step.get("registry_name")  # a step of somebody's own has a class instead
-        if not isinstance(registered, str) or registered not in _KNOWN_STEPS[name]:
+        if not isinstance(registered, str) or registered not in known:
             raise CheckpointError(
                 f"{path}: the step {step.get('registry_name', step.get('class'))!r:.80} is not known here; expected"
-                f" {', '.join(sorted(_KNOWN_STEPS[name]))}. Do its work outside of the policy, and leave it out."
+                f" {', '.join(sorted(known))}. Do its work outside of the policy, and leave it out."
             )
         if not isinstance(step.setdefault("config", {}), dict):
             raise CheckpointError(f"{path}: the configuration of {registered} is no object.")
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
             found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
             raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
-        if registered in (_RELATIVE, _ABSOLUTE) and step["config"].get("enabled") is not False:
+        if registered in RELATIVE and step["config"].get("enabled") is not False:
             raise CheckpointError(
                 f"{path}: {registered} is enabled: actions are relative to the state, which is not compiled. Expected"
                 " a policy of absolute actions."
@@ -201,7 +205,7 @@ def _steps(directory: Path, name: str) -> list[dict[str, Any]]:
     return steps
 
 
-def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
+def renamed_observations(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
     """The policy's name of each renamed observation -> the robot's."""
     step = next((step for step in steps if step["registry_name"] == _RENAME), None)
     names = {} if step is None else Settings(step["config"], f"{directory}: {_RENAME}.").names("rename_map")
@@ -213,6 +217,14 @@ def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -
             " observation of the policy, and the other way round."
         )
     return renamed
+
+
+def state_of(directory: Path, step: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """The tensors that a step saved; none where it has no file."""
+    file = step.get("state_file")
+    if file is not None and (not isinstance(file, str) or Path(file).name != file or len(file) > 200):
+        raise CheckpointError(f"{directory}: state_file {file!r:.80} is not the name of a file in this directory.")
+    return {} if file is None else read_tensors(directory / file)
 
 
 def _statistics(
@@ -230,10 +242,7 @@ def _statistics(
     modes, eps = settings.names("norm_map"), settings.values.get("eps", 1e-8)
     if not isinstance(eps, float) or not eps > 0:
         raise settings.refusal("eps", "a positive number")
-    file = step.get("state_file")
-    if file is not None and (not isinstance(file, str) or Path(file).name != file or len(file) > 200):
-        raise CheckpointError(f"{directory}: state_file {file!r:.80} is not the name of a file in this directory.")
-    tensors = {} if file is None else read_tensors(directory / file)
+    tensors = state_of(directory, step)
     only, own = settings.values.get("normalize_observation_keys"), settings.values.get("features", {})
     if not isinstance(own, dict):
         raise settings.refusal("features", "type and shape by name")
@@ -255,7 +264,7 @@ def _statistics(
         if missing:
             raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
         own_numbers = {name: _unpadded(name, tensors[name], shape) if padded else tensors[name] for name in names}
-        first, second = (_broadcast(directory, name, value, kind, shape) for name, value in own_numbers.items())
+        first, second = (as_statistic(directory, name, value, kind, shape) for name, value in own_numbers.items())
         if mode == "MEAN_STD" and (second < 0).any():
             raise CheckpointError(f"{directory}: {names[1]} has a deviation below 0. Compute the statistics again.")
         result[key] = Statistics(mode, first, second, eps)
@@ -269,7 +278,7 @@ def _unpadded(name: str, value: torch.Tensor, shape: tuple[int, ...]) -> torch.T
     return own if bool((value[len(own) :] == neutral).all()) else value
 
 
-def _broadcast(directory: Path, name: str, value: torch.Tensor, kind: str, shape: tuple[int, ...]) -> torch.Tensor:
+def as_statistic(directory: Path, name: str, value: torch.Tensor, kind: str, shape: tuple[int, ...]) -> torch.Tensor:
     """A statistic in the shape that broadcasts: one entry a channel; of an image ``[channels, 1, 1]``."""
     value = value.to(torch.float32)
     if kind == "VISUAL" and value.ndim == 1:

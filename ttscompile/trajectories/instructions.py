@@ -37,6 +37,6 @@ def instruction_rows(
     different, rows = np.unique(texts, return_inverse=True)
     made = Tokenizer(tokenizer, TrajectoryError)
     lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in different.tolist()]
-    numbers = [made(told.line(line))[told.skipped :] for line in lines]
-    tokens, mask = padded(numbers, observations[told.tokens].shape[-1])
+    length = observations[told.tokens].shape[-1]
+    tokens, mask = padded([made.of_task(line, told, length) for line in lines], length)
     return {told.tokens: tokens[rows], told.mask: mask[rows]}
