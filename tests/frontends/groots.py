@@ -36,13 +36,13 @@ def save(kind: str, folder: Path) -> Path:
 def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
     """By the names and shapes that lerobot saves."""
     drawn = fill({name: torch.empty(shape) for name, shape in shapes.items()}, 5)
-    # Weights for each embodiment are [kinds, before, after], of which ``fill`` thinks that all but the first are inputs.
+    # Weights of each embodiment are [kinds, before, after]; ``fill`` takes all but the first for inputs.
     return {name: 1.5 * value if name.endswith(".W") else value for name, value in drawn.items()}
 
 
 def observation(call: int) -> dict[str, Array]:
     """One frame; of the second call's images the size is another, and so is the state."""
-    rng = np.random.RandomState(call)
+    rng = np.random.RandomState(call + 3)
     found: dict[str, Array] = {STATE: rng.standard_normal(STATE_DIM).astype(np.float32)}
     return found | {key: rng.uniform(0, 1, (3, *SIZES[call])).astype(np.float32) for key in CAMERAS}
 

@@ -172,7 +172,7 @@ class Instruction:
         new_line: whether the text ends with a new line before it is tokenized.
         before: lines before the text, of a policy that has some. The text is then stripped.
         skipped: the first so many tokens of all together are no part of the observation.
-        around: what is written right before and after the text, of a policy that has such.
+        around: what is in the same line before and after the text, of a policy that has such.
         plain: whether the text is in lower case, and of its signs only letters, digits, spaces and ``_`` are left.
         otherwise: stands for an empty text.
     """

@@ -103,7 +103,10 @@ class _DiT(nn.Module):
         super().__init__()
         width, source = config.layers.hidden_size, config.language.text.width
         self.timestep_encoder: Any = nn.Module()
-        self.timestep_encoder.linear_1, self.timestep_encoder.linear_2 = nn.Linear(_WAVES, width), nn.Linear(width, width)
+        self.timestep_encoder.linear_1, self.timestep_encoder.linear_2 = (
+            nn.Linear(_WAVES, width),
+            nn.Linear(width, width),
+        )
         sources = (None if config.itself and i % 2 else source for i in range(config.layers.num_hidden_layers))
         self.transformer_blocks = nn.ModuleList(_Layer(config.layers, each) for each in sources)
         self.proj_out_1, self.proj_out_2 = nn.Linear(width, 2 * width), nn.Linear(width, config.out)

@@ -1,4 +1,4 @@
-"""Layers of the language models Llama, Gemma, Qwen2 and Qwen3, for a prefix that is read once and an expert that reads it.
+"""Layers of the language models Llama, Gemma and Qwen, for a prefix that is read once and an expert that reads it.
 
 Attribute names are those under which the weights of transformers load. Keys and values are ``[B, heads, tokens,
 channels]`` with every head written out, so that what depends on the prefix alone is repeated once a call.

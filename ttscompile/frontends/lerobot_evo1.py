@@ -24,7 +24,6 @@ from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from .families import LoadOptions
 from .instruction import before_images, encoder_folders, language_model_folder, task_tokens
 from .internvl import InternVitConfig, InternVLConfig, Prompt
-from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
 from .lerobot_vla import (
@@ -33,12 +32,14 @@ from .lerobot_vla import (
     padded_size,
     part_of,
     positive_number,
+    read_language,
     read_vla_config,
     read_vla_processors,
     require_square,
+    rope_of,
     vla_spec,
 )
-from .saved_weights import require_weights
+from .saved_weights import renamed, require_weights
 from .settings import Settings, read_json
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
@@ -139,18 +140,9 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
 def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     """Of the language model's entries; defaults are those of transformers."""
     image, text = part_of(model, "vision_config"), part_of(model, "text_config")
-    for own, entry, expected in (
-        (image, "norm_type", "layer_norm"),
-        (image, "use_qk_norm", False),
-        (image, "use_absolute_position_embeddings", True),
-        (image, "num_channels", 3),
-        (model, "vision_feature_layer", -1),
-        (model, "vision_feature_select_strategy", "default"),
-        (text, "model_type", "qwen2"),
-        (text, "hidden_act", "silu"),
-    ):
-        if own.values.get(entry, expected) != expected:
-            raise own.refusal(entry, f"{expected}: another is not rebuilt here".lower())
+    image.require(norm_type="layer_norm", use_qk_norm=False, use_absolute_position_embeddings=True, num_channels=3)
+    model.require(vision_feature_layer=-1, vision_feature_select_strategy="default")
+    text.require(model_type="qwen2", hidden_act="silu")
     names = {field for field in InternVitConfig.__dataclass_fields__ if field in image.values}
     sizes = {name: _side(image, name) for name in names & {"image_size", "patch_size"}}
     vision = InternVitConfig(**{name: image.values[name] for name in names} | sizes)
@@ -158,22 +150,12 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     scale = max(int(1 / ratio), 1)
     if abs(scale * ratio - 1) > 1e-6 or vision.side % scale:
         raise model.refusal("downsample_ratio", f"one of so many of the {vision.side} patches along a side", 0.5)
-    width, heads = text.number("hidden_size", 4096, MOST), text.number("num_attention_heads", 32, MOST)
     there, wanted = text.number("num_hidden_layers", 32, _MOST_LAYERS), settings.values.get("vlm_num_layers", 14)
     if wanted is not None and type(wanted) is not int:
         raise settings.refusal("vlm_num_layers", "a whole number, or null for all", 14)
-    language = LanguageConfig(
-        width=width,
-        hidden=text.number("intermediate_size", 22016, MOST),
-        layers=len(range(there)[:wanted]),
-        heads=heads,
-        groups=heads if text.values.get("num_key_value_heads", 32) is None else text.number("num_key_value_heads", 32),
-        channels=text.number("head_dim", width // heads, MOST),
-        epsilon=positive_number(text, "rms_norm_eps", 1e-6),
-        biased=True,
-    )
-    if heads % language.groups or language.channels % 2:
-        raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
+    heads = text.number("num_attention_heads", 32, MOST)
+    language = read_language(text, len(range(there)[:wanted]), text.number("hidden_size", 4096, MOST) // heads)
+    language = replace(language, biased=True)
     if text.flag("use_sliding_window", False):
         raise text.refusal("use_sliding_window", "false: layers that see a part of the words are not rebuilt here")
     config = InternVLConfig(
@@ -191,11 +173,8 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
 
 def _rotary_base(text: Settings, longest: int) -> float:
     """Of the rotary embedding; a dynamic one is another only where more words than in training are read."""
-    found = text.values.get("rope_parameters") or text.values.get("rope_scaling") or {}
-    if not isinstance(found, dict):
-        raise text.refusal("rope_parameters", "settings by name")
-    rope = Settings({"rope_theta": text.values.get("rope_theta", 10_000.0), **found}, f"{text.where}rope_parameters.")
-    name = "rope_type" if "rope_type" in found else "type"
+    rope = rope_of(text, 10_000.0)
+    name = "rope_type" if "rope_type" in rope.values else "type"
     if rope.choice(name, "default", "dynamic") == "dynamic":
         most = text.number("max_position_embeddings", 32768)
         if longest > most:
@@ -256,9 +235,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, config: Evo1Config, mo
     unread = (".embeddings.mask_token", *((".seq_pool_proj.weight", ".seq_pool_proj.bias") * (config.chunk_size == 1)))
     found = dict[str, Tensor]()
     for saved, value in read_weights(shared, options, *unread).items():
-        name = saved
-        for pattern, new in (_SHARED, *_RENAMED) if kinds == 1 else _RENAMED:
-            name = re.sub(pattern, new, name)
+        name = renamed(saved, (_SHARED, *_RENAMED) if kinds == 1 else _RENAMED)
         if kinds > 1 and _BY_KIND.search(name) and len(value) == kinds:
             value = value[own].T.contiguous() if value.ndim == 3 else value[own].clone()
         found[name] = value

@@ -25,22 +25,44 @@ from .families import LoadOptions
 from .groot import Denoiser, Groot, GrootConfig, Prefix
 from .instruction import before_images, encoder_folders, language_model_folder, task_tokens
 from .internvl import Prompt
-from .language_layers import LanguageConfig
 from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Packed, Seen, read_groot_processors
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
-from .lerobot_vla import Gathered, flow_matching, part_of, positive_number, read_vla_config, vla_spec
+from .lerobot_vla import (
+    Gathered,
+    flow_matching,
+    part_of,
+    positive_number,
+    read_language,
+    read_vla_config,
+    rope_of,
+    vla_spec,
+)
 from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
-from .saved_weights import require_weights
+from .saved_weights import renamed, require_weights
 from .settings import Settings, read_json
 
 _BASE, _BACKBONE = "nvidia/GR00T-N1.7-3B", "nvidia/Cosmos-Reason2-2B"
 _MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS, _MOST_KINDS, _MOST_PATCHES = 512, 2**20, 400, 4096, 2**22
 _LENGTH = 64
 """Tokens of an instruction with what is after it, of a policy that none is compiled into; lerobot has no limit."""
-_TURN, _IMAGE, _END = "<|im_start|>user\n", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>\n"
+_TURN, _IMAGE, _END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""
 _EMPTY = "Perform the task."
+_DEFAULTS = {
+    "backbone_embedding_dim": 2048,
+    "input_embedding_dim": 1536,
+    "hidden_size": 1024,
+    "max_state_dim": 132,
+    "max_action_dim": 132,
+    "max_num_embodiments": 32,
+    "max_seq_len": 1024,
+    "action_horizon": 40,
+    "select_layer": 16,
+    "num_inference_timesteps": 4,
+    "num_timestep_buckets": 1000,
+}
+"""What lerobot takes for an entry that a base model leaves out."""
 _INNER = "_groot_model.backbone.model."
 _EMBEDDING = "backbone.language_model.embed_tokens.weight"
 _RENAMED = (
@@ -67,7 +89,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     folders = encoder_folders(options.encoders, directory)
     name = settings.text("base_model_path", _BASE, _MOST_LETTERS)
     folder = language_model_folder(name, folders, "Gr00tN1d7", "base model")
-    base = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")
+    base = Settings(_DEFAULTS | read_json(folder / CONFIG), f"{folder / CONFIG}: ")
     name = base.text("model_name", _BACKBONE, _MOST_LETTERS)
     folder = language_model_folder(name, folders, "qwen3_vl", "backbone")
     model = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")
@@ -93,7 +115,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     if STATE in processors.normalizers:
         encoder.normalizer = Packed(processors.normalizers[STATE], processors.clipped)
     edge, bounded = processors.geometry.edge, processors.bounded
-    steps = base.number("num_inference_timesteps", 4), base.number("num_timestep_buckets", 1000, 2**20)
+    steps = base.number("num_inference_timesteps"), base.number("num_timestep_buckets", most=2**20)
 
     def table(each: LoadOptions) -> SamplerTable:
         return _sampler(settings, each, *steps, bounded)
@@ -135,17 +157,8 @@ def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -
     settings = Settings(read_json(folder / (name := "preprocessor_config.json")), f"{folder / name}: ")
     vision, half = part_of(model, "vision_config"), [0.5] * 3
     patch, merge = vision.number("patch_size", 16, MOST), vision.number("spatial_merge_size", 2, MOST)
-    for entry, expected in (
-        ("patch_size", patch),
-        ("merge_size", merge),
-        ("temporal_patch_size", vision.number("temporal_patch_size", 2, MOST)),
-        ("image_mean", half),
-        ("image_std", half),
-        ("do_normalize", True),
-        ("do_rescale", True),
-    ):
-        if settings.values.get(entry, expected if entry[:2] == "do" else None) != expected:
-            raise settings.refusal(entry, f"{expected}")
+    own = Settings({"patch_size": None, "merge_size": None} | settings.values, settings.where)
+    own.require(patch_size=patch, merge_size=merge, image_mean=half, image_std=half, do_normalize=True, do_rescale=True)
     side, size = processors.geometry.target, part_of(settings, "size")
     least, most = (size.number(f"{entry}_edge", most=2**31) for entry in ("shortest", "longest"))
     if side % (patch * merge) or not least <= side**2 <= most:
@@ -166,38 +179,33 @@ def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -
 def read_config(base: Settings, model: Settings, processors: GrootProcessors) -> GrootConfig:
     """Sizes and variant, of the entries of the base model and of its backbone."""
     language, dit = _read_language(base, model, processors.geometry.target), part_of(base, "diffusion_model_cfg")
-    width, out = _tower(dit, language), dit.number("output_dim", most=MOST)
-    mixing = None
-    if base.values.get("vl_self_attention_cfg"):
-        own = part_of(base, "vl_self_attention_cfg")
-        mixing = _tower(own, language) if own.values.get("num_layers") != 0 else None
-    kinds = base.number("max_num_embodiments", 32, _MOST_KINDS)
-    for entry, expected, default in (
-        ("backbone_embedding_dim", language.text.width, 2048),
-        ("input_embedding_dim", width.hidden_size, 1536),
-        ("hidden_size", out, 1024),
-        ("state_history_length", 1, 1),
-        ("max_state_dim", processors.padded[0], 132),
-        ("max_action_dim", processors.padded[1], 132),
-    ):
-        if base.values.get(entry, default) != expected:
-            raise base.refusal(entry, f"{expected}, as the parts beside it have it", default)
-    if mixing is not None and mixing.hidden_size != language.text.width:
-        raise base.refusal("vl_self_attention_cfg", f"heads of {language.text.width} channels together")
-    if processors.embodiment >= kinds:
-        raise base.refusal("max_num_embodiments", f"more than {processors.embodiment}, that of {processors.kind}", 32)
+    layers, width = _tower(dit), language.text.width
+    mixing = part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
+    mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None
+    base.require(
+        backbone_embedding_dim=width,
+        input_embedding_dim=layers.hidden_size,
+        hidden_size=(out := dit.number("output_dim", 26, MOST)),
+        state_history_length=1,
+        max_state_dim=processors.padded[0],
+        max_action_dim=processors.padded[1],
+    )
+    if mixed is not None and mixed.hidden_size != width:
+        raise base.refusal("vl_self_attention_cfg", f"heads of {width} channels together")
+    if processors.embodiment >= base.number("max_num_embodiments", most=_MOST_KINDS):
+        raise base.refusal("max_num_embodiments", f"more than {processors.embodiment}, that of {processors.kind}")
     itself, apart = dit.flag("interleave_self_attention", False), base.flag("use_alternate_vl_dit", True)
     if apart and not itself:
         raise dit.refusal("interleave_self_attention", "true, with use_alternate_vl_dit")
-    horizon = base.number("action_horizon", 40, MOST)
-    places = base.number("max_seq_len", 1024, MOST) if base.flag("add_pos_embed", True) else None
+    horizon = base.number("action_horizon", most=MOST)
+    places = base.number("max_seq_len", most=MOST) if base.flag("add_pos_embed", True) else None
     if places is not None and places < horizon:
-        raise base.refusal("max_seq_len", f"at least the {horizon} actions of a chunk", 1024)
+        raise base.refusal("max_seq_len", f"at least the {horizon} actions of a chunk")
     return GrootConfig(
         language=language,
-        mixing=mixing,
+        mixing=mixed,
         normed=base.flag("use_vlln", True),
-        layers=width,
+        layers=layers,
         out=out,
         state=processors.padded[0],
         actions=processors.padded[1],
@@ -208,17 +216,15 @@ def read_config(base: Settings, model: Settings, processors: GrootProcessors) ->
     )
 
 
-def _tower(own: Settings, language: Qwen3VLConfig) -> TowerConfig:
+def _tower(own: Settings) -> TowerConfig:
     """Layers of diffusers, of the head or of what mixes the language model's features."""
-    for entry, expected, default in (
-        ("positional_embeddings", None, "sinusoidal"),
-        ("activation_fn", "gelu-approximate", "gelu-approximate"),
-        ("attention_bias", True, True),
-        ("norm_type", "ada_norm", "ada_norm"),
-        ("norm_elementwise_affine", False, False),
-    ):
-        if own.values.get(entry, default) != expected:
-            raise own.refusal(entry, f"{expected}: another is not rebuilt here".lower(), default)
+    Settings({"positional_embeddings": "sinusoidal"} | own.values, own.where).require(
+        positional_embeddings=None,
+        activation_fn="gelu-approximate",
+        attention_bias=True,
+        norm_type="ada_norm",
+        norm_elementwise_affine=False,
+    )
     heads = own.number("num_attention_heads", 8, MOST)
     width = heads * own.number("attention_head_dim", 64, MOST)
     return TowerConfig(
@@ -234,19 +240,10 @@ def _tower(own: Settings, language: Qwen3VLConfig) -> TowerConfig:
 def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
     """Of the backbone's entries; defaults are those of transformers."""
     image, text = part_of(model, "vision_config"), part_of(model, "text_config")
-    found = text.values.get("rope_parameters") or text.values.get("rope_scaling") or {}
-    if not isinstance(found, dict):
-        raise text.refusal("rope_parameters", "settings by name")
-    rope = Settings({"rope_theta": text.values.get("rope_theta", 5e5), **found}, f"{text.where}rope_parameters.")
-    for own, entry, expected in (
-        (image, "in_channels", 3),
-        (text, "hidden_act", "silu"),
-        (text, "attention_bias", False),
-        (rope, "rope_type", "default"),
-        (rope, "mrope_interleaved", True),
-    ):
-        if own.values.get(entry, expected) != expected:
-            raise own.refusal(entry, f"{expected}: another is not rebuilt here".lower())
+    rope = rope_of(text, 5e5)
+    image.require(in_channels=3, out_hidden_size=text.values.get("hidden_size"))
+    text.require(hidden_act="silu", attention_bias=False)
+    rope.require(rope_type="default", mrope_interleaved=True)
     depth, table = image.number("depth", 27, _MOST_LAYERS), image.number("num_position_embeddings", 2304, _MOST_PATCHES)
     stacked, sections = image.values.get("deepstack_visual_indexes", [8, 16, 24]), rope.values.get("mrope_section")
     if not isinstance(stacked, list) or len(set(map(str, stacked)) & set(map(str, range(depth)))) < len(stacked):
@@ -270,22 +267,11 @@ def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
     )
     if vision.hidden_size // vision.num_attention_heads % 4:
         raise image.refusal("num_heads", "heads of a multiple of 4 channels")
-    width, heads = text.number("hidden_size", 4096, MOST), text.number("num_attention_heads", 32, MOST)
-    language = LanguageConfig(
-        width=width,
-        hidden=text.number("intermediate_size", 22016, MOST),
-        layers=min(text.number("num_hidden_layers", 32, _MOST_LAYERS), base.number("select_layer", 16)),
-        heads=heads,
-        groups=text.number("num_key_value_heads", 32, MOST),
-        channels=text.number("head_dim", 128, MOST),
-        epsilon=positive_number(text, "rms_norm_eps", 1e-6),
-        normed=True,
-    )
-    if heads % language.groups or language.channels % 2:
-        raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
+    layers = min(text.number("num_hidden_layers", 32, _MOST_LAYERS), base.number("select_layer"))
+    language = replace(read_language(text, layers, 128), normed=True)
     vocabulary = text.number("vocab_size", 151936, _MOST_VOCABULARY)
-    base_angle = positive_number(rope, "rope_theta", 5e5)
-    return Qwen3VLConfig(vision, language, vocabulary, (sections[1], sections[2]), base_angle)
+    angle = positive_number(rope, "rope_theta", 5e5)
+    return Qwen3VLConfig(vision, language, vocabulary, (sections[1], sections[2]), angle)
 
 
 def _narrowed(shared: LeRobotConfig, processors: GrootProcessors, config: GrootConfig) -> LeRobotConfig:
@@ -306,8 +292,8 @@ def _prompt(
 ) -> tuple[Prompt, Instruction]:
     """What is before each image, and how a task is told."""
     shown = len(processors.cameras) * processors.frames
-    around = (_TURN + _IMAGE * shown, _END)
-    told = Instruction(TOKENS, MASK, False, around=around, plain=processors.plain, otherwise=_EMPTY)
+    own = {"around": (_IMAGE * shown, _END), "plain": processors.plain, "otherwise": _EMPTY}
+    told = Instruction(TOKENS, MASK, True, (_TURN,), **own)
     tokens = task_tokens(told.line(""), name, folder, None, vocabulary, "")
     between = before_images(tokens, model.number("image_token_id", 151655, _MOST_VOCABULARY), shown, folder)
     skipped = shown + sum(map(len, between))
@@ -340,9 +326,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, config: GrootConfig, k
         if saved.startswith(_INNER):
             inner[saved.removeprefix(f"{_INNER}model.")] = value
             continue
-        name = saved
-        for pattern, new in _RENAMED:
-            name = re.sub(pattern, new, name)
+        name = renamed(saved, _RENAMED)
         if name.endswith((".W", ".b")):
             own, axes = (".weight", 3) if name.endswith(".W") else (".bias", 2)
             if value.ndim != axes or len(value) <= kind:

@@ -127,9 +127,7 @@ def read_groot_processors(directory: Path, features: Features) -> GrootProcessor
     pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
     decode = _one(directory, after, _UNPACK, _DECODE)
     packing = _settings(directory, pack)
-    for entry, expected in (("state_horizon", 1), ("language_key", TASK)):
-        if packing.values.get(entry, expected) != expected:
-            raise packing.refusal(entry, str(expected))
+    packing.require(state_horizon=1, language_key=TASK)
     kind, known = packing.values.get("embodiment_tag"), packing.values.get("embodiment_mapping")
     number = known.get(kind) if isinstance(known, dict) and isinstance(kind, str) else None
     if not isinstance(kind, str) or type(number) is not int or number < 0:
@@ -186,9 +184,7 @@ def _cameras(packing: Settings, features: Features) -> tuple[str, ...]:
 
 
 def _geometry(encoding: Settings) -> Geometry:
-    for entry, what in (("use_albumentations", "resizes with another filter"), ("letter_box_transform", "pads images")):
-        if encoding.flag(entry, False):
-            raise encoding.refusal(entry, f"false: what {what} is not rebuilt here")
+    encoding.require(use_albumentations=False, letter_box_transform=False)
     target = encoding.size("image_target_size", None, MOST_PIXELS)
     if target is None or target[0] != target[1]:
         raise encoding.refusal("image_target_size", "height and width of a square")
@@ -214,33 +210,20 @@ def _actions(
         tensors = state_of(directory, step) if settings.flag("normalize_min_max", True) else {}
         statistics = _statistics(directory, tensors, ACTION, features)
         if tensors and statistics is None:
-            raise CheckpointError(f"{directory}: {_UNPACK} needs {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}.")
+            raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
         return statistics, statistics is not None and settings.flag("clip_normalized_action", False), None
-    groups, raw = _groups(settings), settings.values.get("raw_stats")
-    first, last = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
-    ends = []
-    for end in (first, last):
-        try:
-            ends.append([float(number) for name in groups for number in raw["action"][name][end]])  # type: ignore[index]
-        except (KeyError, TypeError, ValueError) as error:
-            raise settings.error(f"raw_stats has no numbers {end} of each of {', '.join(groups)[:300]}") from error
-    tensors = {f"{ACTION}.{name}": torch.tensor(end) for name, end in zip(("min", "max"), ends, strict=True)}
-    steps = settings.values["modality_config"]["action"].get("delta_indices")
-    return _statistics(directory, tensors, ACTION, features), True, len(steps) if isinstance(steps, list) and steps else None
-
-
-def _groups(settings: Settings) -> list[str]:
-    """Names of the groups of an action, none of which may be relative to the state."""
-    config = settings.values.get("modality_config")
-    action = config.get("action") if isinstance(config, dict) else None
-    groups = action.get("modality_keys") if isinstance(action, dict) else None
-    if not isinstance(groups, list) or not groups or not all(isinstance(name, str) for name in groups):
-        raise settings.error("modality_config names no groups of the action; expected modality_keys")
-    each = action.get("action_configs") or []
-    relative = any(isinstance(one, dict) and str(one.get("rep")).lower() == "relative" for one in each)
-    if settings.flag("use_relative_action", False) and relative:
+    if settings.flag("use_relative_action", False):
         raise settings.refusal("use_relative_action", "false: actions relative to the state are not compiled")
-    return groups
+    names = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
+    try:
+        raw, own = settings.values["raw_stats"]["action"], settings.values["modality_config"]["action"]
+        ends = [[float(number) for group in own["modality_keys"] for number in raw[group][name]] for name in names]
+        steps = len(own.get("delta_indices") or ()) or None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        expected = f"groups of an action in modality_config, and numbers {' and '.join(names)} of each in raw_stats"
+        raise settings.error(f"{error!r:.80}; expected {expected}") from error
+    tensors = {f"{ACTION}.{name}": torch.tensor(end) for name, end in zip(("min", "max"), ends, strict=True)}
+    return _statistics(directory, tensors, ACTION, features), True, steps
 
 
 def _statistics(directory: Path, tensors: Mapping[str, Tensor], key: str, features: Features) -> Statistics | None:

@@ -18,6 +18,7 @@ from ..core.spec import WITHOUT, Instruction, ObservationSpec, PolicySpec, Sampl
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
 from .families import LoadOptions
+from .language_layers import LanguageConfig
 from .lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
 from .lerobot_policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
 from .lerobot_processors import Normalizer, Processors, read_processors
@@ -180,3 +181,29 @@ def part_of(model: Settings, name: str) -> Settings:
     if not isinstance(inner, dict):
         raise model.refusal(name, "its entries")
     return Settings(inner, f"{model.where}{name}.")
+
+
+def read_language(text: Settings, layers: int, channels: int) -> LanguageConfig:
+    """Sizes of a language model, of which so many layers are used; ``channels`` of a head where it does not say."""
+    heads = text.number("num_attention_heads", 32, MOST)
+    known = text.values.get("num_key_value_heads", 32) is not None
+    config = LanguageConfig(
+        width=text.number("hidden_size", 4096, MOST),
+        hidden=text.number("intermediate_size", 22016, MOST),
+        layers=layers,
+        heads=heads,
+        groups=text.number("num_key_value_heads", 32) if known else heads,
+        channels=text.number("head_dim", channels, MOST),
+        epsilon=positive_number(text, "rms_norm_eps", 1e-6),
+    )
+    if heads % config.groups or config.channels % 2:
+        raise text.error(f"{heads} heads of {config.channels} channels do not fit {config.groups} of keys")
+    return config
+
+
+def rope_of(text: Settings, base: float) -> Settings:
+    """What a language model says of its rotary embedding; ``base`` where it says nothing of that."""
+    found = text.values.get("rope_parameters") or text.values.get("rope_scaling") or {}
+    if not isinstance(found, dict):
+        raise text.refusal("rope_parameters", "settings by name")
+    return Settings({"rope_theta": text.values.get("rope_theta", base), **found}, f"{text.where}rope_parameters.")

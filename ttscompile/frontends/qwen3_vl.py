@@ -7,7 +7,6 @@ Sources: Bai et al., Qwen3-VL (arXiv 2511.21631); Meng et al., DeepStack (arXiv 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ from ..errors import CheckpointError
 from .clip import ImageTowerConfig, Layers
 from .internvl import Prompt
 from .language_layers import LanguageConfig, Layer, Rotation, added, rotation
+from .saved_weights import renamed
 from .siglip import squares
 
 _RENAMED = (
@@ -98,7 +98,7 @@ class _Merger(nn.Module):
 
 
 class _Vision(nn.Module):
-    """Pixels in -1..1 ``[N, 3, size, size]`` to tokens, and after them those of each stacked layer, as more channels."""
+    """Pixels in -1..1 ``[N, 3, size, size]`` to tokens; after them those of each stacked layer, as more channels."""
 
     def __init__(self, config: QwenVisionConfig, width: int) -> None:
         super().__init__()
@@ -203,16 +203,15 @@ def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[
         CheckpointError: positions that are not a square of what is configured.
     """
     found = dict[str, Tensor]()
-    for name, value in saved.items():
-        for pattern, new in _RENAMED:
-            name = re.sub(pattern, new, name)
+    for own, value in saved.items():
+        name = renamed(own, _RENAMED)
         if name == "visual.embeddings.patch_embedding.weight" and value.ndim == 5:
             value = value.sum(2)
         elif name == "visual.embeddings.positions":
             value = _between_positions(value, config.vision)
         elif ".attn.qkv." in name:
             thirds = zip("qkv", value.chunk(3), strict=False)
-            found |= {name.replace("attn.qkv", f"self_attn.{one}_proj"): own.clone() for one, own in thirds}
+            found |= {name.replace("attn.qkv", f"self_attn.{one}_proj"): each.clone() for one, each in thirds}
             continue
         found[name] = value
     return found
@@ -221,7 +220,9 @@ def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[
 def _between_positions(table: Tensor, config: QwenVisionConfig) -> Tensor:
     """Of a square of trained positions ``[N, width]`` those of an image, bilinear; corners stay corners."""
     if len(table) != config.table**2:
-        raise CheckpointError(f"there are {len(table)} positions of patches; expected {config.table} by {config.table}.")
+        raise CheckpointError(
+            f"there are {len(table)} positions of patches; expected {config.table} by {config.table}."
+        )
     at = torch.linspace(0, config.table - 1, config.side)
     low = at.int()
     share, high = (at - low)[:, None, None], (low + 1).clamp(max=config.table - 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,13 @@ def names_of(keys: Sequence[str]) -> str:
     """A few names and how many more there are."""
     more = f" and {len(keys) - SHOWN} more" if len(keys) > SHOWN else ""
     return ", ".join(keys[:SHOWN]) + more
+
+
+def renamed(name: str, rules: Sequence[tuple[str, str]]) -> str:
+    """The name after all of these patterns and what they become, one after the other."""
+    for pattern, new in rules:
+        name = re.sub(pattern, new, name)
+    return name
 
 
 def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.Tensor]:
