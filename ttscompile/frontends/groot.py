@@ -135,11 +135,11 @@ class Groot(nn.Module):
 
 
 class Prefix(nn.Module):
-    """What the network reads once a call."""
+    """What the network reads once a call; ``seen`` makes of an image what the backbone sees of it."""
 
-    def __init__(self, network: Groot) -> None:
+    def __init__(self, network: Groot, seen: nn.Module) -> None:
         super().__init__()
-        head = network.action_head
+        head, self.seen = network.action_head, seen
         self.backbone, self.norm, self.mixing = network.backbone, head.vlln, head.vl_self_attention
         self.state_encoder, self.apart = head.state_encoder, network.config.words_every is not None
 
@@ -154,7 +154,7 @@ class Prefix(nn.Module):
             mask: bool ``[B, L]``.
             state: padded ``[B, Ds]``.
         """
-        features, valid = self.backbone(images, tokens, mask)
+        features, valid = self.backbone([self.seen(image) for image in images], tokens, mask)
         features, own = self.norm(features), self.state_encoder(state)[:, None]
         if self.mixing is not None:
             features = self.mixing(features, added(valid[:, None, None, :]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import NamedTuple
 
 import torch
@@ -127,6 +128,30 @@ class Layer(nn.Module):
         seen = Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
         x = x + attention.attend(queries, seen, mask)
         return x + self.mlp(self.post_attention_layernorm(x)), keys, values
+
+
+class Words(nn.Module):
+    """A language model but for its last norm: the embedding of its tokens, and its layers."""
+
+    def __init__(self, vocabulary: int, config: LanguageConfig) -> None:
+        super().__init__()
+        self.embed_tokens = nn.Embedding(vocabulary, config.width)
+        self.layers = nn.ModuleList(Layer(config) for _ in range(config.layers))
+
+
+def laid(seen: Iterable[Tensor], words: Iterable[Tensor | None], last: Tensor) -> Tensor:
+    """A prompt ``[B, S, width]``: words before each image, what is of the image, and what is after the last one.
+
+    Args:
+        seen: ``[B, tokens, width]`` of each image; of fewer than there are places for, the others are left out.
+        words: before each place, ``[1, n, width]``, or None.
+        last: ``[B, L, width]``.
+    """
+    parts = [last]
+    for own, image in zip_longest(words, seen):
+        parts[-1:-1] = [] if own is None else [own.expand(len(last), -1, -1)]
+        parts[-1:-1] = [] if image is None else [image]
+    return torch.cat(parts, 1)
 
 
 def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:

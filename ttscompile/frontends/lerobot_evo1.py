@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from ..core.spec import Affine, ChunkSpec, Instruction, PolicySpec, SamplerTable
-from ..errors import CheckpointError
 from .clip import ACTIVATIONS
 from .encoded import EncodedDenoiser
 from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
@@ -39,7 +38,7 @@ from .lerobot_vla import (
     rope_of,
     vla_spec,
 )
-from .saved_weights import renamed, require_weights
+from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
@@ -91,14 +90,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     else:
         tokens = task_tokens(told.line(options.task), name, folder, None, vocabulary, "")
         task = torch.tensor([tokens[told.skipped :][:length]])
-    weights = _weights(shared, options, config, model)
-    try:
-        with torch.device("meta"):  # compared before anything of the configured sizes takes memory
-            network = Evo1(config, Prompt(between, len(shared.cameras)))
-        require_weights(network.state_dict(), weights, "config.json, or the language model's,")
-        network.load_state_dict(weights, assign=True)
-    except CheckpointError as error:
-        raise CheckpointError(f"{directory}: {error}") from error
+    weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
+    network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
     encoder = Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
     side = config.language.vision.image_size
     spec = vla_spec(shared, processors, (side, side), "stretch", sizes, options, lambda each: _sampler(settings, each))

@@ -26,7 +26,7 @@ from .groot import Denoiser, Groot, GrootConfig, Prefix
 from .instruction import before_images, encoder_folders, language_model_folder, task_tokens
 from .internvl import Prompt
 from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
-from .lerobot_groot_steps import OLD, GrootProcessors, Packed, Seen, read_groot_processors
+from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
 from .lerobot_vla import (
     Gathered,
@@ -39,7 +39,7 @@ from .lerobot_vla import (
     vla_spec,
 )
 from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
-from .saved_weights import renamed, require_weights
+from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _BASE, _BACKBONE = "nvidia/GR00T-N1.7-3B", "nvidia/Cosmos-Reason2-2B"
@@ -104,16 +104,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         tokens = task_tokens(told.line(options.task), name, folder, None, config.language.vocabulary, "")
         task = torch.tensor([tokens[told.skipped :]])
     weights = _weights(shared, options, config, processors.embodiment)
-    try:
-        with torch.device("meta"):  # compared before anything of the configured sizes takes memory
-            network = Groot(config, prompt)
-        require_weights(network.state_dict(), weights, "config.json, or the base model's,")
-        network.load_state_dict(weights, assign=True)
-    except CheckpointError as error:
-        raise CheckpointError(f"{directory}: {error}") from error
-    encoder = Gathered(shared, processors, _Shown(Seen(processors.geometry), Prefix(network)), config.state, task)
-    if STATE in processors.normalizers:
-        encoder.normalizer = Packed(processors.normalizers[STATE], processors.clipped)
+    network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
+    encoder = Gathered(shared, processors, Prefix(network, Seen(processors.geometry)), config.state, task)
     edge, bounded = processors.geometry.edge, processors.bounded
     steps = base.number("num_inference_timesteps"), base.number("num_timestep_buckets", most=2**20)
 
@@ -124,17 +116,6 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     source = {**spec.source, "embodiment": processors.kind}
     spec = replace(spec, source=source, instruction=told if task is None else None)
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
-
-
-class _Shown(nn.Module):
-    """Images as the backbone sees them, before what reads them."""
-
-    def __init__(self, seen: Seen, prefix: Prefix) -> None:
-        super().__init__()
-        self.seen, self.prefix = seen, prefix
-
-    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
-        return self.prefix([self.seen(image) for image in images], tokens, mask, state)  # type: ignore[no-any-return]
 
 
 def _require_version(settings: Settings) -> None:

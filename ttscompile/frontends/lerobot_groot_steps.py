@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -52,8 +52,7 @@ class GrootProcessors(Processors):
         embodiment: number of the robot among those that the policy was trained with.
         kind: its name.
         plain: whether instructions are in lower case and without signs.
-        clipped: whether numbers of the state that are out of range are clipped.
-        bounded: whether actions are, before they are unnormalised.
+        bounded: whether actions are clipped before they are unnormalised.
         executed: actions of a chunk that mean something; None for all.
         padded: numbers of a state and of an action, padded.
         geometry: of the images.
@@ -64,15 +63,13 @@ class GrootProcessors(Processors):
     embodiment: int
     kind: str
     plain: bool
-    clipped: bool
     bounded: bool
     executed: int | None
     padded: tuple[int, int]
     geometry: Geometry
 
 
-@dataclass(frozen=True)
-class Geometry:
+class Geometry(NamedTuple):
     """Sides of images in pixels: as they are first resized, what of that is kept in the middle, and what is seen."""
 
     edge: int
@@ -85,37 +82,17 @@ class Seen(nn.Module):
 
     def __init__(self, geometry: Geometry) -> None:
         super().__init__()
-        self.geometry, crop, target = geometry, geometry.crop, geometry.target
+        self.geometry, (_, crop, target) = geometry, geometry
         self.zoom = ResizeCrop(crop, crop, (target, target), mode="bicubic")
 
     def forward(self, image: Tensor) -> Tensor:
         """See the class."""
-        edge, crop, target = self.geometry.edge, self.geometry.crop, self.geometry.target
+        edge, crop, target = self.geometry
         if edge == crop == target:
             return image
         start = (edge - crop) // 2
         pixels = ((image[:, :, start : start + crop, start : start + crop] + 1) * 127.5).round()
         return self.zoom(pixels).clamp(0, 255).round() / 127.5 - 1  # type: ignore[no-any-return]
-
-
-class Packed(nn.Module):
-    """A state's ``2 (x - low) / range - 1``, zero where there is no range; clipped, if it is so configured."""
-
-    low: Tensor
-    width: Tensor
-    still: Tensor
-
-    def __init__(self, statistics: Statistics, clipped: bool) -> None:
-        super().__init__()
-        self.clipped, still = clipped, statistics.second == statistics.first
-        self.register_buffer("low", statistics.first, persistent=False)
-        self.register_buffer("width", statistics.width, persistent=False)
-        self.register_buffer("still", still, persistent=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``[..., D]`` -> the same."""
-        scaled = torch.where(self.still, 0.0, 2 * (x - self.low) / self.width - 1)
-        return scaled.clamp(-1, 1) if self.clipped else scaled
 
 
 def read_groot_processors(directory: Path, features: Features) -> GrootProcessors:
@@ -127,7 +104,7 @@ def read_groot_processors(directory: Path, features: Features) -> GrootProcessor
     pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
     decode = _one(directory, after, _UNPACK, _DECODE)
     packing = _settings(directory, pack)
-    packing.require(state_horizon=1, language_key=TASK)
+    packing.require(state_horizon=1, language_key=TASK, clip_outliers=True)
     kind, known = packing.values.get("embodiment_tag"), packing.values.get("embodiment_mapping")
     number = known.get(kind) if isinstance(known, dict) and isinstance(kind, str) else None
     if not isinstance(kind, str) or type(number) is not int or number < 0:
@@ -152,7 +129,6 @@ def read_groot_processors(directory: Path, features: Features) -> GrootProcessor
         embodiment=number,
         kind=kind,
         plain=packing.flag("formalize_language", True),
-        clipped=packing.flag("clip_outliers", True),
         bounded=bounded,
         executed=executed,
         padded=(packing.number("max_state_dim", 132), packing.number("max_action_dim", 132)),
@@ -233,4 +209,4 @@ def _statistics(directory: Path, tensors: Mapping[str, Tensor], key: str, featur
         return None
     kind, shape = features[key]
     low, high = (as_statistic(directory, name, tensors[name], kind, shape) for name in names)
-    return Statistics("MIN_MAX", low, high, _EPSILON)
+    return Statistics("MIN_MAX", low, high, _EPSILON, clipped=True)

@@ -34,7 +34,7 @@ from .lerobot_vla import (
     vla_spec,
 )
 from .pi import Expert, Pi, PiConfig, Prefix
-from .saved_weights import require_weights
+from .saved_weights import filled
 from .siglip import SiglipConfig
 
 _VISION = "paligemma_with_expert.paligemma.model.vision_tower."
@@ -58,12 +58,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     weights = _weights(shared, options)
     try:
         config = read_config(shared, weights, adaptive)
-        with torch.device("meta"):
-            network = Pi(config)
-        require_weights(network.state_dict(), weights, CONFIG)
-        network.load_state_dict(weights, assign=True)
     except CheckpointError as error:
         raise CheckpointError(f"{directory}: {error}") from error
+    network = filled(lambda: Pi(config), weights, CONFIG, directory)
     length = shared.settings.number("tokenizer_max_length", 200 if adaptive else 48, MOST)
     sizes = {"actions": config.actions}
     task = None

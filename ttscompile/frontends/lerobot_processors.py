@@ -62,12 +62,14 @@ class Statistics:
         mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
         first: mean, or the lower end of the range.
         second: standard deviation, or the upper end.
+        clipped: whether what is out of range is clipped, and is 0 where there is no range.
     """
 
     mode: str
     first: torch.Tensor
     second: torch.Tensor
     eps: float
+    clipped: bool = False
 
     @property
     def width(self) -> torch.Tensor:
@@ -108,6 +110,7 @@ class Normalizer(nn.Module):
 
     first: torch.Tensor
     width: torch.Tensor
+    still: torch.Tensor | None
 
     def __init__(self, statistics: Statistics | None) -> None:
         super().__init__()
@@ -115,6 +118,8 @@ class Normalizer(nn.Module):
         if statistics is not None:
             self.register_buffer("first", statistics.first, persistent=False)
             self.register_buffer("width", statistics.width, persistent=False)
+            still = statistics.second == statistics.first if statistics.clipped else None
+            self.register_buffer("still", still, persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """``[B, To, ...]`` -> the same."""
@@ -122,7 +127,8 @@ class Normalizer(nn.Module):
             return x
         if self.mode == "MEAN_STD":
             return (x - self.first) / self.width
-        return 2 * (x - self.first) / self.width - 1
+        scaled = 2 * (x - self.first) / self.width - 1
+        return scaled if self.still is None else torch.where(self.still, 0.0, scaled).clamp(-1, 1)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from torch.nn import functional
 from ..errors import CheckpointError
 from .clip import ImageTowerConfig, Layers
 from .internvl import Prompt
-from .language_layers import LanguageConfig, Layer, Rotation, added, rotation
+from .language_layers import LanguageConfig, Rotation, Words, added, laid, rotation
 from .saved_weights import renamed
 from .siglip import squares
 
@@ -119,13 +119,6 @@ class _Vision(nn.Module):
         return torch.cat([self.merger(x), *stacked], -1)
 
 
-class _Language(nn.Module):
-    def __init__(self, config: Qwen3VLConfig) -> None:
-        super().__init__()
-        self.embed_tokens = nn.Embedding(config.vocabulary, config.text.width)
-        self.layers = nn.ModuleList(Layer(config.text) for _ in range(config.text.layers))
-
-
 class Qwen3VL(nn.Module):
     """Images and words to a feature of each token, as the last layer leaves it, not normalised.
 
@@ -135,7 +128,10 @@ class Qwen3VL(nn.Module):
     def __init__(self, config: Qwen3VLConfig, prompt: Prompt) -> None:
         super().__init__()
         self.config, self.prompt = config, prompt
-        self.visual, self.language_model = _Vision(config.vision, config.text.width), _Language(config)
+        self.visual, self.language_model = (
+            _Vision(config.vision, config.text.width),
+            Words(config.vocabulary, config.text),
+        )
         side, at = config.vision.tokens, 0
         places, pictured = list[tuple[int, int, int]](), list[bool]()
         for words in prompt.between:
@@ -156,17 +152,18 @@ class Qwen3VL(nn.Module):
         """
         text, language = self.config.text, self.language_model
         seen = self.visual(torch.stack(images, 1).flatten(0, 1)).unflatten(0, (-1, len(images)))
-        levels = seen.split(text.width, -1)
+        shown = [seen[:, place % len(images)] for place in range(len(self.prompt.between))]
+        levels = list(zip(*(each.split(text.width, -1) for each in shown), strict=True))
         valid = functional.pad(mask, (len(self.places), 0), value=True)
         count = len(self.places) + tokens.shape[1]
         hidden = added(valid[:, None, None, :] & torch.ones(count, count, dtype=torch.bool).tril())
         turns = self._turns(tokens.shape[1])
         words = [language.embed_tokens(torch.tensor([each])) for each in self.prompt.between]
-        x = _laid(levels[0], words, language.embed_tokens(tokens))
+        x = laid(levels[0], words, language.embed_tokens(tokens))
         blank, none = [torch.zeros_like(each) for each in words], torch.zeros(1, tokens.shape[1], text.width)
         for number, layer in enumerate(language.layers):
             if 0 < number < len(levels):
-                x = x + _laid(levels[number], blank, none.expand(len(x), -1, -1))
+                x = x + laid(levels[number], blank, none.expand(len(x), -1, -1))
             x = layer(x, turns, hidden)[0]
         return x, valid
 
@@ -177,20 +174,6 @@ class Qwen3VL(nn.Module):
         for own, section in enumerate(self.config.sections, 1):
             axis[own : 3 * section : 3] = own
         return rotation(places[:, axis][None], self.config.text.channels, self.config.base)
-
-
-def _laid(seen: Tensor, words: list[Tensor], last: Tensor) -> Tensor:
-    """``[B, S, width]``: the words before each image and its own tokens, and what is after the last one.
-
-    Args:
-        seen: ``[B, images, tokens, width]``.
-        words: before each place, ``[1, n, width]``.
-        last: ``[B, L, width]``.
-    """
-    parts = list[Tensor]()
-    for place, each in enumerate(words):
-        parts += [each.expand(len(seen), -1, -1), seen[:, place % seen.shape[1]]]
-    return torch.cat([*parts, last], 1)
 
 
 def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[str, Tensor]:
