@@ -16,6 +16,7 @@ from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
 from .instruction import encoder_folders
 from .lerobot_config import ACTION, CONFIG
+from .lerobot_groot_steps import read_groot_processors
 from .lerobot_policy import TOKENS
 from .lerobot_processors import NORMALIZE, PREPROCESSOR, Features, Processors, Statistics, read_processors
 from .saved_weights import read_tensors
@@ -82,8 +83,9 @@ def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[s
     entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
     both = {**entries["input_features"], **entries["output_features"]}
     features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
-    found = read_processors(directory, features)
-    step: dict[str, Any] = {"config": {}} | next(one for one in steps if one.get("registry_name") == NORMALIZE)
+    read = read_groot_processors if entries["type"] == "groot" else read_processors
+    found, own = read(directory, features), (one for one in steps if one.get("registry_name") == NORMALIZE)
+    step: dict[str, Any] = {"config": {}} | next(own, {})
     doubts, action = [], {} if found.action is None else {ACTION: found.action}
     for key, (kind, _) in features.items():
         mode, name = step["config"].get("norm_map", {}).get(kind, "IDENTITY"), found.renamed.get(key, key)
