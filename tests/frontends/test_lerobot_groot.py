@@ -158,8 +158,9 @@ def test_lerobots_commands_take_it_with_its_task_alone(directory: Path) -> None:
 
 
 def test_doctor_knows_statistics_and_tokenizer(directory: Path) -> None:
-    found = {one.name: one for one in examine(directory, load_checkpoint_policy(directory)[1])}
+    found = {one.what: one for one in examine(directory, load_checkpoint_policy(directory)[1])}
     assert "263 tokens; 263 are known" in found["tokenizer"].found
+    assert "in column 1 of 4, which the policy does not see" in found["normaliser of observation.state"].found
     assert "range of 5 numbers" in found["normaliser of action"].found
 
 

@@ -239,7 +239,7 @@ def test_the_action_is_normalised_whatever_the_features_say(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "kind", ["vqbet", "groot", "xvla", "vla_jepa", "wall_x", "eo1", "molmoact2", "pi0_fast", "something_new"]
+    "kind", ["vqbet", "xvla", "vla_jepa", "wall_x", "eo1", "molmoact2", "pi0_fast", "something_new"]
 )
 def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     """Each with what can be done instead."""

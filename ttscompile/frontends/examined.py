@@ -62,6 +62,8 @@ def _judged(key: str, one: Statistics) -> Finding:
         remedy = f"Minimum and maximum are exchanged, or damaged. {_REPEAT}"
     elif inert.all():
         level, told, remedy = Level.PROBLEM, f"inert: its {of} is 0 everywhere", _REPEAT
+    elif inert.any() and one.clipped and key != ACTION:
+        level, told = Level.NOTE, f"its range is 0 in {_columns(inert)}, which the policy does not see"
     elif inert.any() and key == ACTION:
         level, told = Level.NOTE, f"the policy always gives the same in {_columns(inert)}"
     elif inert.any():

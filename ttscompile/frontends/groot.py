@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from .clip import Attention, FeedForward, Layers, TowerConfig
+from .evo1 import Perceptron
 from .internvl import Prompt
 from .language_layers import added
 from .qwen3_vl import Qwen3VL, Qwen3VLConfig
@@ -54,15 +55,6 @@ class GrootConfig:
     places: int | None
     itself: bool
     words_every: int | None
-
-
-class _Perceptron(nn.Module):
-    def __init__(self, before: int, inside: int, after: int) -> None:
-        super().__init__()
-        self.layer1, self.layer2 = nn.Linear(before, inside), nn.Linear(inside, after)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.layer2(torch.relu(self.layer1(x)))  # type: ignore[no-any-return]
 
 
 class _ActionEncoder(nn.Module):
@@ -116,9 +108,9 @@ class _Head(nn.Module):
     def __init__(self, config: GrootConfig) -> None:
         super().__init__()
         width, source, inside = config.layers.hidden_size, config.language.text.width, config.out
-        self.state_encoder = _Perceptron(config.state, inside, width)
+        self.state_encoder = Perceptron(config.state, inside, width)
         self.action_encoder = _ActionEncoder(config.actions, width)
-        self.action_decoder = _Perceptron(inside, inside, config.actions)
+        self.action_decoder = Perceptron(inside, inside, config.actions)
         self.vlln = nn.LayerNorm(source) if config.normed else nn.Identity()
         self.vl_self_attention = Layers(config.mixing) if config.mixing else None
         self.position_embedding = nn.Embedding(config.places, width) if config.places else None
@@ -146,13 +138,8 @@ class Prefix(nn.Module):
     def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
         """The state's token ``[B, 1, E]``; what is added to scores, ``[B, 1, 1, W]``; and the features it is of.
 
-        These are of words ``[B, W, width]`` and then those of images, where they are looked at by turns.
-
-        Args:
-            images: of each camera ``[B, 3, H, W]``, in -1..1.
-            tokens: int64 ``[B, L]``.
-            mask: bool ``[B, L]``.
-            state: padded ``[B, Ds]``.
+        These are of words ``[B, W, width]`` and then those of images, where they are looked at by turns. ``state`` is
+        padded, ``[B, Ds]``; the others are those of ``Qwen3VL``.
         """
         features, valid = self.backbone([self.seen(image) for image in images], tokens, mask)
         features, own = self.norm(features), self.state_encoder(state)[:, None]

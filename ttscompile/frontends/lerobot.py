@@ -6,38 +6,22 @@ safetensors; neither lerobot nor torchvision is needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from torch import nn
 
 from ..core.spec import PolicySpec
-from . import (
-    lerobot_act,
-    lerobot_diffusion,
-    lerobot_evo1,
-    lerobot_groot,
-    lerobot_multi_task_dit,
-    lerobot_pi,
-    lerobot_smolvla,
-)
 from .families import LoadOptions
 from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
 from .settings import read_json
 
-TYPES: Mapping[str, Callable[[Path, Mapping[str, Any], LoadOptions], tuple[nn.Module, PolicySpec]]] = {
-    "act": lerobot_act.load,
-    "diffusion": lerobot_diffusion.load,
-    "evo1": lerobot_evo1.load,
-    "groot": lerobot_groot.load,
-    "multi_task_dit": lerobot_multi_task_dit.load,
-    "pi0": lerobot_pi.load,
-    "pi05": lerobot_pi.load,
-    "smolvla": lerobot_smolvla.load,
+TYPES = {
+    **{name: f"lerobot_{name}" for name in ("act", "diffusion", "evo1", "groot", "multi_task_dit", "smolvla")},
+    **dict.fromkeys(("pi0", "pi05"), "lerobot_pi"),
 }
-"""By ``type`` of ``config.json``, whose entries they are given."""
+"""The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 
 
 def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
@@ -46,4 +30,5 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     kind = str(entries.get("type"))
     if kind not in TYPES:
         refuse_policy(f"{kind:.80}", LEROBOT, f"{directory}: ")
-    return TYPES[kind](directory, entries, options)
+    module = import_module(f".{TYPES[kind]}", __package__)
+    return module.load(directory, entries, options)  # type: ignore[no-any-return]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -84,19 +85,16 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     length = settings.number("max_text_length", 1024, MOST) - images
     if length < 1:
         raise settings.refusal("max_text_length", f"more than the {images} tokens of {views} images", 1024)
-    sizes, task = {"actions": config.max_action_dim}, None
-    if options.task is None:
-        sizes |= {"tokens": length, "vocabulary": vocabulary}
-    else:
+    sizes, task = {"actions": config.max_action_dim, "tokens": length, "vocabulary": vocabulary}, None
+    if options.task is not None:
         tokens = task_tokens(told.line(options.task), name, folder, None, vocabulary, "")
         task = torch.tensor([tokens[told.skipped :][:length]])
     weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
     network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
     encoder = Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
     side = config.language.vision.image_size
-    spec = vla_spec(shared, processors, (side, side), "stretch", sizes, options, lambda each: _sampler(settings, each))
-    read = told if task is None else None
-    spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform", instruction=read)
+    spec = vla_spec(shared, processors, (side, side), "stretch", sizes, options, partial(_sampler, settings), told)
+    spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform")
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
 

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,6 @@ _DEFAULTS = {
     "max_seq_len": 1024,
     "action_horizon": 40,
     "select_layer": 16,
-    "num_inference_timesteps": 4,
     "num_timestep_buckets": 1000,
 }
 """What lerobot takes for an entry that a base model leaves out."""
@@ -67,6 +67,7 @@ _INNER = "_groot_model.backbone.model."
 _EMBEDDING = "backbone.language_model.embed_tokens.weight"
 _RENAMED = (
     (r"^_groot_model\.", ""),
+    (r"\.layer([12])\.([Wb])$", r".fc\1.\2"),
     (r"\.timestep_embedder\.", "."),
     (r"\.attn1\.to_([qkv])\.", r".attn1.\1_proj."),
     (r"\.attn1\.to_out\.0\.", ".attn1.out_proj."),
@@ -97,24 +98,17 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     config = read_config(base, model, processors)
     shared = _narrowed(shared, processors, config)
     prompt, told = _prompt(processors, name, folder, model, config.language.vocabulary)
-    sizes, task = {"actions": config.actions}, None
-    if options.task is None:
-        sizes |= {"tokens": _LENGTH, "vocabulary": config.language.vocabulary}
-    else:
-        tokens = task_tokens(told.line(options.task), name, folder, None, config.language.vocabulary, "")
+    sizes, task = {"actions": config.actions, "tokens": _LENGTH, "vocabulary": config.language.vocabulary}, None
+    if options.task is not None:
+        tokens = task_tokens(told.line(options.task), name, folder, None, sizes["vocabulary"], "")
         task = torch.tensor([tokens[told.skipped :]])
     weights = _weights(shared, options, config, processors.embodiment)
     network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
     encoder = Gathered(shared, processors, Prefix(network, Seen(processors.geometry)), config.state, task)
-    edge, bounded = processors.geometry.edge, processors.bounded
-    steps = base.number("num_inference_timesteps"), base.number("num_timestep_buckets", most=2**20)
-
-    def table(each: LoadOptions) -> SamplerTable:
-        return _sampler(settings, each, *steps, bounded)
-
-    spec = vla_spec(shared, processors, (edge, edge), "stretch", sizes, options, table)
-    source = {**spec.source, "embodiment": processors.kind}
-    spec = replace(spec, source=source, instruction=told if task is None else None)
+    edge, own = processors.geometry.edge, {name: each for name, each in entries.items() if each is not None}
+    table = partial(_sampler, Settings({**base.values, **own}, settings.where), processors.bounded)
+    spec = vla_spec(shared, processors, (edge, edge), "stretch", sizes, options, table, told)
+    spec = replace(spec, source={**spec.source, "embodiment": processors.kind})
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
 
@@ -281,13 +275,12 @@ def _prompt(
     return Prompt(between, len(processors.cameras)), replace(told, skipped=skipped)
 
 
-def _sampler(settings: Settings, options: LoadOptions, usual: int, buckets: int, bounded: bool) -> SamplerTable:
-    """From noise at time 0 to actions at 1; a time is one of so many buckets. Actions are clipped at the end."""
-    own = Settings({name: value for name, value in settings.values.items() if value is not None}, settings.where)
-    count = integration_steps(own, options, "num_inference_timesteps", usual)
+def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
+    """From noise at time 0 to actions at 1; a time is a bucket of many. Actions may be clipped at the end."""
+    count, buckets = integration_steps(settings, options, "num_inference_timesteps", 4), "num_timestep_buckets"
     table = flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
-    table = replace(table, timesteps=(times * buckets).astype(np.int64))
+    table = replace(table, timesteps=(times * settings.number(buckets, most=2**20)).astype(np.int64))
     if not bounded:
         return table
     if table.name != "euler":

@@ -62,11 +62,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         raise CheckpointError(f"{directory}: {error}") from error
     network = filled(lambda: Pi(config), weights, CONFIG, directory)
     length = shared.settings.number("tokenizer_max_length", 200 if adaptive else 48, MOST)
-    sizes = {"actions": config.actions}
-    task = None
-    if options.task is None:
-        sizes |= {"tokens": length, "vocabulary": config.vocabulary}
-    else:
+    sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
+    if options.task is not None:
         name = str(processors.tokenizer.get("tokenizer_name") or "google/paligemma-3b-pt-224")
         found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"

@@ -67,11 +67,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))
     length = settings.number("tokenizer_max_length", 48, MOST)
-    sizes = {"actions": config.actions}
-    if options.task is None:
-        sizes |= {"tokens": length, "vocabulary": config.vocabulary}
-        task = None
-    else:
+    sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
+    if options.task is not None:
         tokenizer = str(processors.tokenizer.get("tokenizer_name") or name)
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
         found = find_encoder(tokenizer, folders, "smolvlm")

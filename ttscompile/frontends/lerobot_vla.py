@@ -77,17 +77,18 @@ def vla_spec(
     sizes: Mapping[str, int],
     options: LoadOptions,
     table: Make | None = None,
+    told: Instruction | None = None,
 ) -> PolicySpec:
     """The specification of a policy.
 
     Args:
         image: height and width that images are resized to; None where they stay.
         fit: where the rest of a resized image is.
-        sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
-            absent where it is compiled in.
+        sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction, and ``vocabulary``.
+        told: how a task becomes tokens; None as the processors say.
         table: the loop; None for ten steps, or as many as are configured, from time 1 to time 0.
     """
-    language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if "tokens" in sizes else {}
+    language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if options.task is None else {}
     source = {"policy": str(config.settings.values["type"])}
     source |= {} if options.task is None else {"task": options.task}
     source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
@@ -99,9 +100,9 @@ def vla_spec(
         observations |= {processors.renamed.get(key, key): resized for key in config.cameras}
     # The instruction of pi05 holds its state too, which only lerobot's processor can put there.
     plain = language and not processors.state_in_prompt
-    told = Instruction(TOKENS, MASK, processors.new_line) if plain else None
+    read = told or Instruction(TOKENS, MASK, processors.new_line) if plain else None
     sample = (config.horizon, sizes["actions"])
-    return replace(spec, sample=sample, observations=observations, instruction=told)
+    return replace(spec, sample=sample, observations=observations, instruction=read)
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:

@@ -47,11 +47,6 @@ class QwenVisionConfig(ImageTowerConfig):
     table: int = 48
     stacked: tuple[int, ...] = ()
 
-    @property
-    def tokens(self) -> int:
-        """Along a side of an image."""
-        return self.side // self.merge
-
 
 @dataclass(frozen=True)
 class Qwen3VLConfig:
@@ -132,7 +127,7 @@ class Qwen3VL(nn.Module):
             _Vision(config.vision, config.text.width),
             Words(config.vocabulary, config.text),
         )
-        side, at = config.vision.tokens, 0
+        side, at = config.vision.side // config.vision.merge, 0
         places, pictured = list[tuple[int, int, int]](), list[bool]()
         for words in prompt.between:
             places += [(at + i,) * 3 for i in range(len(words))]

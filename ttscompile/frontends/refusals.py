@@ -22,7 +22,7 @@ _BUILD = "Build the network with the code that trained it and use ttscompile.com
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
 _DITA = f"{_HEAD} For Dita they are the tokens of words and frames; examples/vla/dita.py does it."
 _SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleDP."
-_GROOT = "Open it in LeRobot (--policy.type=groot --policy.base_model_path=..), and convert what save_pretrained writes."
+_GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
