@@ -39,9 +39,8 @@ class GrootConfig:
         actions: numbers of an action, padded.
         horizon: actions that are denoised.
         places: rows of the embedding of an action's place in the chunk; None without one.
-        itself: whether every other layer looks at state and actions alone.
-        words_every: of the layers that look at the language model's features, each so many-th looks at words and the
-            others at images; None if all look at both.
+        looks: what each layer looks at: ``itself``, state and actions alone, or features of ``words`` or ``images``.
+        apart: whether those of words are without those of images.
     """
 
     language: Qwen3VLConfig
@@ -53,8 +52,8 @@ class GrootConfig:
     actions: int
     horizon: int
     places: int | None
-    itself: bool
-    words_every: int | None
+    looks: tuple[str, ...]
+    apart: bool
 
 
 class _ActionEncoder(nn.Module):
@@ -99,7 +98,7 @@ class _DiT(nn.Module):
             nn.Linear(_WAVES, width),
             nn.Linear(width, width),
         )
-        sources = (None if config.itself and i % 2 else source for i in range(config.layers.num_hidden_layers))
+        sources = (None if look == "itself" else source for look in config.looks)
         self.transformer_blocks = nn.ModuleList(_Layer(config.layers, each) for each in sources)
         self.proj_out_1, self.proj_out_2 = nn.Linear(width, 2 * width), nn.Linear(width, config.out)
 
@@ -133,7 +132,7 @@ class Prefix(nn.Module):
         super().__init__()
         head, self.seen = network.action_head, seen
         self.backbone, self.norm, self.mixing = network.backbone, head.vlln, head.vl_self_attention
-        self.state_encoder, self.apart = head.state_encoder, network.config.words_every is not None
+        self.state_encoder, self.apart = head.state_encoder, network.config.apart
 
     def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
         """The state's token ``[B, 1, E]``; what is added to scores, ``[B, 1, 1, W]``; and the features it is of.
@@ -161,8 +160,8 @@ class Denoiser(nn.Module):
 
     def forward(self, sample: Tensor, timestep: Tensor, encoded: tuple[Tensor, ...]) -> Tensor:
         """``[B, T, D]``, timesteps int64 ``[B]`` and what ``Prefix`` gives -> velocity ``[B, T, D]``."""
-        head, config = self.head, self.config
-        state, hidden, words, *pictures = encoded
+        head = self.head
+        state, hidden, words, pictures = (*encoded, None)[:4]
         clock, count = timestep.to(torch.float32), sample.shape[1]
         angle = _angles(clock, _WAVES // 2, _WAVES // 2 - 1)
         made, model = torch.cat([angle.cos(), angle.sin()], -1), head.model
@@ -171,13 +170,9 @@ class Denoiser(nn.Module):
         if head.position_embedding is not None:
             x = x + head.position_embedding.weight[:count]
         x = torch.cat([state, x], 1)
-        for number, layer in enumerate(model.transformer_blocks):
-            if config.itself and number % 2:
-                x = layer(x, None, None, time)
-            elif config.words_every is None or number % (2 * config.words_every) == 0:
-                x = layer(x, words, hidden, time)
-            else:
-                x = layer(x, pictures[0], None, time)
+        seen = {"itself": (None, None), "words": (words, hidden), "images": (pictures, None)}
+        for look, layer in zip(self.config.looks, model.transformer_blocks, strict=True):
+            x = layer(x, *seen[look], time)
         shift, scale = model.proj_out_1(functional.silu(time))[:, None].chunk(2, -1)
         x = functional.layer_norm(x, x.shape[-1:], eps=1e-6) * (1 + scale) + shift
         return head.action_decoder(model.proj_out_2(x[:, -count:]))  # type: ignore[no-any-return]

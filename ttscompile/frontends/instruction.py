@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
+from ..core.spec import Instruction
 from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
 from .clip import NAME_FOLDER, find_encoder
@@ -52,15 +54,19 @@ def task_tokens(
     return tokens
 
 
-def before_images(tokens: list[int], image: int, places: int, folder: Path) -> tuple[tuple[int, ...], ...]:
-    """The tokens of a prompt before each of its images.
+def told_after(
+    told: Instruction, name: str, folder: Path, vocabulary: int, image: int, places: int
+) -> tuple[tuple[tuple[int, ...], ...], Instruction]:
+    """The tokens of a prompt before each of its images; and how a task is told of which these are skipped.
 
     Args:
         image: the token that stands for one.
-        places: of images that the prompt was written with.
+        places: of images that the prompt is written with.
     """
+    tokens = task_tokens(told.line(""), name, folder, None, vocabulary, "")
     at = [i for i, token in enumerate(tokens) if token == image]
     if len(at) != places:
         found = f"{len(at)} tokens {image} (image_token_id) in a prompt of {places} images; expected one for each"
         raise CheckpointError(f"{folder}: its tokenizer makes {found}. It is of another model than its config.json.")
-    return tuple(tuple(tokens[start + 1 : end]) for start, end in zip([-1, *at], at, strict=False))
+    between = tuple(tuple(tokens[start + 1 : end]) for start, end in zip([-1, *at], at, strict=False))
+    return between, replace(told, skipped=places + sum(map(len, between)))

@@ -22,7 +22,7 @@ from .clip import ACTIVATIONS
 from .encoded import EncodedDenoiser
 from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from .families import LoadOptions
-from .instruction import before_images, encoder_folders, language_model_folder, task_tokens
+from .instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from .internvl import InternVitConfig, InternVLConfig, Prompt
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
@@ -79,8 +79,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     vocabulary, views = config.language.vocabulary, _views(settings)
     told = Instruction(TOKENS, MASK, False, tuple(_IMAGE.format(i + 1) for i in range(views)))
     image = model.number("image_token_id", 151667, _MOST_VOCABULARY)
-    between = before_images(task_tokens(told.line(""), name, folder, None, vocabulary, ""), image, views, folder)
-    told = replace(told, skipped=views + sum(map(len, between)))
+    between, told = told_after(told, name, folder, vocabulary, image, views)
     images = told.skipped + views * (config.language.image_tokens - 1)
     length = settings.number("max_text_length", 1024, MOST) - images
     if length < 1:
@@ -133,7 +132,7 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     image, text = part_of(model, "vision_config"), part_of(model, "text_config")
     image.require(norm_type="layer_norm", use_qk_norm=False, use_absolute_position_embeddings=True, num_channels=3)
     model.require(vision_feature_layer=-1, vision_feature_select_strategy="default")
-    text.require(model_type="qwen2", hidden_act="silu")
+    text.require(model_type="qwen2", hidden_act="silu", use_sliding_window=False)
     names = {field for field in InternVitConfig.__dataclass_fields__ if field in image.values}
     sizes = {name: _side(image, name) for name in names & {"image_size", "patch_size"}}
     vision = InternVitConfig(**{name: image.values[name] for name in names} | sizes)
@@ -147,8 +146,6 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     heads = text.number("num_attention_heads", 32, MOST)
     language = read_language(text, len(range(there)[:wanted]), text.number("hidden_size", 4096, MOST) // heads)
     language = replace(language, biased=True)
-    if text.flag("use_sliding_window", False):
-        raise text.refusal("use_sliding_window", "false: layers that see a part of the words are not rebuilt here")
     config = InternVLConfig(
         vision=vision,
         text=language,
@@ -170,8 +167,7 @@ def _rotary_base(text: Settings, longest: int) -> float:
         most = text.number("max_position_embeddings", 32768)
         if longest > most:
             raise text.refusal("max_position_embeddings", f"at least max_text_length, {longest}, with a dynamic one")
-    if rope.values.get("partial_rotary_factor", 1.0) != 1:
-        raise rope.refusal("partial_rotary_factor", "1")
+    rope.require(partial_rotary_factor=1)
     return positive_number(rope, "rope_theta", 10_000.0)
 
 

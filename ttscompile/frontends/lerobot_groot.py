@@ -24,7 +24,7 @@ from .clip import ACTIVATIONS, TowerConfig
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .groot import Denoiser, Groot, GrootConfig, Prefix
-from .instruction import before_images, encoder_folders, language_model_folder, task_tokens
+from .instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from .internvl import Prompt
 from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
@@ -44,25 +44,15 @@ from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _BASE, _BACKBONE = "nvidia/GR00T-N1.7-3B", "nvidia/Cosmos-Reason2-2B"
-_MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS, _MOST_KINDS, _MOST_PATCHES = 512, 2**20, 400, 4096, 2**22
+_MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS, _MOST_PATCHES = 512, 2**20, 400, 2**22
 _LENGTH = 64
 """Tokens of an instruction with what is after it, of a policy that none is compiled into; lerobot has no limit."""
 _TURN, _IMAGE, _END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""
 _EMPTY = "Perform the task."
-_DEFAULTS = {
-    "backbone_embedding_dim": 2048,
-    "input_embedding_dim": 1536,
-    "hidden_size": 1024,
-    "max_state_dim": 132,
-    "max_action_dim": 132,
-    "max_num_embodiments": 32,
-    "max_seq_len": 1024,
-    "action_horizon": 40,
-    "select_layer": 16,
-    "num_timestep_buckets": 1000,
-}
-"""What lerobot takes for an entry that a base model leaves out."""
+_DEFAULTS = {"backbone_embedding_dim": 2048, "input_embedding_dim": 1536, "hidden_size": 1024}
+_DEFAULTS |= dict.fromkeys(("max_state_dim", "max_action_dim"), 132)
+"""What lerobot takes for a width that a base model leaves out."""
 _INNER = "_groot_model.backbone.model."
 _EMBEDDING = "backbone.language_model.embed_tokens.weight"
 _RENAMED = (
@@ -117,10 +107,7 @@ def _require_version(settings: Settings) -> None:
     path = str(settings.values.get("base_model_path")).lower()
     if settings.values.get("tokenizer_assets_repo") is not None or re.search(r"gr00t[-_]n1\.[0-6]", path):
         raise settings.error(f"this policy is {OLD}")
-    transform = settings.values.get("action_decode_transform")
-    if transform == "auto":
-        transform = "libero" if settings.values.get("embodiment_tag") == "libero_sim" else None
-    if transform not in (None, "none"):
+    if settings.values.get("action_decode_transform") not in (None, "none"):
         raise settings.refusal(
             "action_decode_transform",
             "none: that the gripper's number g becomes -sign(2 g - 1) is not compiled, and is the robot's to do",
@@ -143,10 +130,8 @@ def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -
         )
     path, entry = folder / "chat_template.jinja", read_json(folder / "tokenizer_config.json").get("chat_template")
     template = path.read_text("utf-8", "replace")[:_MOST_VOCABULARY] if path.is_file() else entry
-    if template is None:
-        return
-    wanted = ("<|im_start|>", _IMAGE, "<|im_end|>")
-    if not isinstance(template, str) or not all(word in template for word in wanted) or "helpful assist" in template:
+    wanted, found = ("<|im_start|>", _IMAGE, "<|im_end|>"), str(template)
+    if template is not None and (not all(word in found for word in wanted) or "helpful assist" in found):
         expected = f"Qwen3-VL's: {' '.join(wanted)}, and no words of its own"
         raise CheckpointError(f"{folder}: its chat template is another one than is rebuilt here; expected {expected}.")
 
@@ -157,23 +142,18 @@ def read_config(base: Settings, model: Settings, processors: GrootProcessors) ->
     layers, width = _tower(dit), language.text.width
     mixing = part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
     mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None
-    base.require(
-        backbone_embedding_dim=width,
-        input_embedding_dim=layers.hidden_size,
-        hidden_size=(out := dit.number("output_dim", 26, MOST)),
-        state_history_length=1,
-        max_state_dim=processors.padded[0],
-        max_action_dim=processors.padded[1],
-    )
+    (state, actions), out = processors.padded, dit.number("output_dim", 26, MOST)
+    base.require(backbone_embedding_dim=width, input_embedding_dim=layers.hidden_size, hidden_size=out)
+    base.require(state_history_length=1, max_state_dim=state, max_action_dim=actions)
     if mixed is not None and mixed.hidden_size != width:
         raise base.refusal("vl_self_attention_cfg", f"heads of {width} channels together")
-    if processors.embodiment >= base.number("max_num_embodiments", most=_MOST_KINDS):
-        raise base.refusal("max_num_embodiments", f"more than {processors.embodiment}, that of {processors.kind}")
     itself, apart = dit.flag("interleave_self_attention", False), base.flag("use_alternate_vl_dit", True)
+    every = 2 * base.number("attend_text_every_n_blocks", 2, MOST) if apart else 1
     if apart and not itself:
         raise dit.refusal("interleave_self_attention", "true, with use_alternate_vl_dit")
-    horizon = base.number("action_horizon", most=MOST)
-    places = base.number("max_seq_len", most=MOST) if base.flag("add_pos_embed", True) else None
+    looks = ("itself" if itself and i % 2 else "images" if i % every else "words" for i in range(_MOST_LAYERS))
+    horizon = base.number("action_horizon", 40, MOST)
+    places = base.number("max_seq_len", 1024, MOST) if base.flag("add_pos_embed", True) else None
     if places is not None and places < horizon:
         raise base.refusal("max_seq_len", f"at least the {horizon} actions of a chunk")
     return GrootConfig(
@@ -182,24 +162,20 @@ def read_config(base: Settings, model: Settings, processors: GrootProcessors) ->
         normed=base.flag("use_vlln", True),
         layers=layers,
         out=out,
-        state=processors.padded[0],
-        actions=processors.padded[1],
+        state=state,
+        actions=actions,
         horizon=horizon,
         places=places,
-        itself=itself,
-        words_every=base.number("attend_text_every_n_blocks", 2, MOST) if apart else None,
+        looks=tuple(looks)[: layers.num_hidden_layers],
+        apart=apart,
     )
 
 
 def _tower(own: Settings) -> TowerConfig:
     """Layers of diffusers, of the head or of what mixes the language model's features."""
-    Settings({"positional_embeddings": "sinusoidal"} | own.values, own.where).require(
-        positional_embeddings=None,
-        activation_fn="gelu-approximate",
-        attention_bias=True,
-        norm_type="ada_norm",
-        norm_elementwise_affine=False,
-    )
+    own = Settings({"positional_embeddings": "sinusoidal", **own.values}, own.where)
+    own.require(positional_embeddings=None, activation_fn="gelu-approximate", attention_bias=True)
+    own.require(norm_type="ada_norm", norm_elementwise_affine=False)
     heads = own.number("num_attention_heads", 8, MOST)
     width = heads * own.number("attention_head_dim", 64, MOST)
     return TowerConfig(
@@ -242,7 +218,7 @@ def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
     )
     if vision.hidden_size // vision.num_attention_heads % 4:
         raise image.refusal("num_heads", "heads of a multiple of 4 channels")
-    layers = min(text.number("num_hidden_layers", 32, _MOST_LAYERS), base.number("select_layer"))
+    layers = min(text.number("num_hidden_layers", 32, _MOST_LAYERS), base.number("select_layer", 16))
     language = replace(read_language(text, layers, 128), normed=True)
     vocabulary = text.number("vocab_size", 151936, _MOST_VOCABULARY)
     angle = positive_number(rope, "rope_theta", 5e5)
@@ -252,8 +228,6 @@ def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
 def _narrowed(shared: LeRobotConfig, processors: GrootProcessors, config: GrootConfig) -> LeRobotConfig:
     """Cameras that are shown, in their order, and the chunk that the head makes."""
     features = {key: shared.features[key] for key in (STATE, *processors.cameras, ACTION)}
-    if not processors.cameras:
-        raise shared.settings.error("input_features have no camera that video_modality_keys name")
     for name, own in ((STATE, config.state), (ACTION, config.actions)):
         if (count := features[name][1][0]) > own:
             raise shared.settings.error(f"{name} has {count} numbers; expected {own} at most, which the head has")
@@ -269,10 +243,9 @@ def _prompt(
     shown = len(processors.cameras) * processors.frames
     own = {"around": (_IMAGE * shown, _END), "plain": processors.plain, "otherwise": _EMPTY}
     told = Instruction(TOKENS, MASK, True, (_TURN,), **own)
-    tokens = task_tokens(told.line(""), name, folder, None, vocabulary, "")
-    between = before_images(tokens, model.number("image_token_id", 151655, _MOST_VOCABULARY), shown, folder)
-    skipped = shown + sum(map(len, between))
-    return Prompt(between, len(processors.cameras)), replace(told, skipped=skipped)
+    image = model.number("image_token_id", 151655, _MOST_VOCABULARY)
+    between, told = told_after(told, name, folder, vocabulary, image, shown)
+    return Prompt(between, len(processors.cameras)), told
 
 
 def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
@@ -280,7 +253,7 @@ def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> Sampler
     count, buckets = integration_steps(settings, options, "num_inference_timesteps", 4), "num_timestep_buckets"
     table = flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
-    table = replace(table, timesteps=(times * settings.number(buckets, most=2**20)).astype(np.int64))
+    table = replace(table, timesteps=(times * settings.number(buckets, 1000, 2**20)).astype(np.int64))
     if not bounded:
         return table
     if table.name != "euler":

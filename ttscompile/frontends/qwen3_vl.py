@@ -152,7 +152,11 @@ class Qwen3VL(nn.Module):
         valid = functional.pad(mask, (len(self.places), 0), value=True)
         count = len(self.places) + tokens.shape[1]
         hidden = added(valid[:, None, None, :] & torch.ones(count, count, dtype=torch.bool).tril())
-        turns = self._turns(tokens.shape[1])
+        places = torch.tensor(self.places + [(self.after + i,) * 3 for i in range(tokens.shape[1])])
+        axis = torch.zeros(text.channels // 2, dtype=torch.int64)  # time, row or column, of each pair of channels
+        for own, section in enumerate(self.config.sections, 1):
+            axis[own : 3 * section : 3] = own
+        turns = rotation(places[:, axis][None], text.channels, self.config.base)
         words = [language.embed_tokens(torch.tensor([each])) for each in self.prompt.between]
         x = laid(levels[0], words, language.embed_tokens(tokens))
         blank, none = [torch.zeros_like(each) for each in words], torch.zeros(1, tokens.shape[1], text.width)
@@ -161,14 +165,6 @@ class Qwen3VL(nn.Module):
                 x = x + laid(levels[number], blank, none.expand(len(x), -1, -1))
             x = layer(x, turns, hidden)[0]
         return x, valid
-
-    def _turns(self, count: int) -> Rotation:
-        """Rotary embedding of all tokens; of a pair of channels by the time, the row or the column of each."""
-        places = torch.tensor(self.places + [(self.after + i,) * 3 for i in range(count)])
-        axis = torch.zeros(self.config.text.channels // 2, dtype=torch.int64)
-        for own, section in enumerate(self.config.sections, 1):
-            axis[own : 3 * section : 3] = own
-        return rotation(places[:, axis][None], self.config.text.channels, self.config.base)
 
 
 def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[str, Tensor]:
