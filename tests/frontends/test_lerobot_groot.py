@@ -117,7 +117,7 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
 def test_what_depends_on_words_and_images_alone_leaves_the_loop(compiled: Path) -> None:
     """So do the keys and values that the head's layers look at."""
     manifest = load_artifact(compiled).manifest
-    blocks = [block.kind for block in manifest.program.blocks]
+    blocks = [block.kind for block in manifest.blocks]
     assert blocks == ["cross_attention", "feed_forward", "self_attention", "feed_forward"] * 2
     assert manifest.spec.source["embodiment"] == "new_embodiment"
 

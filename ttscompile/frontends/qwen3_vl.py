@@ -200,7 +200,7 @@ def _between_positions(table: Tensor, config: QwenVisionConfig) -> Tensor:
     at = torch.linspace(0, config.table - 1, config.side)
     low = at.int()
     share, high = (at - low)[:, None, None], (low + 1).clamp(max=config.table - 1)
-    grid = table.unflatten(0, (config.table, config.table))
+    grid = table.reshape(config.table, config.table, -1)
     for _ in range(2):  # rows, then columns
         grid = (grid[low] * (1 - share) + grid[high] * share).transpose(0, 1)
     return grid.flatten(0, 1)
