@@ -95,7 +95,7 @@ def test_what_is_compiled_gives_them_too(compiled: Path, golden: Mapping[str, Ar
         found = policy.predict_action_chunk(given, noise=Noise(groots.noise()), plan="dense")
         assert found.shape == (1, 4, 5)
         assert np.abs(found - golden[f"words.{call}"]).max() < 1e-4
-    with pytest.raises(ObservationError, match=r"has 73 tokens, and the policy reads 64\. Use fewer words"):
+    with pytest.raises(ObservationError, match=r"has 74 tokens, and the policy reads 64\. Use fewer words"):
         policy.predict_action_chunk(given | {"task": "x" * 71})
 
 

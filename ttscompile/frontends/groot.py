@@ -160,8 +160,7 @@ class Denoiser(nn.Module):
 
     def forward(self, sample: Tensor, timestep: Tensor, encoded: tuple[Tensor, ...]) -> Tensor:
         """``[B, T, D]``, timesteps int64 ``[B]`` and what ``Prefix`` gives -> velocity ``[B, T, D]``."""
-        head = self.head
-        state, hidden, words, *pictures = encoded
+        head, (state, hidden, words, *pictures) = self.head, encoded
         clock, count = timestep.to(torch.float32), sample.shape[1]
         angle = _angles(clock, _WAVES // 2, _WAVES // 2 - 1)
         made, model = torch.cat([angle.cos(), angle.sin()], -1), head.model
@@ -170,8 +169,7 @@ class Denoiser(nn.Module):
         if head.position_embedding is not None:
             x = x + head.position_embedding.weight[:count]
         x = torch.cat([state, x], 1)
-        seen: dict[str, tuple[Tensor | None, Tensor | None]] = {"itself": (None, None), "words": (words, hidden)}
-        seen["images"] = (pictures[0] if pictures else None, None)
+        seen: Any = {"itself": (None, None), "words": (words, hidden), "images": (*pictures, None)}
         for look, layer in zip(self.config.looks, model.transformer_blocks, strict=True):
             x = layer(x, *seen[look], time)
         shift, scale = model.proj_out_1(functional.silu(time))[:, None].chunk(2, -1)

@@ -53,8 +53,7 @@ _EMPTY = "Perform the task."
 _DEFAULTS = {"backbone_embedding_dim": 2048, "input_embedding_dim": 1536, "hidden_size": 1024}
 _DEFAULTS |= dict.fromkeys(("max_state_dim", "max_action_dim"), 132)
 """What lerobot takes for a width that a base model leaves out."""
-_INNER = "_groot_model.backbone.model."
-_EMBEDDING = "backbone.language_model.embed_tokens.weight"
+_INNER, _EMBEDDING = "_groot_model.backbone.model.", "backbone.language_model.embed_tokens.weight"
 _RENAMED = (
     (r"^_groot_model\.", ""),
     (r"\.layer([12])\.([Wb])$", r".fc\1.\2"),
@@ -108,10 +107,8 @@ def _require_version(settings: Settings) -> None:
     if settings.values.get("tokenizer_assets_repo") is not None or re.search(r"gr00t[-_]n1\.[0-6]", path):
         raise settings.error(f"this policy is {OLD}")
     if settings.values.get("action_decode_transform") not in (None, "none"):
-        raise settings.refusal(
-            "action_decode_transform",
-            "none: that the gripper's number g becomes -sign(2 g - 1) is not compiled, and is the robot's to do",
-        )
+        rule = "none: that the gripper's number g becomes -sign(2 g - 1) is not compiled, and is the robot's to do"
+        raise settings.refusal("action_decode_transform", rule)
 
 
 def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -> None:
@@ -232,8 +229,7 @@ def _narrowed(shared: LeRobotConfig, processors: GrootProcessors, config: GrootC
         if (count := features[name][1][0]) > own:
             raise shared.settings.error(f"{name} has {count} numbers; expected {own} at most, which the head has")
     executed = min(shared.n_action_steps, shared.horizon, config.horizon, processors.executed or config.horizon)
-    own = {"features": features, "horizon": config.horizon, "n_action_steps": executed}
-    return LeRobotConfig(**vars(shared) | own)
+    return replace(shared, features=features, horizon=config.horizon, n_action_steps=executed)
 
 
 def _prompt(
@@ -250,10 +246,10 @@ def _prompt(
 
 def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
     """From noise at time 0 to actions at 1; a time is a bucket of many. Actions may be clipped at the end."""
-    count, buckets = integration_steps(settings, options, "num_inference_timesteps", 4), "num_timestep_buckets"
+    count = integration_steps(settings, options, "num_inference_timesteps", 4)
     table = flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
-    table = replace(table, timesteps=(times * settings.number(buckets, 1000, 2**20)).astype(np.int64))
+    table = replace(table, timesteps=(times * settings.number("num_timestep_buckets", 1000, 2**20)).astype(np.int64))
     if not bounded:
         return table
     if table.name != "euler":
