@@ -21,7 +21,6 @@ from lerobot.policies.groot import GrootConfig, GrootPolicy, make_groot_pre_post
 from lerobot.policies.groot.groot_n1_7 import GR00TN17, GR00TN17Config
 from safetensors.torch import load_file
 from tokenizers import Tokenizer, models, pre_tokenizers
-from torchvision.transforms.v2.functional import _geometry
 from transformers import PreTrainedTokenizerFast, Qwen2VLImageProcessor, Qwen3VLConfig, Qwen3VLVideoProcessor
 
 from .. import groots
@@ -38,6 +37,7 @@ TEMPLATE = """{%- for message in messages -%}
 """What Qwen3-VL's says of a message of a user."""
 BACKBONE = f"./nvidia/{groots.BACKBONE}"
 """Where lerobot looks for a tokenizer, whatever the base model says."""
+RESIZE = "torchvision.transforms.v2.functional._geometry._do_native_uint8_resize_on_cpu"
 SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"]
 SPECIAL += ["<|video_pad|>"]
 VISION: dict[str, Any] = {
@@ -252,7 +252,7 @@ def chunk(policy: Any, call: int, given: dict[str, Any]) -> Any:
     before, after = make_pre_post_processors(policy.config, pretrained_path="policy")
     batch = {**{key: torch.from_numpy(value) for key, value in given.items()}, "task": groots.TASKS[call]}
     # As on a graphics card: on a processor torchvision would round in the middle of a resize.
-    with patch.object(_geometry, "_do_native_uint8_resize_on_cpu", lambda _: False):
+    with patch(RESIZE, lambda _: False):
         batch = before(batch)
     with patch("torch.randn", lambda *_, **__: torch.from_numpy(groots.noise())):
         return after(policy.predict_action_chunk(batch)).numpy()
