@@ -237,8 +237,8 @@ def _prompt(
 ) -> tuple[Prompt, Instruction]:
     """What is before each image, and how a task is told."""
     shown = len(processors.cameras) * processors.frames
-    own = {"around": (_IMAGE * shown, _END), "plain": processors.plain, "otherwise": _EMPTY}
-    told = Instruction(TOKENS, MASK, True, (_TURN,), **own)
+    around = (_IMAGE * shown, _END)
+    told = Instruction(TOKENS, MASK, True, (_TURN,), around=around, plain=processors.plain, otherwise=_EMPTY)
     image = model.number("image_token_id", 151655, _MOST_VOCABULARY)
     between, told = told_after(told, name, folder, vocabulary, image, shown)
     return Prompt(between, len(processors.cameras)), told

@@ -166,7 +166,7 @@ def backbone(kind: str) -> None:
     tokenizer.save_pretrained(folder)
     half = [0.5] * 3
     size = {"shortest_edge": 64, "longest_edge": 4096}
-    settings = {"patch_size": 4, "merge_size": 2, "image_mean": half, "image_std": half, "size": size}
+    settings: dict[str, Any] = {"patch_size": 4, "merge_size": 2, "image_mean": half, "image_std": half, "size": size}
     Qwen2VLImageProcessor(**settings).save_pretrained(folder)
     shutil.copy(folder / "preprocessor_config.json", folder / "own.json")
     Qwen3VLVideoProcessor(**settings).save_pretrained(folder)
@@ -205,7 +205,7 @@ def base(kind: str) -> None:
     folder = Path(groots.BASE)
     (folder / "processor_config.json").write_text(json.dumps({"processor_kwargs": PROCESSORS[kind]}, indent=1))
     if kind == "native":
-        statistics = {"state": {}, "action": {}}
+        statistics: dict[str, Any] = {"state": {}, "action": {}}
         for part in statistics:
             for key, low in GROUPS.items():
                 own = np.array(low + [0.25] * (part == "action" and key == "arm"))
@@ -236,7 +236,7 @@ def save(kind: str) -> Any:
     loaded = policy.load_state_dict(groots.weights(shapes), strict=False)
     assert not loaded.unexpected_keys, loaded
     assert loaded.missing_keys == ["_groot_model.backbone.model.model.language_model.embed_tokens.weight"]  # tied
-    statistics = {}
+    statistics: dict[str, dict[str, torch.Tensor]] = {}
     for key, count in ((STATE, groots.STATE_DIM), ("action", groots.ACTION_DIM)):
         low = torch.linspace(-1.5, 0.5, count)
         statistics[key] = {"mean": low, "std": low.abs() + 0.5, "min": low, "max": low + 2}
