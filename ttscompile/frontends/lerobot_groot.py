@@ -116,7 +116,7 @@ def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -
     settings = Settings(read_json(folder / (name := "preprocessor_config.json")), f"{folder / name}: ")
     vision, half = part_of(model, "vision_config"), [0.5] * 3
     patch, merge = vision.number("patch_size", 16, MOST), vision.number("spatial_merge_size", 2, MOST)
-    own = Settings({"patch_size": None, "merge_size": None} | settings.values, settings.where)
+    own = Settings({"patch_size": None, "merge_size": None, **settings.values}, settings.where)
     own.require(patch_size=patch, merge_size=merge, image_mean=half, image_std=half, do_normalize=True, do_rescale=True)
     side, size = processors.geometry.target, part_of(settings, "size")
     least, most = (size.number(f"{entry}_edge", most=2**31) for entry in ("shortest", "longest"))
