@@ -109,6 +109,17 @@ def test_runtimes_agree_on_random_plans(compiled: Path, runtime: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.soak
+def test_in_eight_bits_its_actions_are_near(tmp_path: Path, golden: Mapping[str, Array]) -> None:
+    ttscompile.convert(groots.save("words", tmp_path / "saved"), tmp_path / "compiled", precision="int8")
+    policy = ttscompile.load(tmp_path / "compiled", tokenizer=groots.SAVED / "words" / groots.BACKBONE)
+    assert (policy.info.default_plan, policy.info.precision) == ("full", "int8")
+    given = {key: value[None] for key, value in groots.observation(0).items()} | {"task": groots.TASKS[0]}
+    found = policy.predict_action_chunk(given, noise=Noise(groots.noise()))
+    assert 1e-5 < np.abs(found - golden["words.0"]).max() < 0.2
+
+
+@pytest.mark.slow
 def test_every_rung_of_verify_holds(compiled: Path) -> None:
     assert ttscompile.verify(compiled, calls=1).passed
 
