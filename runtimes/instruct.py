@@ -28,7 +28,7 @@ class Instruct:
             raise ObservationError(f"{path}: this policy takes no text that alone would give its tokens. {remedy}")
         self._told, self._keys = spec.instruction, tuple(spec.observations)
         self._length = spec.observations[spec.instruction.tokens].shape[0]
-        self._tokenizer = Tokenizer(path, ObservationError, self._told.skipped + self._length)
+        self._tokenizer = Tokenizer(path, ObservationError)
         self._made: dict[str, list[int]] = {}
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -48,5 +48,5 @@ class Instruct:
     def _tokens(self, text: str) -> list[int]:
         """Of one text; the last is kept, since an episode has one."""
         if text not in self._made:
-            self._made = {text: self._tokenizer(self._told.line(text))[self._told.skipped :]}
+            self._made = {text: self._tokenizer.of_task(text, self._told, self._length)}
         return self._made[text]

@@ -81,7 +81,7 @@ def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], 
         load_checkpoint_policy(save(built))
 
 
-LEROBOT_TYPES = ["vqbet", "pi0_fast", "tdmpc", "sac", "groot", "vla_jepa", "wall_x"]
+LEROBOT_TYPES = ["vqbet", "pi0_fast", "tdmpc", "sac", "vla_jepa", "wall_x"]
 LEROBOT_TYPES += ["molmoact2", "fastwam", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
@@ -94,6 +94,7 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["checkpoints/latest.ckpt", ".hydra/config.yaml"], "a directory of checkpoints.*latest.ckpt"),
     (["config.json", "model.safetensors"], r"a directory of weights .told by model\.safetensors"),
     (["config.json=lang_adaptor", "pytorch_model.bin"], r"this is RDT .told by config\.json: lang_adaptor.*dpmsolver"),
+    (["config.json=model_type=Gr00tN1d7", "model-00001.safetensors"], r"N1\.7 as NVIDIA saves it.*save_pretrained"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
     (["config.json=policy_head_type=scale_dp_policy", "model.safetensors"], r"DexVLA.*scaledp\.py"),
     (["pytorch_model.bin"], "a directory of weights"),

@@ -176,7 +176,10 @@ class Instruction:
         mask: key of what says which of them count, bool ``[B, L]``.
         new_line: whether the text ends with a new line before it is tokenized.
         before: lines before the text, of a policy that has some. The text is then stripped.
-        skipped: the first so many tokens of both together are no part of the observation.
+        skipped: the first so many tokens of all together are no part of the observation.
+        around: what is in the same line before and after the text, of a policy that has such.
+        plain: whether the text is in lower case, and of its signs only letters, digits, spaces and ``_`` are left.
+        otherwise: stands for an empty text.
     """
 
     tokens: str
@@ -184,9 +187,16 @@ class Instruction:
     new_line: bool
     before: tuple[str, ...] = field(default=(), metadata=OMITTED)
     skipped: int = field(default=0, metadata=OMITTED)
+    around: tuple[str, ...] = field(default=(), metadata=OMITTED)
+    plain: bool = field(default=False, metadata=OMITTED)
+    otherwise: str = field(default="", metadata=OMITTED)
 
     def line(self, text: str) -> str:
         """What is tokenized."""
+        text = text or self.otherwise
+        if self.plain:
+            text = "".join(c for c in text.lower() if c.isalnum() or c.isspace() or c == "_") or self.otherwise
+        text = text.join(self.around) if self.around else text
         text = "\n".join([*self.before, text.strip()]) if self.before else text
         return f"{text}\n" if self.new_line and not text.endswith("\n") else text
 

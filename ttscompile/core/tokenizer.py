@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .coercion import Errors
+from .spec import Instruction
 
 TASK = "task"
 """The key of an instruction's text, as LeRobot has it."""
@@ -29,18 +30,17 @@ class Tokenizer:
     Args:
         path: of ``tokenizer.json``, of CLIP's ``vocab.json``, or of the folder that has one of them.
         error: class of the errors.
-        most: tokens of a text, those that the tokenizer adds before and after it counted; None for no limit.
 
     Raises:
         TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
     """
 
-    def __init__(self, path: str | os.PathLike[str], error: Errors, most: int | None = None) -> None:
+    def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
         own = Path(path)
         self._path, self._error = (find_tokenizer(own) or own / FILE) if own.is_dir() else own, error
-        self._tokenizer: Any = self._read(most)
+        self._tokenizer: Any = self._read()
 
-    def _read(self, most: int | None) -> Any:
+    def _read(self) -> Any:
         path = self._path
         clip = path.name == _VOCABULARY
         for file in (path, path.with_name(_MERGES)) if clip else (path,):
@@ -56,7 +56,6 @@ class Tokenizer:
             ) from missing
         try:
             made = _clip(path) if clip else tokenizers.Tokenizer.from_file(str(path))
-            made.no_truncation() if most is None else made.enable_truncation(most)
         except Exception as damaged:  # of damaged files the package raises plain Exception
             raise self._error(f"{path}: no tokenizer that can be read: {damaged!s:.200}. Copy it again.") from damaged
         made.no_padding()
@@ -67,12 +66,22 @@ class Tokenizer:
         """How many tokens there are, added ones counted."""
         return int(self._tokenizer.get_vocab_size())
 
-    def __call__(self, text: str) -> list[int]:
-        """The tokens of a text, with those that the tokenizer adds."""
+    def __call__(self, text: str, most: int | None = None) -> list[int]:
+        """The tokens of a text, with those that the tokenizer adds; ``most`` of them, cut before an added end."""
         try:
+            self._tokenizer.no_truncation() if most is None else self._tokenizer.enable_truncation(most)
             return list(self._tokenizer.encode(text).ids)
         except Exception as refused:
             raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
+
+    def of_task(self, text: str, told: Instruction, length: int) -> list[int]:
+        """The tokens that a policy observes of a task; too many are refused where words after the text would be cut."""
+        most = None if told.around else told.skipped + length
+        tokens = self(told.line(text), most)[told.skipped :]
+        if told.around and len(tokens) > length:
+            found = f"{len(tokens)} tokens, and the policy reads {length}"
+            raise self._error(f"the task {text!r:.100} has {found}. Use fewer words, or compile it in: convert --task.")
+        return tokens
 
 
 def _clip(vocabulary: Path) -> Any:

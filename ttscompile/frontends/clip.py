@@ -19,6 +19,7 @@ from torch import nn
 from torch.nn import functional
 
 from ..errors import CheckpointError
+from .language_layers import Rotation, rotate
 from .settings import Settings, read_json
 
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
@@ -193,29 +194,36 @@ def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Pat
         raise CheckpointError(f"{where}: {error}") from error
 
 
-class SelfAttention(nn.Module):
-    """Attention of a layer; Florence-2's have the same."""
+class Attention(nn.Module):
+    """Attention of ``width`` channels in all heads together; ``source`` is the width of what is looked at."""
 
-    def __init__(self, config: TowerConfig) -> None:
+    def __init__(self, width: int, heads: int, source: int | None = None) -> None:
         super().__init__()
-        width = config.hidden_size
-        self.heads = config.num_attention_heads
-        self.q_proj, self.k_proj = nn.Linear(width, width), nn.Linear(width, width)
-        self.v_proj, self.out_proj = nn.Linear(width, width), nn.Linear(width, width)
+        self.heads, self.channels = heads, width // heads
+        self.q_proj, self.k_proj = nn.Linear(width, width), nn.Linear(source or width, width)
+        self.v_proj, self.out_proj = nn.Linear(source or width, width), nn.Linear(width, width)
 
-    def forward(self, x: torch.Tensor, mask: torch.Tensor | None, read: int) -> torch.Tensor:
-        """``[B, tokens, width]`` -> the first ``read`` tokens of the result."""
-        width = x.shape[-1]
+    def forward(
+        self, x: torch.Tensor, seen: torch.Tensor, mask: torch.Tensor | None, turns: Rotation | None = None
+    ) -> torch.Tensor:
+        """``[B, T, width]`` that look at ``[B, S, source]`` -> ``[B, T, width]``.
+
+        Args:
+            mask: added to the scores, if there is one.
+            turns: the rotary embedding of queries and keys, if there is one.
+        """
         q, k, v = (
-            project(tokens).unflatten(-1, (self.heads, width // self.heads)).transpose(1, 2)
-            for project, tokens in ((self.q_proj, x[:, :read]), (self.k_proj, x), (self.v_proj, x))
+            project(tokens).unflatten(-1, (self.heads, self.channels)).transpose(1, 2)
+            for project, tokens in ((self.q_proj, x), (self.k_proj, seen), (self.v_proj, seen))
         )
+        if turns is not None:
+            q, k = rotate(q, turns), rotate(k, turns)
         mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         return self.out_proj(mixed.transpose(1, 2).flatten(2))  # type: ignore[no-any-return]
 
 
 class FeedForward(nn.Module):
-    """Feed-forward of a layer."""
+    """Two layers with an activation between."""
 
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
@@ -232,15 +240,18 @@ class _Layer(nn.Module):
     def __init__(self, config: TowerConfig) -> None:
         super().__init__()
         self.layer_norm1 = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
-        self.self_attn = SelfAttention(config)
+        self.self_attn = Attention(config.hidden_size, config.num_attention_heads)
         self.layer_norm2 = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
         self.mlp = FeedForward(config)
         self.scaled = config.SCALED
         if self.scaled:
             self.lambda_1, self.lambda_2 = (nn.Parameter(torch.ones(config.hidden_size)) for _ in range(2))
 
-    def forward(self, x: torch.Tensor, mask: torch.Tensor | None, read: int) -> torch.Tensor:
-        seen = self.self_attn(self.layer_norm1(x), mask, read)
+    def forward(
+        self, x: torch.Tensor, mask: torch.Tensor | None, read: int, turns: Rotation | None = None
+    ) -> torch.Tensor:
+        normed = self.layer_norm1(x)
+        seen = self.self_attn(normed[:, :read], normed, mask, turns)
         x = x[:, :read] + (self.lambda_1 * seen if self.scaled else seen)
         made = self.mlp(self.layer_norm2(x))
         return x + (self.lambda_2 * made if self.scaled else made)  # type: ignore[no-any-return]

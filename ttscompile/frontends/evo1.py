@@ -49,12 +49,15 @@ class Evo1Config:
         return self.language.text.width
 
 
-class _Perceptron(nn.Module):
+class Perceptron(nn.Module):
+    """Two layers."""
+
     def __init__(self, before: int, inside: int, after: int) -> None:
         super().__init__()
         self.fc1, self.fc2 = nn.Linear(before, inside), nn.Linear(inside, after)
 
     def forward(self, x: Tensor) -> Tensor:
+        """``[..., before]`` -> ``[..., after]``."""
         return self.fc2(torch.relu(self.fc1(x)))  # type: ignore[no-any-return]
 
 
@@ -101,8 +104,8 @@ class _Head(nn.Module):
         self.transformer_blocks = nn.ModuleList(_Layer(config) for _ in range(config.num_layers))
         self.norm_out = nn.LayerNorm(width)
         self.seq_pool_proj = nn.Linear(config.chunk_size * width, width) if several else nn.Identity()
-        self.mlp_head = _Perceptron(width, config.hidden_dim, config.chunk_size * config.max_action_dim)
-        self.state_encoder = _Perceptron(config.max_state_dim, config.state_hidden_dim, width)
+        self.mlp_head = Perceptron(width, config.hidden_dim, config.chunk_size * config.max_action_dim)
+        self.state_encoder = Perceptron(config.max_state_dim, config.state_hidden_dim, width)
         self.action_encoder = _ActionEncoder(config) if several else nn.Linear(config.max_action_dim, width)
 
 

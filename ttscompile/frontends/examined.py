@@ -16,6 +16,7 @@ from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
 from .instruction import encoder_folders
 from .lerobot_config import ACTION, CONFIG
+from .lerobot_groot_steps import read_groot_processors
 from .lerobot_policy import TOKENS
 from .lerobot_processors import NORMALIZE, PREPROCESSOR, Features, Processors, Statistics, read_processors
 from .saved_weights import read_tensors
@@ -61,6 +62,8 @@ def _judged(key: str, one: Statistics) -> Finding:
         remedy = f"Minimum and maximum are exchanged, or damaged. {_REPEAT}"
     elif inert.all():
         level, told, remedy = Level.PROBLEM, f"inert: its {of} is 0 everywhere", _REPEAT
+    elif inert.any() and one.clipped and key != ACTION:
+        level, told = Level.NOTE, f"its range is 0 in {_columns(inert)}, which the policy does not see"
     elif inert.any() and key == ACTION:
         level, told = Level.NOTE, f"the policy always gives the same in {_columns(inert)}"
     elif inert.any():
@@ -82,8 +85,10 @@ def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[s
     entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
     both = {**entries["input_features"], **entries["output_features"]}
     features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
-    found = read_processors(directory, features, str(entries["type"]))
-    step: dict[str, Any] = {"config": {}} | next(one for one in steps if one.get("registry_name") == NORMALIZE)
+    how = () if entries["type"] == "groot" else (str(entries["type"]),)
+    read = read_groot_processors if entries["type"] == "groot" else read_processors
+    found, own = read(directory, features, *how), (one for one in steps if one.get("registry_name") == NORMALIZE)
+    step: dict[str, Any] = {"config": {}} | next(own, {})
     doubts, action = [], {} if found.action is None else {ACTION: found.action}
     for key, (kind, _) in features.items():
         mode, name = step["config"].get("norm_map", {}).get(kind, "IDENTITY"), found.renamed.get(key, key)

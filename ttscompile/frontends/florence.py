@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .clip import ACTIVATIONS, FeedForward, SelfAttention, TowerConfig
+from .clip import ACTIVATIONS, Attention, FeedForward, TowerConfig
 from .internvl import Colours
 from .lerobot_config import MOST
 from .lerobot_vla import part_of, positive_number
@@ -120,11 +120,11 @@ class _Patches(nn.Module):
         return self.norm(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)  # type: ignore[no-any-return]
 
 
-class _Windows(SelfAttention):
+class _Windows(Attention):
     """Patches look at those of their window; what is missing of a window at the border is zeros, and is seen."""
 
     def __init__(self, config: TowerConfig, window: int) -> None:
-        super().__init__(config)
+        super().__init__(config.hidden_size, config.num_attention_heads)
         self.window = window
 
     def within(self, x: Tensor, height: int, width: int) -> Tensor:
@@ -134,13 +134,14 @@ class _Windows(SelfAttention):
         rows, columns = (height + below) // side, (width + right) // side
         grid: Any = functional.pad(torch.unflatten(x, 1, (height, width)), (0, 0, 0, right, 0, below))
         cut = grid.unflatten(2, (columns, side)).unflatten(1, (rows, side)).transpose(2, 3)
-        seen = self(cut.flatten(3, 4).flatten(0, 2), None, side**2)
+        cut = cut.flatten(3, 4).flatten(0, 2)
+        seen = self(cut, cut, None)
         grid = seen.unflatten(1, (side, side)).unflatten(0, (-1, rows, columns)).transpose(2, 3)
         grid = grid.flatten(3, 4).flatten(1, 2)
         return grid[:, :height, :width].flatten(1, 2)  # type: ignore[no-any-return]
 
 
-class _Channels(SelfAttention):
+class _Channels(Attention):
     """Channels look at those of their group."""
 
     def within(self, x: Tensor, height: int, width: int) -> Tensor:
@@ -229,12 +230,13 @@ class _Layer(nn.Module):
 
     def __init__(self, config: BartConfig) -> None:
         super().__init__()
-        self.self_attn, self.mlp = SelfAttention(config), FeedForward(config)
+        self.self_attn = Attention(config.hidden_size, config.num_attention_heads)
+        self.mlp = FeedForward(config)
         self.self_attn_layer_norm = nn.LayerNorm(config.hidden_size)
         self.final_layer_norm = nn.LayerNorm(config.hidden_size)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = self.self_attn_layer_norm(x + self.self_attn(x, None, x.shape[1]))
+        x = self.self_attn_layer_norm(x + self.self_attn(x, x, None))
         return self.final_layer_norm(x + self.mlp(x))  # type: ignore[no-any-return]
 
 

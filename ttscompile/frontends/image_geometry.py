@@ -10,7 +10,7 @@ from ..errors import CheckpointError
 
 
 class ResizeCrop(nn.Module):
-    """Bilinear resize to a fixed size, then a crop of the centre.
+    """Resize to a fixed size, then a crop of the centre.
 
     The resize of a float image is linear and separable: ``rows @ image @ columns``. Both matrices are what the resize
     makes of the unit matrix, so that whatever it does at the border is in them; of both only the part that the crop
@@ -21,6 +21,7 @@ class ResizeCrop(nn.Module):
         crop: (height, width) within the resized image; None for all of it.
         antialias: whether pixels of a smaller image are averages of all that they stand for, as torchvision resizes
             tensors from its version 0.17 on.
+        mode: ``bilinear`` or ``bicubic``.
     """
 
     rows: torch.Tensor
@@ -33,6 +34,7 @@ class ResizeCrop(nn.Module):
         resize: tuple[int, int] | None = None,
         crop: tuple[int, int] | None = None,
         antialias: bool = True,
+        mode: str = "bilinear",
     ) -> None:
         super().__init__()
         whole = resize or (height, width)
@@ -43,7 +45,9 @@ class ResizeCrop(nn.Module):
         self.top, self.left = (round((n - m) / 2.0) for n, m in zip(whole, self.size, strict=True))
         self.resized = resize is not None and resize != (height, width)
         if self.resized:
-            rows, columns = (_resize_matrix(*each, antialias) for each in zip((height, width), whole, strict=True))
+            rows, columns = (
+                _resize_matrix(*each, antialias, mode) for each in zip((height, width), whole, strict=True)
+            )
             self.register_buffer("rows", rows[self.top : self.top + self.size[0]].clone(), persistent=False)
             columns = columns[self.left : self.left + self.size[1]]
             self.register_buffer("columns", columns.t().contiguous(), persistent=False)
@@ -56,8 +60,8 @@ class ResizeCrop(nn.Module):
         return images[:, :, self.top : self.top + height, self.left : self.left + width]
 
 
-def _resize_matrix(before: int, after: int, antialias: bool) -> torch.Tensor:
+def _resize_matrix(before: int, after: int, antialias: bool, mode: str) -> torch.Tensor:
     """``[after, before]``: what resizing along one axis does."""
     unit = torch.eye(before)[None, None]
-    rows = functional.interpolate(unit, (after, before), mode="bilinear", antialias=antialias, align_corners=False)
+    rows = functional.interpolate(unit, (after, before), mode=mode, antialias=antialias, align_corners=False)
     return rows[0, 0]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
+from ..core.spec import Instruction
 from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
 from .clip import NAME_FOLDER, find_encoder
@@ -17,12 +19,12 @@ def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) ->
     return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
 
 
-def language_model_folder(name: str, folders: list[Path], kind: str) -> Path:
+def language_model_folder(name: str, folders: list[Path], kind: str, what: str = "language model") -> Path:
     """The folder of a language model whose ``model_type`` begins with ``kind``."""
     found = find_encoder(name, folders, kind)
     if found is None:
         raise CheckpointError(
-            f"the language model {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
+            f"the {what} {name!r} is not on this machine, and nothing is ever downloaded. Looked for its"
             f" config.json in {', '.join(dict.fromkeys(map(str, folders)))}. {NAME_FOLDER}"
         )
     return found
@@ -45,8 +47,26 @@ def task_tokens(
             f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put its"
             f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {remedy}".rstrip()
         )
-    tokens = Tokenizer(path, CheckpointError, most)(text)
+    tokens = Tokenizer(path, CheckpointError)(text, most)
     if not tokens or max(tokens) >= vocabulary:
         found = f"token {max(tokens)}; the language model has {vocabulary}" if tokens else "no token at all"
         raise CheckpointError(f"{path}: it gives {found}. It belongs to another language model.")
     return tokens
+
+
+def told_after(
+    told: Instruction, name: str, folder: Path, vocabulary: int, image: int, places: int
+) -> tuple[tuple[tuple[int, ...], ...], Instruction]:
+    """The tokens of a prompt before each of its images; and how a task is told of which these are skipped.
+
+    Args:
+        image: the token that stands for one.
+        places: of images that the prompt is written with.
+    """
+    tokens = task_tokens(told.line(""), name, folder, None, vocabulary, "")
+    at = [i for i, token in enumerate(tokens) if token == image]
+    if len(at) != places:
+        found = f"{len(at)} tokens {image} (image_token_id) in a prompt of {places} images; expected one for each"
+        raise CheckpointError(f"{folder}: its tokenizer makes {found}. It is of another model than its config.json.")
+    between = tuple(tuple(tokens[start + 1 : end]) for start, end in zip([-1, *at], at, strict=False))
+    return between, replace(told, skipped=places + sum(map(len, between)))

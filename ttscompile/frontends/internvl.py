@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from .clip import ACTIVATIONS, ImageTowerConfig, Layers
-from .language_layers import LanguageConfig, Layer, Norm, added, rotation
+from .language_layers import LanguageConfig, Norm, Words, added, laid, rotation
 from .siglip import squares
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -145,11 +145,9 @@ class _Projector(nn.Module):
         return self.linear_2(ACTIVATIONS[self.activation](self.linear_1(read)))  # type: ignore[no-any-return]
 
 
-class _Language(nn.Module):
+class _Language(Words):
     def __init__(self, config: InternVLConfig) -> None:
-        super().__init__()
-        self.embed_tokens = nn.Embedding(config.vocabulary, config.text.width)
-        self.layers = nn.ModuleList(Layer(config.text) for _ in range(config.text.layers))
+        super().__init__(config.vocabulary, config.text)
         self.norm = Norm(config.text)
 
 
@@ -175,20 +173,16 @@ class InternVL(nn.Module):
         """
         seen = self.multi_modal_projector(self.vision_tower(torch.stack(images, 1).flatten(0, 1)))
         seen = seen.unflatten(0, (-1, len(images)))
-        language, parts = self.language_model, list[Tensor]()
-        at, positions = 0, list[int]()
-        for number, words in enumerate(self.prompt.between):
-            positions += range(at, at + len(words))
-            at += len(words)
-            if words:
-                parts.append(language.embed_tokens(torch.tensor([words])).expand(len(seen), -1, -1))
-            if number < self.prompt.images:
-                positions += range(at, at + self.config.image_tokens)
-                parts.append(seen[:, number])
+        language, at, positions = self.language_model, 0, list[int]()
+        for number, own in enumerate(self.prompt.between):
+            positions += range(at, at + len(own))
+            at += len(own)
+            positions += range(at, at + self.config.image_tokens * (number < self.prompt.images))
             at += self.config.image_tokens
         valid = functional.pad(mask, (len(positions), 0), value=True)
         positions += range(at, at + tokens.shape[1])
-        x = torch.cat([*parts, language.embed_tokens(tokens)], 1)
+        words = [language.embed_tokens(torch.tensor([each])) if each else None for each in self.prompt.between]
+        x = laid(seen.unbind(1), words, language.embed_tokens(tokens))
         turns = rotation(torch.tensor([positions]), self.config.text.channels, self.config.base)
         causal = torch.ones(len(positions), len(positions), dtype=torch.bool).tril()
         hidden = added(valid[:, None, None, :] & causal)

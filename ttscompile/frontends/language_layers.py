@@ -1,4 +1,4 @@
-"""Layers of the language models Llama, Gemma and Qwen2, for a prefix that is read once and an expert that reads it.
+"""Layers of the language models Llama, Gemma and Qwen, for a prefix that is read once and an expert that reads it.
 
 Attribute names are those under which the weights of transformers load. Keys and values are ``[B, heads, tokens,
 channels]`` with every head written out, so that what depends on the prefix alone is repeated once a call.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import NamedTuple
 
 import torch
@@ -28,6 +29,7 @@ class LanguageConfig:
         epsilon: of the norms.
         gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
         biased: whether queries, keys and values have a bias, as in Qwen2.
+        normed: whether each head's queries and keys are normalised, as in Qwen3.
     """
 
     width: int
@@ -39,6 +41,7 @@ class LanguageConfig:
     epsilon: float = 1e-6
     gemma: bool = False
     biased: bool = False
+    normed: bool = False
 
 
 class Seen(NamedTuple):
@@ -49,11 +52,11 @@ class Seen(NamedTuple):
 
 
 class Norm(nn.Module):
-    """Root mean square normalisation."""
+    """Root mean square normalisation, of the whole width or of ``channels``."""
 
-    def __init__(self, config: LanguageConfig) -> None:
+    def __init__(self, config: LanguageConfig, channels: int | None = None) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.zeros(config.width))
+        self.weight = nn.Parameter(torch.zeros(channels or config.width))
         self.epsilon, self.offset = config.epsilon, 1.0 if config.gemma else 0.0
 
     def forward(self, x: Tensor) -> Tensor:
@@ -73,6 +76,8 @@ class Attention(nn.Module):
         self.k_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.v_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.o_proj = nn.Linear(queries, config.width, bias=False)
+        norms = [Norm(config, config.channels) if config.normed else nn.Identity() for _ in range(2)]
+        self.q_norm, self.k_norm = norms
 
     def split(self, x: Tensor) -> Tensor:
         """``[B, T, heads * channels]`` -> ``[B, heads, T, channels]``."""
@@ -117,12 +122,36 @@ class Layer(nn.Module):
         """The stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``."""
         attention = self.self_attn
         normed = self.input_layernorm(x)
-        keys = rotate(attention.split(attention.k_proj(normed)), turns)
+        keys = rotate(attention.k_norm(attention.split(attention.k_proj(normed))), turns)
         values = attention.split(attention.v_proj(normed))
-        queries = rotate(attention.split(attention.q_proj(normed)), turns)
+        queries = rotate(attention.q_norm(attention.split(attention.q_proj(normed))), turns)
         seen = Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
         x = x + attention.attend(queries, seen, mask)
         return x + self.mlp(self.post_attention_layernorm(x)), keys, values
+
+
+class Words(nn.Module):
+    """A language model but for its last norm: the embedding of its tokens, and its layers."""
+
+    def __init__(self, vocabulary: int, config: LanguageConfig) -> None:
+        super().__init__()
+        self.embed_tokens = nn.Embedding(vocabulary, config.width)
+        self.layers = nn.ModuleList(Layer(config) for _ in range(config.layers))
+
+
+def laid(seen: Iterable[Tensor], words: Iterable[Tensor | None], last: Tensor) -> Tensor:
+    """A prompt ``[B, S, width]``: words before each image, what is of the image, and what is after the last one.
+
+    Args:
+        seen: ``[B, tokens, width]`` of each image; of fewer than there are places for, the others are left out.
+        words: before each place, ``[1, n, width]``, or None.
+        last: ``[B, L, width]``.
+    """
+    parts = [last]
+    for own, image in zip_longest(words, seen):
+        parts[-1:-1] = [] if own is None else [own.expand(len(last), -1, -1)]
+        parts[-1:-1] = [] if image is None else [image]
+    return torch.cat(parts, 1)
 
 
 def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:
@@ -167,9 +196,10 @@ class Rotation(NamedTuple):
 
 
 def rotation(positions: Tensor, channels: int, base: float = 10_000) -> Rotation:
-    """The rotary embedding of positions ``[B, T]``."""
+    """The rotary embedding of positions ``[B, T]``; of several axes, ``[B, T, channels / 2]``."""
     rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32))
-    angles = (positions[..., None].to(torch.float32) * rates)[:, None]
+    own = positions if positions.ndim == 3 else positions[..., None]
+    angles = (own.to(torch.float32) * rates)[:, None]
     return Rotation(angles.cos(), angles.sin())
 
 

@@ -6,7 +6,6 @@ safetensors; neither lerobot nor torchvision is needed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 
@@ -18,17 +17,11 @@ from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
 from .settings import read_json
 
-TYPES: Mapping[str, str] = {
-    "act": "lerobot_act",
-    "diffusion": "lerobot_diffusion",
-    "evo1": "lerobot_evo1",
-    "multi_task_dit": "lerobot_multi_task_dit",
-    "pi0": "lerobot_pi",
-    "pi05": "lerobot_pi",
-    "smolvla": "lerobot_smolvla",
-    "xvla": "lerobot_xvla",
+TYPES = {
+    **{name: f"lerobot_{name}" for name in ("act", "diffusion", "evo1", "groot", "multi_task_dit", "smolvla", "xvla")},
+    **dict.fromkeys(("pi0", "pi05"), "lerobot_pi"),
 }
-"""By ``type`` of ``config.json``: the module, whose ``load`` is given its entries."""
+"""The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 
 
 def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
@@ -37,4 +30,5 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     kind = str(entries.get("type"))
     if kind not in TYPES:
         refuse_policy(f"{kind:.80}", LEROBOT, f"{directory}: ")
-    return import_module(f".{TYPES[kind]}", __package__).load(directory, entries, options)  # type: ignore[no-any-return]
+    module = import_module(f".{TYPES[kind]}", __package__)
+    return module.load(directory, entries, options)  # type: ignore[no-any-return]

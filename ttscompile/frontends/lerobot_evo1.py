@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,12 @@ import torch
 from torch import Tensor, nn
 
 from ..core.spec import Affine, ChunkSpec, Instruction, PolicySpec, SamplerTable
-from ..errors import CheckpointError
 from .clip import ACTIVATIONS
 from .encoded import EncodedDenoiser
 from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from .families import LoadOptions
-from .instruction import encoder_folders, language_model_folder, task_tokens
+from .instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from .internvl import InternVitConfig, InternVLConfig, Prompt
-from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
 from .lerobot_vla import (
@@ -33,12 +32,14 @@ from .lerobot_vla import (
     padded_size,
     part_of,
     positive_number,
+    read_language,
     read_vla_config,
     read_vla_processors,
     require_square,
+    rope_of,
     vla_spec,
 )
-from .saved_weights import require_weights
+from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
@@ -77,31 +78,22 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     config = read_config(shared, model)
     vocabulary, views = config.language.vocabulary, _views(settings)
     told = Instruction(TOKENS, MASK, False, tuple(_IMAGE.format(i + 1) for i in range(views)))
-    between = _between(task_tokens(told.line(""), name, folder, None, vocabulary, ""), views, folder, model)
-    told = replace(told, skipped=views + sum(map(len, between)))
+    image = model.number("image_token_id", 151667, _MOST_VOCABULARY)
+    between, told = told_after(told, name, folder, vocabulary, image, views)
     images = told.skipped + views * (config.language.image_tokens - 1)
     length = settings.number("max_text_length", 1024, MOST) - images
     if length < 1:
         raise settings.refusal("max_text_length", f"more than the {images} tokens of {views} images", 1024)
-    sizes, task = {"actions": config.max_action_dim}, None
-    if options.task is None:
-        sizes |= {"tokens": length, "vocabulary": vocabulary}
-    else:
+    sizes, task = {"actions": config.max_action_dim, "tokens": length, "vocabulary": vocabulary}, None
+    if options.task is not None:
         tokens = task_tokens(told.line(options.task), name, folder, None, vocabulary, "")
         task = torch.tensor([tokens[told.skipped :][:length]])
-    weights = _weights(shared, options, config, model)
-    try:
-        with torch.device("meta"):  # compared before anything of the configured sizes takes memory
-            network = Evo1(config, Prompt(between, len(shared.cameras)))
-        require_weights(network.state_dict(), weights, "config.json, or the language model's,")
-        network.load_state_dict(weights, assign=True)
-    except CheckpointError as error:
-        raise CheckpointError(f"{directory}: {error}") from error
+    weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
+    network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
     encoder = Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
     side = config.language.vision.image_size
-    spec = vla_spec(shared, processors, (side, side), "stretch", sizes, options, lambda each: _sampler(settings, each))
-    read = told if task is None else None
-    spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform", instruction=read)
+    spec = vla_spec(shared, processors, (side, side), "stretch", sizes, options, partial(_sampler, settings), told)
+    spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform")
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
 
@@ -138,18 +130,9 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
 def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     """Of the language model's entries; defaults are those of transformers."""
     image, text = part_of(model, "vision_config"), part_of(model, "text_config")
-    for own, entry, expected in (
-        (image, "norm_type", "layer_norm"),
-        (image, "use_qk_norm", False),
-        (image, "use_absolute_position_embeddings", True),
-        (image, "num_channels", 3),
-        (model, "vision_feature_layer", -1),
-        (model, "vision_feature_select_strategy", "default"),
-        (text, "model_type", "qwen2"),
-        (text, "hidden_act", "silu"),
-    ):
-        if own.values.get(entry, expected) != expected:
-            raise own.refusal(entry, f"{expected}: another is not rebuilt here".lower())
+    image.require(norm_type="layer_norm", use_qk_norm=False, use_absolute_position_embeddings=True, num_channels=3)
+    model.require(vision_feature_layer=-1, vision_feature_select_strategy="default")
+    text.require(model_type="qwen2", hidden_act="silu", use_sliding_window=False)
     names = {field for field in InternVitConfig.__dataclass_fields__ if field in image.values}
     sizes = {name: _side(image, name) for name in names & {"image_size", "patch_size"}}
     vision = InternVitConfig(**{name: image.values[name] for name in names} | sizes)
@@ -157,24 +140,12 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     scale = max(int(1 / ratio), 1)
     if abs(scale * ratio - 1) > 1e-6 or vision.side % scale:
         raise model.refusal("downsample_ratio", f"one of so many of the {vision.side} patches along a side", 0.5)
-    width, heads = text.number("hidden_size", 4096, MOST), text.number("num_attention_heads", 32, MOST)
     there, wanted = text.number("num_hidden_layers", 32, _MOST_LAYERS), settings.values.get("vlm_num_layers", 14)
     if wanted is not None and type(wanted) is not int:
         raise settings.refusal("vlm_num_layers", "a whole number, or null for all", 14)
-    language = LanguageConfig(
-        width=width,
-        hidden=text.number("intermediate_size", 22016, MOST),
-        layers=len(range(there)[:wanted]),
-        heads=heads,
-        groups=heads if text.values.get("num_key_value_heads", 32) is None else text.number("num_key_value_heads", 32),
-        channels=text.number("head_dim", width // heads, MOST),
-        epsilon=positive_number(text, "rms_norm_eps", 1e-6),
-        biased=True,
-    )
-    if heads % language.groups or language.channels % 2:
-        raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
-    if text.flag("use_sliding_window", False):
-        raise text.refusal("use_sliding_window", "false: layers that see a part of the words are not rebuilt here")
+    heads = text.number("num_attention_heads", 32, MOST)
+    language = read_language(text, len(range(there)[:wanted]), text.number("hidden_size", 4096, MOST) // heads)
+    language = replace(language, biased=True)
     config = InternVLConfig(
         vision=vision,
         text=language,
@@ -190,17 +161,13 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
 
 def _rotary_base(text: Settings, longest: int) -> float:
     """Of the rotary embedding; a dynamic one is another only where more words than in training are read."""
-    found = text.values.get("rope_parameters") or text.values.get("rope_scaling") or {}
-    if not isinstance(found, dict):
-        raise text.refusal("rope_parameters", "settings by name")
-    rope = Settings({"rope_theta": text.values.get("rope_theta", 10_000.0), **found}, f"{text.where}rope_parameters.")
-    name = "rope_type" if "rope_type" in found else "type"
+    rope = rope_of(text, 10_000.0)
+    name = "rope_type" if "rope_type" in rope.values else "type"
     if rope.choice(name, "default", "dynamic") == "dynamic":
         most = text.number("max_position_embeddings", 32768)
         if longest > most:
             raise text.refusal("max_position_embeddings", f"at least max_text_length, {longest}, with a dynamic one")
-    if rope.values.get("partial_rotary_factor", 1.0) != 1:
-        raise rope.refusal("partial_rotary_factor", "1")
+    rope.require(partial_rotary_factor=1)
     return positive_number(rope, "rope_theta", 10_000.0)
 
 
@@ -221,16 +188,6 @@ def _views(settings: Settings) -> int:
     if cameras > views:
         raise settings.refusal("max_views", f"{cameras} at least, as many as there are cameras", 3)
     return views
-
-
-def _between(tokens: list[int], views: int, folder: Path, model: Settings) -> tuple[tuple[int, ...], ...]:
-    """The tokens of a prompt before each of its images."""
-    image = model.number("image_token_id", 151667, _MOST_VOCABULARY)
-    at = [i for i, token in enumerate(tokens) if token == image]
-    if len(at) != views:
-        found = f"{len(at)} tokens {image} (image_token_id) in a prompt of {views} images; expected one for each"
-        raise CheckpointError(f"{folder}: its tokenizer makes {found}. It is of another model than its config.json.")
-    return tuple(tuple(tokens[start + 1 : end]) for start, end in zip([-1, *at], at, strict=False))
 
 
 def _chunk(settings: Settings, chunk: ChunkSpec) -> ChunkSpec:
@@ -265,9 +222,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, config: Evo1Config, mo
     unread = (".embeddings.mask_token", *((".seq_pool_proj.weight", ".seq_pool_proj.bias") * (config.chunk_size == 1)))
     found = dict[str, Tensor]()
     for saved, value in read_weights(shared, options, *unread).items():
-        name = saved
-        for pattern, new in (_SHARED, *_RENAMED) if kinds == 1 else _RENAMED:
-            name = re.sub(pattern, new, name)
+        name = renamed(saved, (_SHARED, *_RENAMED) if kinds == 1 else _RENAMED)
         if kinds > 1 and _BY_KIND.search(name) and len(value) == kinds:
             value = value[own].T.contiguous() if value.ndim == 3 else value[own].clone()
         found[name] = value

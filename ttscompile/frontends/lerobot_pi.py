@@ -34,7 +34,7 @@ from .lerobot_vla import (
     vla_spec,
 )
 from .pi import Expert, Pi, PiConfig, Prefix
-from .saved_weights import require_weights
+from .saved_weights import filled
 from .siglip import SiglipConfig
 
 _VISION = "paligemma_with_expert.paligemma.model.vision_tower."
@@ -58,18 +58,12 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     weights = _weights(shared, options)
     try:
         config = read_config(shared, weights, adaptive)
-        with torch.device("meta"):
-            network = Pi(config)
-        require_weights(network.state_dict(), weights, CONFIG)
-        network.load_state_dict(weights, assign=True)
     except CheckpointError as error:
         raise CheckpointError(f"{directory}: {error}") from error
+    network = filled(lambda: Pi(config), weights, CONFIG, directory)
     length = shared.settings.number("tokenizer_max_length", 200 if adaptive else 48, MOST)
-    sizes = {"actions": config.actions}
-    task = None
-    if options.task is None:
-        sizes |= {"tokens": length, "vocabulary": config.vocabulary}
-    else:
+    sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
+    if options.task is not None:
         name = str(processors.tokenizer.get("tokenizer_name") or "google/paligemma-3b-pt-224")
         found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"

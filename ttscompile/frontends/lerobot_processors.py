@@ -5,7 +5,7 @@ Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,13 @@ _RENAME, _TOKENIZE, NORMALIZE = "rename_observations_processor", "tokenizer_proc
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
 PROMPT = "pi05_prepare_state_tokenizer_processor_step"
-_RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
+RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
 _PAD = ("evo1_pad_state_processor", "evo1_pad_action_processor")
 _CROP = "evo1_action_processor"
 """What it does is in the policy's configuration, which lerobot prefers to the step's own."""
 _KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, _RELATIVE}),
-    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, _ABSOLUTE, _CROP}),
+    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, RELATIVE[0]}),
+    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, RELATIVE[1], _CROP}),
 }
 IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
 OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN)}
@@ -65,12 +65,14 @@ class Statistics:
         mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
         first: mean, or the lower end of the range.
         second: standard deviation, or the upper end.
+        clipped: whether what is out of range is clipped, and is 0 where there is no range.
     """
 
     mode: str
     first: torch.Tensor
     second: torch.Tensor
     eps: float
+    clipped: bool = False
 
     @property
     def width(self) -> torch.Tensor:
@@ -111,6 +113,7 @@ class Normalizer(nn.Module):
 
     first: torch.Tensor
     width: torch.Tensor
+    still: torch.Tensor | None
 
     def __init__(self, statistics: Statistics | None) -> None:
         super().__init__()
@@ -118,6 +121,8 @@ class Normalizer(nn.Module):
         if statistics is not None:
             self.register_buffer("first", statistics.first, persistent=False)
             self.register_buffer("width", statistics.width, persistent=False)
+            still = statistics.second == statistics.first if statistics.clipped else None
+            self.register_buffer("still", still, persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """``[B, To, ...]`` -> the same."""
@@ -125,7 +130,8 @@ class Normalizer(nn.Module):
             return x
         if self.mode == "MEAN_STD":
             return (x - self.first) / self.width
-        return 2 * (x - self.first) / self.width - 1
+        scaled = 2 * (x - self.first) / self.width - 1
+        return scaled if self.still is None else torch.where(self.still, 0.0, scaled).clamp(-1, 1)
 
 
 @dataclass(frozen=True)
@@ -154,10 +160,10 @@ class Processors:
 def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:
     """The pipelines of a policy of this type that LeRobot saved, with these features."""
     own = OWN_STEPS.get(kind, ())
-    before, after = (_steps(directory, name, own) for name in (PREPROCESSOR, POSTPROCESSOR))
+    before, after = (read_steps(directory, name, own) for name in (PREPROCESSOR, POSTPROCESSOR))
     padded = any(step["registry_name"] in _PAD for step in before)
     return Processors(
-        renamed=_renamed(directory, before, features),
+        renamed=renamed_observations(directory, before, features),
         normalizers=_statistics(directory, before, NORMALIZE, features, padded),
         action=_statistics(directory, after, _UNNORMALIZE, features, padded).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
@@ -167,9 +173,17 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
     )
 
 
-def _steps(directory: Path, name: str, own: tuple[str, ...]) -> list[dict[str, Any]]:
-    """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order."""
+def read_steps(
+    directory: Path, name: str, own: Collection[str] = (), only: Collection[str] | None = None
+) -> list[dict[str, Any]]:
+    """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order.
+
+    Args:
+        own: names before a policy that are known beside those of all.
+        only: names that are known in their place, of a policy whose steps are its own.
+    """
     path = directory / name
+    known = _KNOWN_STEPS[name].union(own if name == PREPROCESSOR else ()) if only is None else only
     if not path.is_file():
         raise CheckpointError(
             f"{path}: no such file. Policies saved by lerobot before 0.4 keep their statistics inside the weights:"
@@ -178,7 +192,6 @@ def _steps(directory: Path, name: str, own: tuple[str, ...]) -> list[dict[str, A
     steps = read_json(path).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
         raise CheckpointError(f"{path}: has no list of steps; expected a pipeline that lerobot saved.")
-    known = _KNOWN_STEPS[name].union(own if name == PREPROCESSOR else ())
     for step in steps:
         registered = step.get("registry_name")  # a step of somebody's own has a class instead
         if not isinstance(registered, str) or registered not in known:
@@ -191,7 +204,7 @@ def _steps(directory: Path, name: str, own: tuple[str, ...]) -> list[dict[str, A
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
             found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
             raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
-        if registered in (_RELATIVE, _ABSOLUTE) and step["config"].get("enabled") is not False:
+        if registered in RELATIVE and step["config"].get("enabled") is not False:
             raise CheckpointError(
                 f"{path}: {registered} is enabled: actions are relative to the state, which is not compiled. Expected"
                 " a policy of absolute actions."
@@ -209,7 +222,7 @@ def _steps(directory: Path, name: str, own: tuple[str, ...]) -> list[dict[str, A
     return steps
 
 
-def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
+def renamed_observations(directory: Path, steps: list[dict[str, Any]], features: Features) -> dict[str, str]:
     """The policy's name of each renamed observation -> the robot's."""
     step = next((step for step in steps if step["registry_name"] == _RENAME), None)
     names = {} if step is None else Settings(step["config"], f"{directory}: {_RENAME}.").names("rename_map")
@@ -221,6 +234,14 @@ def _renamed(directory: Path, steps: list[dict[str, Any]], features: Features) -
             " observation of the policy, and the other way round."
         )
     return renamed
+
+
+def state_of(directory: Path, step: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """The tensors that a step saved; none where it has no file."""
+    file = step.get("state_file")
+    if file is not None and (not isinstance(file, str) or Path(file).name != file or len(file) > 200):
+        raise CheckpointError(f"{directory}: state_file {file!r:.80} is not the name of a file in this directory.")
+    return {} if file is None else read_tensors(directory / file)
 
 
 def _statistics(
@@ -238,10 +259,7 @@ def _statistics(
     modes, eps = settings.names("norm_map"), settings.values.get("eps", 1e-8)
     if not isinstance(eps, float) or not eps > 0:
         raise settings.refusal("eps", "a positive number")
-    file = step.get("state_file")
-    if file is not None and (not isinstance(file, str) or Path(file).name != file or len(file) > 200):
-        raise CheckpointError(f"{directory}: state_file {file!r:.80} is not the name of a file in this directory.")
-    tensors = {} if file is None else read_tensors(directory / file)
+    tensors = state_of(directory, step)
     only, own = settings.values.get("normalize_observation_keys"), settings.values.get("features", {})
     if not isinstance(own, dict):
         raise settings.refusal("features", "type and shape by name")
@@ -263,7 +281,7 @@ def _statistics(
         if missing:
             raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
         own_numbers = {name: _unpadded(name, tensors[name], shape) if padded else tensors[name] for name in names}
-        first, second = (_broadcast(directory, name, value, kind, shape) for name, value in own_numbers.items())
+        first, second = (as_statistic(directory, name, value, kind, shape) for name, value in own_numbers.items())
         if mode == "MEAN_STD" and (second < 0).any():
             raise CheckpointError(f"{directory}: {names[1]} has a deviation below 0. Compute the statistics again.")
         result[key] = Statistics(mode, first, second, eps)
@@ -277,7 +295,7 @@ def _unpadded(name: str, value: torch.Tensor, shape: tuple[int, ...]) -> torch.T
     return own if bool((value[len(own) :] == neutral).all()) else value
 
 
-def _broadcast(directory: Path, name: str, value: torch.Tensor, kind: str, shape: tuple[int, ...]) -> torch.Tensor:
+def as_statistic(directory: Path, name: str, value: torch.Tensor, kind: str, shape: tuple[int, ...]) -> torch.Tensor:
     """A statistic in the shape that broadcasts: one entry a channel; of an image ``[channels, 1, 1]``."""
     value = value.to(torch.float32)
     if kind == "VISUAL" and value.ndim == 1:

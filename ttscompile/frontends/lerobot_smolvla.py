@@ -13,12 +13,10 @@ import torch
 from torch import nn
 
 from ..core.spec import PolicySpec
-from ..errors import CheckpointError
 from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .instruction import encoder_folders, language_model_folder, task_tokens
-from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import read_weights
 from .lerobot_vla import (
@@ -26,13 +24,14 @@ from .lerobot_vla import (
     padded_size,
     part_of,
     positive_number,
+    read_language,
     read_vla_config,
     read_vla_processors,
     require_square,
     seen_size,
     vla_spec,
 )
-from .saved_weights import require_weights
+from .saved_weights import filled
 from .settings import Settings, read_json
 from .siglip import SiglipConfig
 from .smolvla import Expert, Prefix, SmolVLA, SmolVLAConfig, expert_of
@@ -69,23 +68,14 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))
     length = settings.number("tokenizer_max_length", 48, MOST)
-    sizes = {"actions": config.actions}
-    if options.task is None:
-        sizes |= {"tokens": length, "vocabulary": config.vocabulary}
-        task = None
-    else:
+    sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
+    if options.task is not None:
         tokenizer = str(processors.tokenizer.get("tokenizer_name") or name)
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
         found = find_encoder(tokenizer, folders, "smolvlm")
         task = torch.tensor([task_tokens(text, tokenizer, found, length, config.vocabulary)])
     weights = {name.removeprefix("model."): value for name, value in read_weights(shared, options, *_UNREAD).items()}
-    try:
-        with torch.device("meta"):  # compared before anything of the configured sizes takes memory
-            network = SmolVLA(config)
-        require_weights(network.state_dict(), weights, "config.json, or the language model's,")
-        network.load_state_dict(weights, assign=True)
-    except CheckpointError as error:
-        raise CheckpointError(f"{directory}: {error}") from error
+    network = filled(lambda: SmolVLA(config), weights, "config.json, or the language model's,", directory)
     encoder = Gathered(shared, processors, Prefix(network), config.state, task)
     resize = None if settings.values.get("resize_imgs_with_padding", 0) is None else config.image
     spec = vla_spec(shared, processors, resize, "start", sizes, options)
@@ -95,29 +85,14 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
 def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     """Sizes and variant, of the policy's entries and those of its language model."""
     settings = shared.settings
-    for entry, expected in (("add_image_special_tokens", False), ("use_delta_joint_actions_aloha", False)):
-        if settings.flag(entry, expected) != expected:
-            raise settings.refusal(entry, f"{expected}: the other is not rebuilt".lower())
+    settings.require(add_image_special_tokens=False, use_delta_joint_actions_aloha=False)
     vision_entries, text = part_of(model, "vision_config"), part_of(model, "text_config")
     names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
     vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
     layers = _layers(settings, text.number("num_hidden_layers", None, _MOST_LAYERS))
-    heads = text.number("num_attention_heads", None, MOST)
-    width = text.number("hidden_size", None, MOST)
-    epsilon = text.values.get("rms_norm_eps", 1e-6)
-    if not isinstance(epsilon, float) or not 0 < epsilon < 1:
-        raise text.refusal("rms_norm_eps", "a small positive number")
-    language = LanguageConfig(
-        width=width,
-        hidden=text.number("intermediate_size", None, MOST),
-        layers=layers,
-        heads=heads,
-        groups=text.number("num_key_value_heads", heads, MOST),
-        channels=text.number("head_dim", width // heads, MOST),
-        epsilon=epsilon,
-    )
-    if heads % language.groups or language.channels % 2:
-        raise text.error(f"{heads} heads of {language.channels} channels do not fit {language.groups} of keys")
+    heads, width = text.number("num_attention_heads", None, MOST), text.number("hidden_size", None, MOST)
+    own = Settings({"num_key_value_heads": heads} | dict(text.values), text.where)
+    language = read_language(own, layers, width // heads)
     expert = expert_of(language, positive_number(settings, "expert_width_multiplier", 0.75))
     scale = model.number("scale_factor", 2)
     if not 2 <= expert.width <= MOST or expert.width % 2:

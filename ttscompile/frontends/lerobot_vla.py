@@ -18,6 +18,7 @@ from ..core.spec import WITHOUT, Instruction, ObservationSpec, PolicySpec, Sampl
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
 from .families import LoadOptions
+from .language_layers import LanguageConfig
 from .lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
 from .lerobot_policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
 from .lerobot_processors import Normalizer, Processors, read_processors
@@ -77,17 +78,18 @@ def vla_spec(
     sizes: Mapping[str, int],
     options: LoadOptions,
     table: Make | None = None,
+    told: Instruction | None = None,
 ) -> PolicySpec:
     """The specification of a policy.
 
     Args:
         image: height and width that images are resized to; None where they stay.
         fit: where the rest of a resized image is.
-        sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction and ``vocabulary``, both
-            absent where it is compiled in.
+        sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction, and ``vocabulary``.
+        told: how a task becomes tokens; None as the processors say.
         table: the loop; None for ten steps, or as many as are configured, from time 1 to time 0.
     """
-    language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if "tokens" in sizes else {}
+    language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if options.task is None else {}
     source = {"policy": str(config.settings.values["type"])}
     source |= {} if options.task is None else {"task": options.task}
     source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
@@ -99,9 +101,9 @@ def vla_spec(
         observations |= {processors.renamed.get(key, key): resized for key in config.cameras}
     # The instruction of pi05 holds its state too, which only lerobot's processor can put there.
     plain = language and not processors.state_in_prompt
-    told = Instruction(TOKENS, MASK, processors.new_line) if plain else None
+    read = told or Instruction(TOKENS, MASK, processors.new_line) if plain else None
     sample = (config.horizon, sizes["actions"])
-    return replace(spec, sample=sample, observations=observations, instruction=told)
+    return replace(spec, sample=sample, observations=observations, instruction=read)
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
@@ -191,3 +193,29 @@ def part_of(model: Settings, name: str) -> Settings:
     if not isinstance(inner, dict):
         raise model.refusal(name, "its entries")
     return Settings(inner, f"{model.where}{name}.")
+
+
+def read_language(text: Settings, layers: int, channels: int) -> LanguageConfig:
+    """Sizes of a language model, of which so many layers are used; ``channels`` of a head where it does not say."""
+    heads = text.number("num_attention_heads", 32, MOST)
+    known = text.values.get("num_key_value_heads", 32) is not None
+    config = LanguageConfig(
+        width=text.number("hidden_size", 4096, MOST),
+        hidden=text.number("intermediate_size", 22016, MOST),
+        layers=layers,
+        heads=heads,
+        groups=text.number("num_key_value_heads", 32) if known else heads,
+        channels=text.number("head_dim", channels, MOST),
+        epsilon=positive_number(text, "rms_norm_eps", 1e-6),
+    )
+    if heads % config.groups or config.channels % 2:
+        raise text.error(f"{heads} heads of {config.channels} channels do not fit {config.groups} of keys")
+    return config
+
+
+def rope_of(text: Settings, base: float) -> Settings:
+    """What a language model says of its rotary embedding; ``base`` where it says nothing of that."""
+    found = text.values.get("rope_parameters") or text.values.get("rope_scaling") or {}
+    if not isinstance(found, dict):
+        raise text.refusal("rope_parameters", "settings by name")
+    return Settings({"rope_theta": text.values.get("rope_theta", base), **found}, f"{text.where}rope_parameters.")

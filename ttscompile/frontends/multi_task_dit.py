@@ -18,6 +18,7 @@ from torch import nn
 from torch.nn import functional
 
 from .clip import ClipText, ClipVision, TextConfig, VisionConfig
+from .language_layers import Rotation, rotate, rotation
 from .transformer_for_diffusion import SinusoidalEmbedding
 
 
@@ -56,23 +57,18 @@ class _RotaryAttention(nn.Module):
         width = config.hidden_dim
         self.heads, self.head_width = config.num_heads, width // config.num_heads
         self.qkv_proj, self.out_proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        frequencies = config.rope_base ** -(torch.arange(0, self.head_width, 2).float() / self.head_width)
-        angles = torch.outer(torch.arange(config.horizon).float(), frequencies).repeat(1, 2)
-        self.register_buffer("cos", angles.cos(), persistent=False)
-        self.register_buffer("sin", angles.sin(), persistent=False)
+        turns = rotation(torch.arange(config.horizon)[None], self.head_width, config.rope_base)
+        self.register_buffer("cos", turns.cos, persistent=False)
+        self.register_buffer("sin", turns.sin, persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """``[B, T, width]`` -> the same."""
         _, tokens, width = x.shape
         qkv = self.qkv_proj(x).reshape(-1, tokens, 3, self.heads, self.head_width)
         q, k, v = (qkv[:, :, i].transpose(1, 2) for i in range(3))
-        mixed = functional.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v)
+        turns = Rotation(self.cos, self.sin)
+        mixed = functional.scaled_dot_product_attention(rotate(q, turns), rotate(k, turns), v)
         return self.out_proj(mixed.transpose(1, 2).reshape(-1, tokens, width))  # type: ignore[no-any-return]
-
-    def _rotate(self, x: torch.Tensor) -> torch.Tensor:
-        half = self.head_width // 2
-        turned = torch.cat((-x[..., half:], x[..., :half]), dim=-1)
-        return x * self.cos + turned * self.sin
 
 
 class _Layer(nn.Module):

@@ -18,10 +18,10 @@ from .language_layers import (
     Attention,
     FeedForward,
     LanguageConfig,
-    Layer,
     Norm,
     Rotation,
     Seen,
+    Words,
     added,
     prefix_mask,
     read_prefix,
@@ -113,11 +113,7 @@ class Pi(nn.Module):
         both.paligemma.model.vision_tower = Siglip(config.vision, (side, side))
         both.paligemma.model.multi_modal_projector = nn.Module()
         both.paligemma.model.multi_modal_projector.linear = nn.Linear(config.vision.hidden_size, config.text.width)
-        both.paligemma.model.language_model = nn.Module()
-        both.paligemma.model.language_model.embed_tokens = nn.Embedding(config.vocabulary, config.text.width)
-        both.paligemma.model.language_model.layers = nn.ModuleList(
-            Layer(config.text) for _ in range(config.text.layers)
-        )
+        both.paligemma.model.language_model = Words(config.vocabulary, config.text)
         both.gemma_expert.model.layers = nn.ModuleList(_ExpertLayer(config) for _ in range(config.expert.layers))
         both.gemma_expert.model.norm = _AdaptiveNorm(config.expert) if config.adaptive else Norm(config.expert)
         self.paligemma_with_expert = both

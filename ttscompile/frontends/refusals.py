@@ -22,6 +22,7 @@ _BUILD = "Build the network with the code that trained it and use ttscompile.com
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
 _DITA = f"{_HEAD} For Dita they are the tokens of words and frames; examples/vla/dita.py does it."
 _SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleDP."
+_GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
@@ -95,7 +96,8 @@ DIRECTORIES = (
     Refusal(_JAX_FILES, "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: (lang|img|state)_adaptor\b", "RDT", f"{_HEAD} Its sampler is dpmsolver++."),
-    Refusal(r"^config\.json: model_type=gr00t", "a GR00T model", _HEAD),
+    Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
+    Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
     Refusal(r"^config\.json: (policy_head|model)_type=scale_dp", "DexVLA or its ScaleDP", _SCALEDP),
     Refusal(r"\.ckpt$", "a directory of checkpoints", "Give one of the files in it, checkpoints/latest.ckpt say."),
     Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
@@ -105,13 +107,12 @@ DIRECTORIES = (
 ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
-LEROBOT_TYPES = "act, diffusion, evo1, multi_task_dit, smolvla, pi0, pi05 or xvla"
+LEROBOT_TYPES = "act, diffusion, evo1, groot, multi_task_dit, smolvla, pi0, pi05 or xvla"
 
 LEROBOT = (
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
-    Refusal(r"^groot$", "a GR00T whose backbone, Qwen3-VL, is not rebuilt here", _HEAD),
     Refusal(r"^vla_jepa$", "a policy whose backbone, Qwen3-VL with V-JEPA, is not rebuilt here", _HEAD),
     Refusal(
         r"^(wall_x|eo1)$",

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
+from torch import nn
 
 from ..errors import CheckpointError
 from ..measure.machine import memory_bytes
 
 TIMES = 4
 """Memory that compiling takes, as a multiple of the weights in float32, at most: see ``docs/decisions.md``."""
+
+Network = TypeVar("Network", bound=nn.Module)
 
 SHOWN = 6
 """Names that a message holds; it counts the others."""
@@ -58,6 +62,13 @@ def names_of(keys: Sequence[str]) -> str:
     return ", ".join(keys[:SHOWN]) + more
 
 
+def renamed(name: str, rules: Sequence[tuple[str, str]]) -> str:
+    """The name after all of these patterns and what they become, one after the other."""
+    for pattern, new in rules:
+        name = re.sub(pattern, new, name)
+    return name
+
+
 def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.Tensor]:
     """Weights of any floating-point type, under the names that a network without wrappers gives them."""
     for name, value in weights.items():
@@ -67,6 +78,23 @@ def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.T
     # Without the levels that torch.compile and DistributedDataParallel put around a network.
     parts = {name: [part for part in str(name).split(".") if part not in ("_orig_mod", "module")] for name in weights}
     return {".".join(parts[name]): value.detach().to(torch.float32) for name, value in weights.items()}
+
+
+def filled(make: Callable[[], Network], weights: Mapping[str, torch.Tensor], source: str, where: Path) -> Network:
+    """A network with these weights, which are compared before anything of the configured sizes takes memory.
+
+    Args:
+        source: of the sizes; see ``require_weights``.
+        where: begins the message of an error.
+    """
+    try:
+        with torch.device("meta"):
+            network = make()
+        require_weights(network.state_dict(), weights, source)
+    except CheckpointError as error:
+        raise CheckpointError(f"{where}: {error}") from error
+    network.load_state_dict(weights, assign=True)
+    return network
 
 
 def require_weights(

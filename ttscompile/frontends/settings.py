@@ -85,6 +85,12 @@ class Settings:
             raise self.refusal(name, f"[height, width]{limit} or null")
         return None if value is None else (value[0], value[1])
 
+    def require(self, **expected: Any) -> None:
+        """Raise for an entry that is there, and says another variant than the one that is rebuilt."""
+        for name, value in expected.items():
+            if self.values.get(name, value) != value:
+                raise self.refusal(name, f"{value}: another is not rebuilt here".lower())
+
     def refusal(self, name: str, expected: str, default: Any = None) -> CheckpointError:
         """The error for one entry."""
         return self.error(f"{name} is {self.values.get(name, default)!r:.80}; expected {expected}")

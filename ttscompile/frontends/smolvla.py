@@ -18,10 +18,10 @@ from .language_layers import (
     Attention,
     FeedForward,
     LanguageConfig,
-    Layer,
     Norm,
     Rotation,
     Seen,
+    Words,
     added,
     prefix_mask,
     read_prefix,
@@ -86,13 +86,6 @@ class _Connector(nn.Module):
         return self.modality_projection.proj(squares(patches, self.rows, self.scale))  # type: ignore[no-any-return]
 
 
-class _Text(nn.Module):
-    def __init__(self, config: SmolVLAConfig) -> None:
-        super().__init__()
-        self.embed_tokens = nn.Embedding(config.vocabulary, config.text.width)
-        self.layers = nn.ModuleList(Layer(config.text) for _ in range(config.text.layers))
-
-
 class _ExpertLayer(nn.Module):
     def __init__(self, config: SmolVLAConfig, crosses: bool) -> None:
         super().__init__()
@@ -135,7 +128,7 @@ class SmolVLA(nn.Module):
         both.vlm.model = nn.Module()
         both.vlm.model.vision_model = Siglip(config.vision, config.image)
         both.vlm.model.connector = _Connector(config)
-        both.vlm.model.text_model = _Text(config)
+        both.vlm.model.text_model = Words(config.vocabulary, config.text)
         both.lm_expert = nn.Module()
         both.lm_expert.layers = nn.ModuleList(_ExpertLayer(config, crosses) for crosses in config.crosses)
         both.lm_expert.norm = Norm(config.expert)

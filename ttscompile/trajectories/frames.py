@@ -231,9 +231,7 @@ def instruction_rows(
     if texts.dtype.kind not in "US" or texts.ndim != 1:
         raise TrajectoryError(f"{path}: {TASK!r} is {texts.dtype}{list(texts.shape)}; expected texts [F].")
     different, rows = np.unique(texts, return_inverse=True)
-    length = observations[told.tokens].shape[-1]
-    made = Tokenizer(tokenizer, TrajectoryError, told.skipped + length)
+    made, length = Tokenizer(tokenizer, TrajectoryError), observations[told.tokens].shape[-1]
     lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in different.tolist()]
-    numbers = [made(told.line(line))[told.skipped :] for line in lines]
-    tokens, mask = padded(numbers, length)
+    tokens, mask = padded([made.of_task(line, told, length) for line in lines], length)
     return {told.tokens: tokens[rows], told.mask: mask[rows]}

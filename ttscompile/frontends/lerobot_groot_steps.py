@@ -1,0 +1,212 @@
+"""What LeRobot's own steps for GR00T N1.7 do around the policy: state, cameras, words, images and actions.
+
+Source: ``lerobot.policies.groot.processor_groot`` of huggingface/lerobot 0.6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..core.tokenizer import TASK
+from ..errors import CheckpointError
+from .image_geometry import ResizeCrop
+from .lerobot_config import ACTION, MOST_PIXELS, STATE
+from .lerobot_processors import (
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    RELATIVE,
+    Features,
+    Processors,
+    Statistics,
+    as_statistic,
+    read_steps,
+    renamed_observations,
+    state_of,
+)
+from .settings import Settings
+
+_PACK, _ENCODE = "groot_n1_7_pack_inputs_v1", "groot_n1_7_vlm_encode_v1"
+_UNPACK, _DECODE = "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1"
+_OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
+_COMMON = ("rename_observations_processor", "to_batch_processor", "device_processor", *RELATIVE)
+OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
+_MOST_FRAMES, _MOST_LETTERS, _EPSILON = 64, 400, 1e-8
+_CAMERA = "observation.images."
+_LIBERO, _LIBERO_STEPS = "libero_sim", 8
+"""An embodiment of which lerobot executes so many actions of a chunk."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrootProcessors(Processors):
+    """What the two pipelines of a policy do.
+
+    Attributes:
+        cameras: the policy's names, in the order in which they are shown.
+        frames: that a camera shows of the one image that there is.
+        embodiment: number of the robot among those that the policy was trained with.
+        kind: its name.
+        plain: whether instructions are in lower case and without signs.
+        bounded: whether actions are clipped before they are unnormalised.
+        executed: actions of a chunk that mean something; None for all.
+        padded: numbers of a state and of an action, padded.
+        geometry: of the images.
+    """
+
+    cameras: tuple[str, ...]
+    frames: int
+    embodiment: int
+    kind: str
+    plain: bool
+    bounded: bool
+    executed: int | None
+    padded: tuple[int, int]
+    geometry: Geometry
+
+
+class Geometry(NamedTuple):
+    """Sides of images in pixels: as they are first resized, what of that is kept in the middle, and what is seen."""
+
+    edge: int
+    crop: int
+    target: int
+
+
+class Seen(nn.Module):
+    """Images in -1..1 ``[B, 3, edge, edge]`` as the backbone sees them, in steps of bytes."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        super().__init__()
+        self.geometry, (_, crop, target) = geometry, geometry
+        self.zoom = ResizeCrop(crop, crop, (target, target), mode="bicubic")
+
+    def forward(self, image: Tensor) -> Tensor:
+        """See the class."""
+        edge, crop, target = self.geometry
+        if edge == crop == target:
+            return image
+        start = (edge - crop) // 2
+        pixels = ((image[:, :, start : start + crop, start : start + crop] + 1) * 127.5).round()
+        return self.zoom(pixels).clamp(0, 255).round() / 127.5 - 1  # type: ignore[no-any-return]
+
+
+def read_groot_processors(directory: Path, features: Features) -> GrootProcessors:
+    """The pipelines of a policy with these features."""
+    before = read_steps(directory, PREPROCESSOR, only=(*_COMMON, _PACK, _ENCODE, *_OLD))
+    after = read_steps(directory, POSTPROCESSOR, only=(*_COMMON, _UNPACK, _DECODE, *_OLD))
+    if old := next((step["registry_name"] for step in (*before, *after) if step["registry_name"] in _OLD), None):
+        raise CheckpointError(f"{directory}: the step {old} is {OLD}.")
+    pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
+    decode = _one(directory, after, _UNPACK, _DECODE)
+    packing = _settings(directory, pack)
+    packing.require(state_horizon=1, language_key=TASK, clip_outliers=True)
+    kind, known = packing.values.get("embodiment_tag"), packing.values.get("embodiment_mapping")
+    number = known.get(kind) if isinstance(known, dict) and isinstance(kind, str) else None
+    if not isinstance(kind, str) or type(number) is not int or number < 0:
+        raise packing.error(
+            f"embodiment_tag {kind!r:.80} is none of embodiment_mapping, whose names are"
+            f" {', '.join(known)[:300] if isinstance(known, dict) else 'missing'}; lerobot would take the first one's"
+            " weights. Set embodiment_tag to the robot that the policy was trained for"
+        )
+    read = packing.flag("normalize_min_max", True)
+    state = _statistics(directory, state_of(directory, pack) if read else {}, STATE, features)
+    action, bounded, executed = _actions(directory, decode, features)
+    if kind == _LIBERO and executed is not None:
+        executed = min(executed, _LIBERO_STEPS)
+    encoding = _settings(directory, encode)
+    return GrootProcessors(
+        normalizers={} if state is None else {STATE: state},
+        action=action,
+        renamed=renamed_observations(directory, before, features),
+        tokenizer={"tokenizer_name": encoding.text("model_name", "nvidia/Cosmos-Reason2-2B", _MOST_LETTERS)},
+        cameras=_cameras(packing, features),
+        frames=1 if packing.values.get("video_horizon") is None else packing.number("video_horizon", most=_MOST_FRAMES),
+        embodiment=number,
+        kind=kind,
+        plain=packing.flag("formalize_language", True),
+        bounded=bounded,
+        executed=executed,
+        padded=(packing.number("max_state_dim", 132), packing.number("max_action_dim", 132)),
+        geometry=_geometry(encoding),
+    )
+
+
+def _one(directory: Path, steps: list[dict[str, Any]], *names: str) -> dict[str, Any]:
+    found = [step for step in steps if step["registry_name"] in names]
+    if len(found) != 1:
+        raise CheckpointError(f"{directory}: expected one step {' or '.join(names)}; found {len(found)}.")
+    return found[0]
+
+
+def _settings(directory: Path, step: Mapping[str, Any]) -> Settings:
+    return Settings(step["config"], f"{directory}: {step['registry_name']}.")
+
+
+def _cameras(packing: Settings, features: Features) -> tuple[str, ...]:
+    """In the order of the base's own names, of which lerobot knows one by another; or in alphabetical order."""
+    there = sorted(key for key, (kind, _) in features.items() if kind == "VISUAL")
+    own, found = packing.values.get("video_modality_keys") or [], list[str]()
+    if not isinstance(own, list) or not all(isinstance(name, str) for name in own):
+        raise packing.refusal("video_modality_keys", "names of cameras, or null")
+    for name in own:
+        also = [f"{_CAMERA}image2"] if name == "wrist_image" else []
+        found += [key for key in (f"{_CAMERA}{name}", *also) if key in there][:1]
+    return tuple(found or there)
+
+
+def _geometry(encoding: Settings) -> Geometry:
+    encoding.require(use_albumentations=False, letter_box_transform=False)
+    target = encoding.size("image_target_size", None, MOST_PIXELS)
+    if target is None or target[0] != target[1]:
+        raise encoding.refusal("image_target_size", "height and width of a square")
+    edge, share = target[0], encoding.values.get("crop_fraction")
+    if encoding.values.get("shortest_image_edge") is not None:
+        edge = encoding.number("shortest_image_edge", most=MOST_PIXELS)
+    crop = encoding.size("image_crop_size", None, MOST_PIXELS)
+    if share is None:
+        share = 1.0 if crop is None else crop[0] / target[0]
+    if type(share) not in (int, float):
+        raise encoding.refusal("crop_fraction", "a number, or null")
+    return Geometry(edge, max(1, round(edge * share)) if 0 < share < 1 else edge, target[0])
+
+
+def _actions(
+    directory: Path, step: Mapping[str, Any], features: Features
+) -> tuple[Statistics | None, bool, int | None]:
+    """How actions are unnormalised, whether they are clipped before, and how many of a chunk mean something."""
+    settings, count = _settings(directory, step), features[ACTION][1][0]
+    if settings.values.get("env_action_dim", 0) not in (0, count):
+        raise settings.refusal("env_action_dim", f"{count}, as many as an action has, or 0")
+    if step["registry_name"] == _UNPACK:
+        tensors = state_of(directory, step) if settings.flag("normalize_min_max", True) else {}
+        statistics = _statistics(directory, tensors, ACTION, features)
+        if tensors and statistics is None:
+            raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
+        return statistics, statistics is not None and settings.flag("clip_normalized_action", False), None
+    if settings.flag("use_relative_action", False):
+        raise settings.refusal("use_relative_action", "false: actions relative to the state are not compiled")
+    names = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
+    try:
+        raw, own = settings.values["raw_stats"]["action"], settings.values["modality_config"]["action"]
+        ends = [[float(number) for group in own["modality_keys"] for number in raw[group][name]] for name in names]
+        steps = len(own.get("delta_indices") or ()) or None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        expected = f"groups of an action in modality_config, and numbers {' and '.join(names)} of each in raw_stats"
+        raise settings.error(f"{error!r:.80}; expected {expected}") from error
+    tensors = {f"{ACTION}.{name}": torch.tensor(end) for name, end in zip(("min", "max"), ends, strict=True)}
+    return _statistics(directory, tensors, ACTION, features), True, steps
+
+
+def _statistics(directory: Path, tensors: Mapping[str, Tensor], key: str, features: Features) -> Statistics | None:
+    """The range of a feature; None where nothing is known of it."""
+    names = [f"{key}.{name}" for name in ("min", "max")]
+    if not all(name in tensors for name in names):
+        return None
+    kind, shape = features[key]
+    low, high = (as_statistic(directory, name, tensors[name], kind, shape) for name in names)
+    return Statistics("MIN_MAX", low, high, _EPSILON, clipped=True)
