@@ -39,13 +39,13 @@ def captured_once(directory: Path) -> Iterator[None]:
     class Converter:
         """In place of the compiler's; what is given to the tracer is given to it."""
 
-        def __init__(self, module: nn.Module, spec: PolicySpec, streams: int, symbolic: bool) -> None:
-            self.module, self.how = module, (spec, streams, symbolic)
+        def __init__(self, module: nn.Module, spec: PolicySpec, streams: int) -> None:
+            self.module, self.how = module, (spec, streams)
 
-        def convert(self, spec: PolicySpec) -> tuple[Graph, export.Weights]:
+        def convert(self) -> tuple[Graph, export.Weights]:
             key = structure(self.module, *self.how) if torch.export.export is watched else None
             if key is None:
-                return convert(*trace(self.module, *self.how)).convert(spec)
+                return convert(*trace(self.module, *self.how)).convert()
             held = registered(self.module)
             if (path := directory / key).exists():
                 graph, values = pickle.loads(path.read_bytes())  # by this run, in a folder of its own
@@ -54,7 +54,7 @@ def captured_once(directory: Path) -> Iterator[None]:
                 }
             with untraced():
                 traced = trace(self.module, *self.how)
-            graph, weights = convert(*traced).convert(spec)
+            graph, weights = convert(*traced).convert()
             start = "module." if _by_position(self.module) else ""
             values = {
                 name: one if (own := name.removeprefix(start)) not in held else own for name, one in weights.items()
@@ -64,8 +64,8 @@ def captured_once(directory: Path) -> Iterator[None]:
             Path(unfinished.name).rename(path)
             return graph, weights
 
-    def given(module: nn.Module, spec: PolicySpec, streams: int, symbolic: bool) -> tuple[Any, ...]:
-        return module, spec, streams, symbolic
+    def given(module: nn.Module, spec: PolicySpec, streams: int) -> tuple[Any, ...]:
+        return module, spec, streams
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(export, "_traced", given)
@@ -91,14 +91,14 @@ def _by_position(module: nn.Module) -> bool:
     return any(p.kind is p.VAR_KEYWORD for p in inspect.signature(module.forward).parameters.values())
 
 
-def structure(module: nn.Module, spec: PolicySpec, streams: int, symbolic: bool) -> str | None:
+def structure(module: nn.Module, spec: PolicySpec, streams: int) -> str | None:
     """A name for all that a graph depends on; None for a module that cannot be pickled."""
     file = io.BytesIO()
     pickler = _Structure(file, module)
     given = [(name, one.shape, str(one.dtype)) for name, one in export._examples(spec, streams).items()]
     modes = torch.get_default_dtype(), torch.is_grad_enabled(), torch.is_inference_mode_enabled()
     try:
-        pickler.dump((module, given, dict(spec.arguments), spec.sample_argument, symbolic, str(modes)))
+        pickler.dump((module, given, dict(spec.arguments), spec.sample_argument, str(modes)))
     except Exception:  # whatever the classes of a module raise
         return None
     return sha256(repr(sorted(pickler.sources)).encode() + file.getvalue()).hexdigest()

@@ -17,11 +17,12 @@ import click
 from deciding import Row
 from nested import Decided, Nested, nested
 
-from ttscompile.cli.output import counted_parts, print_json, results_console, run, say, table
-from ttscompile.cli.recordings import FilesCommand, Sources, trajectories_options
+from ttscompile.calibration.progress import Bar
+from ttscompile.cli.output import print_json, results_console, run, say, table
+from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 
 
-@click.command(cls=FilesCommand, context_settings={"show_default": True})
+@click.command(cls=SectionedCommand, context_settings={"show_default": True})
 @click.argument("directory", type=click.Path(exists=True, path_type=Path))
 @trajectories_options()
 @click.option("--evaluations", multiple=True, default=(3.0, 4.0), help="Of the network in a call, on average.")
@@ -49,7 +50,7 @@ def main(
 ) -> None:
     """Measure it for the policy of the artifact in DIRECTORY."""
     sizes = {"most": most, "fitted": fitted, "learned": learned, "judged": judged, "seed": seed}
-    with counted_parts() as tell:
+    with Bar(shown=True) as bar:
         found = nested(
             directory,
             trajectories,
@@ -58,7 +59,7 @@ def main(
             minutes=minutes,
             jumps=jumps,
             **sizes,
-            progress=tell,
+            progress=bar.tell,
         )
     if as_json:
         print_json(found.to_json())

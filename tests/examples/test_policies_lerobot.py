@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,7 +80,8 @@ def test_one_instruction_in_a_policy_whose_tokenizer_is_not_clips_own() -> None:
         text, rows = str(file["instruction"][5]), file["observation.language.tokens"][5]
         mask = file["observation.language.attention_mask"][5]
     module, _ = load_checkpoint_policy(trained / "policy", options=LoadOptions(task=text))
-    assert module.get_submodule("encoder").task_tokens.tolist() == [rows[mask].tolist()]
+    encoder: Any = module.get_submodule("encoder")
+    assert encoder.task_tokens.tolist() == [rows[mask].tolist()]
 
 
 def test_encoders_that_are_kept_elsewhere_are_named_to_the_rival_too(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def eager(directory: Path, kind: str, call: int, options: LoadOptions = AS_SAVED
     given = {key: value[None] for key, value in xvlas.observation(call, kind).items()}
     if spec.instruction is not None:
         length = spec.observations[TOKENS].shape[0]
-        made = Tokenizer(TOKENIZER, CheckpointError, length)(spec.instruction.line(xvlas.TASKS[call]))
+        made = Tokenizer(TOKENIZER, CheckpointError)(spec.instruction.line(xvlas.TASKS[call]), length)
         given[TOKENS], given[MASK] = padded([made], length)
     obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(xvlas.noise(kind))).numpy())

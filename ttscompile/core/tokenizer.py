@@ -96,8 +96,8 @@ def _clip(vocabulary: Path) -> Any:
     )
     words = pre_tokenizers.Split(Regex(_WORDS), "removed", invert=True)
     made.pre_tokenizer = pre_tokenizers.Sequence([words, pre_tokenizers.ByteLevel(add_prefix_space=False)])
-    numbers = [(token, made.token_to_id(token)) for token in (end, begin)]
-    made.post_processor = processors.RobertaProcessing(*numbers, trim_offsets=False, add_prefix_space=False)
+    around = (end, made.token_to_id(end)), (begin, made.token_to_id(begin))
+    made.post_processor = processors.RobertaProcessing(*around, trim_offsets=False, add_prefix_space=False)  # type: ignore[arg-type]
     return made
 
 

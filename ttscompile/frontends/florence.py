@@ -123,8 +123,8 @@ class _Patches(nn.Module):
 class _Windows(Attention):
     """Patches look at those of their window; what is missing of a window at the border is zeros, and is seen."""
 
-    def __init__(self, config: TowerConfig, window: int) -> None:
-        super().__init__(config.hidden_size, config.num_attention_heads)
+    def __init__(self, width: int, heads: int, window: int) -> None:
+        super().__init__(width, heads)
         self.window = window
 
     def within(self, x: Tensor, height: int, width: int) -> Tensor:
@@ -173,9 +173,10 @@ class _Half(nn.Module):
 
 
 def _block(stage: Stage, window: int) -> nn.Module:
-    between = replace(stage.tower, num_attention_heads=stage.groups)
-    windows, channels = _Windows(stage.tower, window), _Channels(between)
-    halves = {"spatial_block": _Half(stage.tower, windows), "channel_block": _Half(between, channels)}
+    tower = stage.tower
+    windows = _Windows(tower.hidden_size, tower.num_attention_heads, window)
+    channels = _Channels(tower.hidden_size, stage.groups)
+    halves = {"spatial_block": _Half(tower, windows), "channel_block": _Half(tower, channels)}
     return nn.Sequential(OrderedDict(halves))
 
 
