@@ -63,7 +63,7 @@ def draw(path: Path) -> None:
     axes.set_xlabel("distance from the original, in units of what other noise changes")
     axes.set_ylabel("success, difference in points")
     axes.set_xlim(0, None)
-    axes.legend(loc="lower left", fontsize="small")
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncol=4, frameon=False)
     figure.savefig(path, dpi=110)
 
 
