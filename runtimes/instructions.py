@@ -41,7 +41,6 @@ class Instructions:
         cells: computed cells in order of execution, flat indices ``k * blocks + b``.
         gaps: runs of reused blocks within a step, of all steps in order.
         slots: how many sums have to be kept at a time.
-        segments: how many sums are made in the call.
         table: whether sums are over the table, and not over the last computed residuals as they are.
         load_rows: rows of the table that are loaded, in order.
         load_from: what each of them takes: an entry of the rollout cache by its flat index, or ``~b`` for the last
@@ -57,7 +56,6 @@ class Instructions:
     cells: tuple[int, ...]
     gaps: tuple[Add, ...]
     slots: int
-    segments: int
     table: bool
     load_rows: tuple[int, ...]
     load_from: tuple[int, ...]
@@ -127,7 +125,6 @@ def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
         cells=tuple(np.flatnonzero(computed).tolist()),
         gaps=tuple(zip(slot, rows.tolist(), (rows + made).tolist(), loads, strict=True)),
         slots=slots,
-        segments=len(starts) - len(maker),
         table=table,
         load_rows=tuple(load_rows),
         load_from=tuple(load_from),

@@ -24,18 +24,6 @@ MOST_THREADS = 1024
 """More than any machine has a use for: onnxruntime tries to make as many as it is told, for minutes."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """How a runtime is opened.
-
-    Attributes:
-        threads: of arithmetic, one of which is the caller's. The reference runs with torch's own setting.
-    """
-
-    threads: int = 1
-    device: str = CPU
-
-
 Open: TypeAlias = Callable[[View], Backend[Any]]
 
 
@@ -45,7 +33,8 @@ class Kind:
 
     Attributes:
         make: what opens its backends on views of one artifact, which share what they have in common; imports what it
-            needs when it is called.
+            needs when it is called, with threads of arithmetic, one of which is the caller's (the reference runs with
+            torch's own setting), and with a device.
         install: what pip has to install where its packages are missing.
         held: the precisions beside fp32 that it computes in, from models that the artifact holds.
         made: the precisions of residual blocks that it makes of the weights in fp32.
@@ -53,7 +42,7 @@ class Kind:
         devices: whether it computes anywhere else than on the CPU.
     """
 
-    make: Callable[[Options], Open]
+    make: Callable[[int, str], Open]
     install: str
     held: tuple[str, ...] = ()
     made: tuple[str, ...] = ()
@@ -61,25 +50,25 @@ class Kind:
     devices: bool = False
 
 
-def _onnxruntime(options: Options) -> Open:
+def _onnxruntime(threads: int, device: str) -> Open:
     from .onnxruntime.backend import OnnxBackend
     from .onnxruntime.sessions import Sessions
 
-    return partial(OnnxBackend, sessions=Sessions(options.threads), known={})
+    return partial(OnnxBackend, sessions=Sessions(threads), known={})
 
 
-def _reference(options: Options) -> Open:
+def _reference(threads: int, device: str) -> Open:
     from .reference.backend import ReferenceBackend
 
     return ReferenceBackend
 
 
-def _torch(options: Options) -> Open:
+def _torch(threads: int, device: str) -> Open:
     from .torch.backend import TorchBackend
     from .torch.devices import device_of
     from .torch.network import Placed
 
-    return partial(TorchBackend, placed=Placed(device_of(options.device)), threads=options.threads)
+    return partial(TorchBackend, placed=Placed(device_of(device)), threads=threads)
 
 
 RUNTIMES = {
@@ -144,14 +133,14 @@ def open_runtime(
         able = ", ".join(repr(name) for name, each in RUNTIMES.items() if each.devices)
         problem = f"runtime {runtime!r} computes on the CPU alone; found device {device!r}"
         raise RuntimeUnavailableError(f"{problem}. Use runtime={able}.")
-    options, opener = Options(threads, device or CPU), list[Open]()
+    opener = list[Open]()
 
     def backend(view: View) -> Backend[Any]:
         require_able(runtime, artifact, Plan(precision=view.precision, tokens=view.variant.tokens))
         try:
             with artifact.reading(), fitting(view):  # a backend reads arrays that are mapped from the files
                 if not opener:
-                    opener.append(kind.make(options))
+                    opener.append(kind.make(threads, device or CPU))
                 return opener[0](view)
         except ModuleNotFoundError as error:
             problem = f"runtime {runtime!r} needs {error.name!r}, which is not installed"

@@ -86,6 +86,9 @@ class Runtime:
 
     A plan whose loop begins with the chunk of the call before has that of the last call of the episode, moved by what
     is executed of it. Where there is none, its ``otherwise`` is executed.
+
+    Attributes:
+        streams: B of the episode under way; None after ``reset`` and before the first call.
     """
 
     def __init__(
@@ -103,7 +106,7 @@ class Runtime:
         self._given = False  # whether a plan that is not the artifact's ever was
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
-        self._streams: int | None = None
+        self.streams: int | None = None
         self._chunk: FloatArray | None = None  # denoised sample of the last call of the episode
         self._executed: int | None = None  # steps of it; None for all of ``action``
 
@@ -125,11 +128,6 @@ class Runtime:
     def backend(self) -> Backend[Any]:
         """That of the last call."""
         return self._used.backend
-
-    @property
-    def streams(self) -> int | None:
-        """B of the episode under way; None after ``reset`` and before the first call."""
-        return self._streams
 
     @property
     def frames(self) -> FramePieces:
@@ -158,7 +156,7 @@ class Runtime:
             self._chunk = None
 
     def _end_episode(self) -> None:
-        self._written = self._dropped = self._chunk = self._streams = self._executed = None
+        self._written = self._dropped = self._chunk = self.streams = self._executed = None
 
     def require_streams(self, streams: int) -> None:
         """Raise unless a call of so many streams may be the next one.
@@ -222,7 +220,7 @@ class Runtime:
             keep, written = np.zeros_like(keep), np.zeros_like(written)
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
-        self._streams, self._chunk = streams, made.sample
+        self.streams, self._chunk = streams, made.sample
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
         report = CallReport(

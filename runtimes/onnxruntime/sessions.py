@@ -289,11 +289,7 @@ class Bound:
         self._arrays = (*inputs.values(), *outputs.values())  # the binding holds bare addresses
         assert all(array.flags.c_contiguous for array in self._arrays)
         self._session = session
-        self._binding = session.io_binding()
-        for name, array in inputs.items():
-            self._binding.bind_input(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
-        for name, array in outputs.items():
-            self._binding.bind_output(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+        self._binding = _binding(session, inputs, outputs)
 
     def run(self) -> None:
         """Run once. Raises ArtifactError: the graph does not do what the manifest says."""
@@ -301,6 +297,14 @@ class Bound:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's own classes, and what it raises itself
             raise _failed(error) from error
+
+
+def _binding(session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> Any:
+    binding = session.io_binding()
+    for bind, arrays in ((binding.bind_input, inputs), (binding.bind_output, outputs)):
+        for name, array in arrays.items():
+            bind(name, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+    return binding
 
 
 def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
@@ -343,18 +347,14 @@ def renew_piece(
     into = {renewed_name(key): array for key, array in kept.items()}
     given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]
     assert all(array.flags.c_contiguous for array in given.values())
-    binding = sessions[name].io_binding()
     try:
-        for key, array in given.items():
-            binding.bind_input(key, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
+        binding = _binding(sessions[name], given, into)
         for output in made:
             binding.bind_output(output, "cpu")
-        for output, array in into.items():
-            binding.bind_output(output, "cpu", 0, array.dtype.type, array.shape, array.ctypes.data)
         sessions[name].run_with_iobinding(binding)
     except Exception as error:  # onnxruntime's own classes, and what it raises itself
         raise _failed(error) from error
-    return tuple(value.numpy() for value in binding.get_outputs()[: len(made)])
+    return tuple(value.numpy() for value in binding.get_outputs()[len(into) :])
 
 
 def _failed(error: Exception) -> ArtifactError:

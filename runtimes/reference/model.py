@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
-from ttscompile.core.lattice import PlanArray, Source, check_plan, require_legal
+from ttscompile.core.lattice import Source, check_plan, require_legal
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.evaluate import Evaluator
@@ -243,76 +243,46 @@ class ReferenceModel:
         contexts: Contexts,
         initial: Tensor,
         noise: Tensor | None,
-        gates: Tensor | PlanArray,
+        plan: npt.ArrayLike,
         cache: RolloutCache | None = None,
         *,
-        write_gradients: bool = True,
         correction: Correction | None = None,
         known: Known | None = None,
     ) -> Denoised:
-        """One call: K steps from noise to sample.
-
-        With gates that require a gradient every candidate of every cell is evaluated, since the gradient of a gate is
-        the product of its candidate and the gradient of the sum. A candidate that is computed although its gate is 0
-        is evaluated without recording: its own gradient would be multiplied by 0. With gates that do not, blocks are
-        evaluated for the streams that compute them, and nothing else.
+        """One call: K steps from noise to sample. A block is evaluated for the streams that compute it, and no others.
 
         Args:
-            gates: one-hot ``[B, K, blocks, 4]``, float32; or a plan, int8 ``[K, blocks]`` or ``[B, K, blocks]``.
+            plan: int8 ``[K, blocks]`` or ``[B, K, blocks]``.
             cache: what the previous call of the episode left; None at its start.
-            write_gradients: let the gradient of a COMPUTE gate include what writing the caches does to later steps,
-                by taking the written value to be ``g * computed + (1 - g) * old``. Values do not change.
 
         Raises:
-            IllegalPlanError: gates that are not one-hot, of the wrong shape, or that read what was never computed.
+            IllegalPlanError: a plan of the wrong shape, or that reads what was never computed.
         """
         cache = cache if cache is not None else self.empty_cache(contexts.streams)
-        one_hot, plan = self._gates(gates, contexts.streams)
-        one_hot = one_hot.to(self.device)
-        require_legal(plan, self.groups, cache.written)
+        plans = check_plan(plan, self.steps, self.blocks, contexts.streams)
+        require_legal(plans, self.groups, cache.written)
+        gates = torch.nn.functional.one_hot(torch.from_numpy(plans.astype(np.int64)), 4).float().to(self.device)
         caches = Caches(rollout=dict(cache.residuals))
 
         def blocks(k: int, stream: Tensor) -> Tensor:
             for b in range(self.blocks):
-                cell = Cell(k, b, self.groups[b], plan[:, k, b], one_hot[:, k, b], self._types[b])
-                stream = stream + reuse(cell, self._candidate(cell, stream, contexts), caches, write_gradients)
+                cell = Cell(k, b, self.groups[b], plans[:, k, b], gates[:, k, b], self._types[b])
+                stream = stream + reuse(cell, self._computed(cell, stream, contexts), caches)
             return stream
 
         loop = self.steps_of(contexts, initial, noise, blocks, correction, known)
         samples = tuple(carried.sample for carried in loop)
-        return Denoised(samples, RolloutCache(caches.rollout, cache.written | (plan == Source.COMPUTE)))
+        return Denoised(samples, RolloutCache(caches.rollout, cache.written | (plans == Source.COMPUTE)))
 
-    def _candidate(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
-        """The computed residual of all streams, or of those that take it with zeros for the others; None if none do."""
+    def _computed(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
+        """The residual of the streams that compute it, with zeros for the others; None if none do."""
         takers = np.flatnonzero(cell.plan == Source.COMPUTE).tolist()
-        others = np.flatnonzero(cell.plan != Source.COMPUTE).tolist()
-        if not others:
+        if len(takers) == len(cell.plan):
             return self.block(cell.b, cell.k, stream, contexts)
-        if not takers and not cell.trains:
+        if not takers:
             return None
-        axis, whole = stream_axis(cell.type), torch.zeros_like(stream)
-        if cell.trains:
-            with torch.no_grad():
-                part = self.block(cell.b, cell.k, stream, contexts, others)
-            whole = whole.index_copy(axis, torch.tensor(others, device=whole.device), part)
-        if takers:
-            part = self.block(cell.b, cell.k, stream, contexts, takers)
-            whole = whole.index_copy(axis, torch.tensor(takers, device=whole.device), part)
-        return whole
-
-    def _gates(self, gates: Tensor | PlanArray, streams: int) -> tuple[Tensor, PlanArray]:
-        """Gates as float32 ``[B, K, blocks, 4]`` and the plan that they stand for."""
-        if not isinstance(gates, Tensor):
-            plan = check_plan(gates, self.steps, self.blocks, streams)
-            return torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float(), plan
-        if tuple(gates.shape) != (streams, self.steps, self.blocks, 4):
-            expected = f"[B, K, blocks, 4] = ({streams}, {self.steps}, {self.blocks}, 4)"
-            raise IllegalPlanError(f"gates have shape {tuple(gates.shape)}; expected {expected}.")
-        values = gates.detach()
-        if not bool((((values == 0) | (values == 1)).all(-1) & (values.sum(-1) == 1)).all()):
-            remedy = "use straight-through gates, hard in the forward pass"
-            raise IllegalPlanError(f"gates must be one-hot over their last axis: {remedy}.")
-        return gates, values.argmax(-1).cpu().numpy().astype(np.int8)
+        part, there = self.block(cell.b, cell.k, stream, contexts, takers), torch.tensor(takers, device=stream.device)
+        return torch.zeros_like(stream).index_copy(stream_axis(cell.type), there, part)
 
     def _bind(
         self, piece: LoopPiece, value: Tensor, k: int, contexts: Contexts, streams: Sequence[int] | None = None

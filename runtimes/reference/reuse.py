@@ -61,14 +61,9 @@ class Cell:
     gates: Tensor
     type: TensorType
 
-    @property
-    def trains(self) -> bool:
-        """Whether the gates want a gradient."""
-        return self.gates.requires_grad
-
-    def takes(self, source: Source) -> bool:
-        """Whether any stream takes its residual from here."""
-        return bool((self.plan == source).any())
+    def wants(self, source: Source) -> bool:
+        """Whether a stream takes its residual from here; or the gates want a gradient, and so all candidates."""
+        return self.gates.requires_grad or bool((self.plan == source).any())
 
     def gate(self, source: Source) -> Tensor:
         """The gate of each stream, shaped to be multiplied with a residual."""
@@ -76,17 +71,15 @@ class Cell:
         shape[stream_axis(self.type)] = -1
         return self.gates[:, source].reshape(shape)
 
-    def written(self, computed: Tensor, old: Tensor | None, gradients: bool) -> Tensor:
+    def written(self, computed: Tensor, old: Tensor | None) -> Tensor:
         """A cache entry after this cell: computed where the stream computes, as it was elsewhere."""
         if old is None:
             return computed
-        gate = self.gate(Source.COMPUTE)
-        if gradients and self.trains:
-            return gate * computed + (1 - gate) * old
-        return torch.where(gate.detach() == 1, computed, old)
+        gate = self.gate(Source.COMPUTE)  # whose gradient has a part of what later steps read
+        return gate * computed + (1 - gate) * old if gate.requires_grad else torch.where(gate == 1, computed, old)
 
 
-def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: bool) -> Tensor:
+def reuse(cell: Cell, computed: Tensor | None, caches: Caches) -> Tensor:
     """What one cell adds to the stream; writes the caches of the streams that compute it.
 
     Args:
@@ -95,13 +88,12 @@ def reuse(cell: Cell, computed: Tensor | None, caches: Caches, write_gradients: 
     """
     forward, timestep = caches.forward.get(cell.group), caches.timestep.get(cell.b)
     rollout = caches.rollout.get((cell.k, cell.b))
-    if computed is not None and (cell.takes(Source.COMPUTE) or (cell.trains and write_gradients)):
-        caches.forward[cell.group] = cell.written(computed, forward, write_gradients)
-        caches.timestep[cell.b] = cell.written(computed, timestep, write_gradients)
-    if computed is not None and cell.takes(Source.COMPUTE):
-        caches.rollout[cell.k, cell.b] = cell.written(computed.detach(), rollout, False)
+    if computed is not None and cell.wants(Source.COMPUTE):
+        caches.forward[cell.group] = cell.written(computed, forward)
+        caches.timestep[cell.b] = cell.written(computed, timestep)
+        caches.rollout[cell.k, cell.b] = cell.written(computed.detach(), rollout)
     candidates = zip(Source, (computed, forward, timestep, rollout), strict=True)
-    added = [cell.gate(s) * c for s, c in candidates if c is not None and (cell.trains or cell.takes(s))]
+    added = [cell.gate(s) * c for s, c in candidates if c is not None and cell.wants(s)]
     return torch.stack(added).sum(0) if len(added) > 1 else added[0]
 
 

@@ -148,12 +148,14 @@ class TorchBackend:
         """The sampler's steps with the correction of a call; made once for each, and once for its prefixes."""
         key = call.correction, call.known is not None
         if key not in self._advances:
-            advance = Advance(self._manifest.spec, call.correction, self.device)
-            masked = None if call.known is None else MaskedUpdates(advance.updates, self._manifest.spec.chunk)
+            spec, masked = self._manifest.spec, None
+            advance = Advance(spec, call.correction, self.device)
+            if call.known is not None:
+                masked = MaskedUpdates(np.array(advance.updates.cpu().numpy()), spec.chunk)
             self._advances[key] = advance, masked
         advance, masked = self._advances[key]
         if masked is not None and call.known is not None and masked.mask(call.known.values.shape[2]):
-            advance.write(masked.updates)
+            advance.updates.copy_(torch.from_numpy(masked.updates))
         return advance
 
     @contextmanager

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import Any, TypeVar
+from copy import copy
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -81,6 +82,23 @@ def _older(read: Callable[[], Setting]) -> Setting | None:
         return read()
     except RuntimeError:
         return None
+
+
+class OnTensors:
+    """What computes with tensors of its own: attributes of the names in ``TENSORS``, None for one it lacks."""
+
+    TENSORS: tuple[str, ...] = ()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What it computes with, by name."""
+        return {name: value for name in self.TENSORS if isinstance(value := getattr(self, name), Tensor)}
+
+    def on(self, tensors: Mapping[str, Tensor]) -> Self:
+        """The same with other tensors in the place of ``tensors()``."""
+        other = copy(self)
+        for name in self.TENSORS:
+            setattr(other, name, tensors.get(name))
+        return other
 
 
 def placed(array: npt.NDArray[np.generic], device: torch.device) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -29,48 +27,38 @@ class Prepared(NamedTuple):
     shift: Tensor
 
 
-class IdleSteps:
+class IdleSteps(devices.OnTensors):
     """What steps that add one sum of residuals predict, from numbers of the size of the sample."""
+
+    TENSORS = ("constant", "head", "shift", "along", "across", "basis")
 
     def __init__(self, form: IdleForm, device: torch.device) -> None:
         def there(array: object) -> Tensor:
             return devices.placed(np.asarray(array, np.float32), device)
 
         self._turned, self._norm = form.turned, form.norm
-        self._constant, self._head, self._shift = there(form.constant), there(form.head), there(form.shift)
+        self.constant, self.head, self.shift = there(form.constant), there(form.head), there(form.shift)
         self._dimensions = form.head.shape[1]
         product = there(form.product)
-        self._along, self._across = product[: self._dimensions + 1], product[self._dimensions + 1 :]
+        self.along, self.across = product[: self._dimensions + 1], product[self._dimensions + 1 :]
         self._held = not form.product.any()  # the prediction is the total's, whatever the sample is
-        self._basis = None if form.norm is None else there(form.norm.basis)
-
-    def on(self, tensors: Mapping[str, Tensor]) -> IdleSteps:
-        """The same with other tensors in the place of ``tensors()``."""
-        other = copy(self)
-        for name in self.tensors():
-            setattr(other, f"_{name}", tensors[name])
-        return other
-
-    def tensors(self) -> dict[str, Tensor]:
-        """What it computes with, by name."""
-        names = ("constant", "head", "shift", "along", "across", "basis")
-        return {name: value for name in names if isinstance(value := getattr(self, f"_{name}"), Tensor)}
+        self.basis = None if form.norm is None else there(form.norm.basis)
 
     def prepare(self, total: Tensor) -> Prepared:
         """What is known as soon as the total is."""
-        stream = (total.transpose(0, 1) if self._turned else total) + self._constant
-        if self._norm is None or self._basis is None:
-            numerator = stream @ self._head
+        stream = (total.transpose(0, 1) if self._turned else total) + self.constant
+        if self._norm is None or self.basis is None:
+            numerator = stream @ self.head
             blank = torch.zeros_like(numerator)
             rows = torch.cat([blank, torch.ones_like(blank[..., :1])], 2)
         else:
             width = stream.shape[2]
             centred = stream - stream.mean(2, keepdim=True)
-            along = centred @ self._basis
-            across = centred - along @ self._basis.T
+            along = centred @ self.basis
+            across = centred - along @ self.basis.T
             deviation = ((across * across).sum(2, keepdim=True) / width + self._norm.eps).sqrt()
-            rows, numerator = torch.cat([along / width**0.5, deviation], 2), centred @ self._head
-        shift = self._shift.expand(-1, len(stream), -1)
+            rows, numerator = torch.cat([along / width**0.5, deviation], 2), centred @ self.head
+        shift = self.shift.expand(-1, len(stream), -1)
         return Prepared(rows.permute(2, 0, 1).flatten(1), numerator.permute(2, 0, 1).flatten(1), shift.flatten(1))
 
     def predict(self, known: Prepared, sample: Tensor) -> Tensor:
@@ -78,6 +66,6 @@ class IdleSteps:
         rows, numerator, shift = known
         if not self._held:
             flat = sample.view(self._dimensions, -1)
-            rows = torch.addmm(rows, self._along, flat)
-            numerator = torch.addmm(numerator, self._across, flat)
+            rows = torch.addmm(rows, self.along, flat)
+            numerator = torch.addmm(numerator, self.across, flat)
         return torch.addcdiv(shift, numerator, torch.linalg.vector_norm(rows, dim=0)).view(sample.shape)

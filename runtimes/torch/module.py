@@ -153,7 +153,7 @@ class PrunedCall(CallModule):
 
     def empty_rollout(self, streams: int) -> Rollout:
         """The rollout cache at the start of an episode of so many streams, where the module is."""
-        lattice, device = (self.spec.sampler.steps, len(self._groups)), self._kept("offset")["noise"].device
+        lattice, device = (self.spec.sampler.steps, len(self._groups)), self.kept("offset")["noise"].device
         residuals = torch.zeros(*lattice, *self._type.at(streams), device=device)
         return residuals, torch.zeros(streams, *lattice, dtype=torch.bool, device=device)
 

@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
 from ttscompile.core.envelope import FAR, plain_cells
-from ttscompile.core.spec import Affine, PolicySpec
+from ttscompile.core.spec import Affine
 from ttscompile.errors import ObservationError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, block_name
-from ttscompile.ir.program import Binding, Pieces, frame_values
+from ttscompile.ir.program import Binding, frame_values
 
 from .idle_steps import IdleSteps
 from .sampler import Advance
@@ -32,32 +32,22 @@ class PlainNetwork:
     """``loop.Network`` of one call; the prologue is computed when it is made.
 
     Args:
-        pieces: of the artifact.
-        evaluators: of all pieces, from ``evaluators_of``.
-        weights: value of every constant.
-        first: the same at step 0.
-        tables: ``[K, ...]`` by name.
+        module: whose pieces these are, and whose constants as they are in the call.
         obs: normalised, by key.
         streams: B.
-        idle: see ``loop.Network``.
 
     Attributes:
+        idle: see ``loop.Network``.
         stream_type: of the residual stream.
     """
 
-    def __init__(
-        self,
-        pieces: Pieces,
-        evaluators: Mapping[str, Evaluator],
-        weights: Tensors,
-        first: Tensors,
-        tables: Tensors,
-        obs: Tensors,
-        streams: int,
-        idle: IdleSteps | None,
-    ) -> None:
-        self._pieces, self._evaluators, self._streams, self.idle = pieces, evaluators, streams, idle
-        self._weights, self._first, self._tables = weights, first, tables
+    def __init__(self, module: CallModule, obs: Tensors, streams: int) -> None:
+        self._pieces = pieces = module.pieces
+        self._evaluators = evaluators = module.evaluators
+        self._weights = weights = module.kept("weight")
+        self._first, self._tables = weights | module.kept("first weight"), module.kept("table")
+        self.idle = None if module.idle is None else module.idle.on(module.kept("idle"))
+        self._streams = streams
         self.stream_type = pieces.blocks[0].type
         seen = frame_values(pieces, lambda name, given: evaluators[name]({**weights, **given}), obs)
         made = evaluators[CONDITION]({**weights, **obs, **seen})
@@ -159,19 +149,18 @@ class PlainNetwork:
         return dict(zip(step.outputs, self._run(STEP, reads), strict=True))
 
 
-def evaluators_of(pieces: Pieces) -> dict[str, Evaluator]:
-    """Of every piece; constants are inputs, which an exporter puts others in the place of."""
-    return {
-        name: Evaluator(replace(graph, inputs={**graph.inputs, **graph.constants}, constants={}), {})
-        for name, graph in pieces.graphs().items()
-    }
-
-
 CPU = torch.device("cpu")
 
 
 class CallModule(nn.Module):
-    """A call of a policy. Every constant is a buffer; nothing is a parameter, or kept from call to call."""
+    """A call of a policy. Every constant is a buffer; nothing is a parameter, or kept from call to call.
+
+    Attributes:
+        spec: what goes in and comes out.
+        pieces: of the artifact.
+        evaluators: of all pieces. Constants are inputs, which an exporter puts others in the place of.
+        idle: see ``loop.Network``, with the constants as they were.
+    """
 
     def __init__(
         self,
@@ -182,7 +171,7 @@ class CallModule(nn.Module):
     ) -> None:
         super().__init__()
         manifest, pieces = view.manifest, view.pieces
-        self._spec, self._pieces, self._features = manifest.spec, pieces, manifest.features
+        self.spec, self.pieces, self._features = manifest.spec, pieces, manifest.features
         self._names: dict[str, str] = {}  # of buffers, by what they hold
         constants = {name for graph in pieces.graphs().values() for name in graph.constants}
         self._keep("weight", {name: value for name, value in weights.items() if name in constants})
@@ -192,8 +181,8 @@ class CallModule(nn.Module):
         self._bound = None if correction is None else manifest.spec.sampler.bound
         self._keep("advance", self._advance.tensors())
         form, _ = idle_form(pieces, view.weights)
-        self._idle = None if form is None else IdleSteps(form, CPU)
-        self._keep("idle", {} if self._idle is None else self._idle.tensors())
+        self.idle = None if form is None else IdleSteps(form, CPU)
+        self._keep("idle", {} if self.idle is None else self.idle.tensors())
         bias = np.zeros((1, 1, 1, 1), np.float32) if correction is None else correction.bias
         self._keep("offset", {"noise": manifest.spec.sampler.noise_to_next[:, None, None, None], "bias": bias})
         envelope = view.artifact.envelope
@@ -206,15 +195,13 @@ class CallModule(nn.Module):
         for key, each in manifest.spec.observations.items():
             self._keep(f"normalizer {key}", _numbers(each.normalizer))
         self._keep("actions", _numbers(manifest.spec.chunk.normalizer))
-        self._evaluators = evaluators_of(pieces)
-
-    @property
-    def spec(self) -> PolicySpec:
-        """What goes in and comes out."""
-        return self._spec
+        self.evaluators = {
+            name: Evaluator(replace(graph, inputs={**graph.inputs, **graph.constants}, constants={}), {})
+            for name, graph in pieces.graphs().items()
+        }
 
     def _network(self, obs: Mapping[str, Tensor], initial: Tensor) -> PlainNetwork:
-        spec = self._spec
+        spec = self.spec
         horizon, dimensions = spec.sample
         if initial.ndim != 3 or tuple(initial.shape[1:]) != spec.sample or initial.dtype != torch.float32:
             found = f"{initial.dtype} {list(initial.shape)}"
@@ -227,24 +214,13 @@ class CallModule(nn.Module):
                 expected = f"{one.dtype} [{', '.join(map(str, (len(initial), *one.shape)))}]"
                 found = "none" if value is None else f"{value.dtype} {list(value.shape)}"
                 raise ObservationError(f"observation {key!r} must be {expected}; found {found}.")
-            normalizer = self._kept(f"normalizer {key}")
+            normalizer = self.kept(f"normalizer {key}")
             given[key] = value * normalizer["scale"] + normalizer["offset"] if normalizer else value
-        weights = self._kept("weight")
-        idle = None if self._idle is None else self._idle.on(self._kept("idle"))
-        return PlainNetwork(
-            pieces=self._pieces,
-            evaluators=self._evaluators,
-            weights=weights,
-            first=weights | self._kept("first weight"),
-            tables=self._kept("table"),
-            obs=given,
-            streams=len(initial),
-            idle=idle,
-        )
+        return PlainNetwork(self, given, len(initial))
 
     def _is_far(self, network: PlainNetwork) -> Tensor:
         """Which streams are so far outside of what was recorded that they have no correction, bool ``[B]``."""
-        envelope = self._kept("envelope")
+        envelope = self.kept("envelope")
         away = network.condition(self._features) @ envelope["reading"] - envelope["center"]
         far: Tensor = torch.linalg.vector_norm(away, dim=1) > FAR
         return far
@@ -257,13 +233,13 @@ class CallModule(nn.Module):
         Raises:
             ObservationError: noise of the steps of another shape, or missing.
         """
-        advance = self._advance.on(self._kept("advance"))
+        advance = self._advance.on(self.kept("advance"))
         if not corrected:
             assert self._far is not None
-            advance = self._far.on(self._kept("far"))
-        spec = self._spec
+            advance = self._far.on(self.kept("far"))
+        spec = self.spec
         horizon, dimensions = spec.sample
-        own = self._kept("offset")
+        own = self.kept("offset")
         bias = own["bias"] if corrected else torch.zeros_like(own["bias"])
         offset = bias.expand(spec.sampler.steps, dimensions, len(initial), horizon)
         if spec.sampler.stochastic:
@@ -282,8 +258,8 @@ class CallModule(nn.Module):
         """The actions of a denoised sample ``[B, T, D]``, in their own units."""
         if self._bound is not None:
             sample = sample.clamp(-self._bound, self._bound)
-        actions = sample[..., : self._spec.chunk.action_dim]
-        normalizer = self._kept("actions")
+        actions = sample[..., : self.spec.chunk.action_dim]
+        normalizer = self.kept("actions")
         return (actions - normalizer["offset"]) / normalizer["scale"] if normalizer else actions.clone()
 
     def _keep(self, kind: str, arrays: Mapping[str, object]) -> None:
@@ -292,7 +268,8 @@ class CallModule(nn.Module):
             self._names[f"{kind}/{name}"] = buffer
             self.register_buffer(buffer, value if isinstance(value, Tensor) else torch.tensor(np.asarray(value)))
 
-    def _kept(self, kind: str) -> dict[str, Tensor]:
+    def kept(self, kind: str) -> dict[str, Tensor]:
+        """Constants of a kind, by name."""
         start = f"{kind}/"
         found = {n.removeprefix(start): b for n, b in self._names.items() if n.startswith(start)}
         return {name: self.get_buffer(buffer) for name, buffer in found.items()}

@@ -34,43 +34,33 @@ from .sampler import Advance, State, begin
 class SteppedAdvance(Advance):
     """The same, also at a step that only the program knows."""
 
+    TENSORS = (*Advance.TENSORS, "columns", "remember", "number")
+
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
         super().__init__(spec, correction, device)
         number = np.full(self.steps, -1, np.int64)
         for each, landing in self.jumps.values():
             number[landing] = each
-        self._columns = torch.tensor(self._to_clean, dtype=torch.float32, device=device)
-        self._remember = torch.tensor(self._anchors, device=device)
-        self._number = torch.tensor(number, device=device)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """See ``Advance.tensors``."""
-        own = {"columns": self._columns, "remember": self._remember, "number": self._number}
-        return super().tensors() | own
-
-    def on(self, tensors: Mapping[str, Tensor]) -> SteppedAdvance:
-        """See ``Advance.on``."""
-        other = super().on(tensors)
-        assert isinstance(other, SteppedAdvance)
-        other._columns, other._remember, other._number = (tensors[n] for n in ("columns", "remember", "number"))
-        return other
+        self.columns = torch.tensor(self._to_clean, dtype=torch.float32, device=device)
+        self.remember = torch.tensor(self._anchors, device=device)
+        self.number = torch.tensor(number, device=device)
 
     def at(self, state: State, prediction: Tensor, k: Tensor, offset: Tensor) -> State:
         """What is carried to the step after k, which is int64 ``[1]``."""
         clean = None
         if self._clip is not None:
-            of_sample, of_prediction = self._columns.index_select(0, k)[0].unbind()
+            of_sample, of_prediction = self.columns.index_select(0, k)[0].unbind()
             clean = (state.sample * of_sample + prediction * of_prediction).clamp(-self._clip, self._clip)
-        matrix = self._plain.index_select(0, k)[0].expand(len(state.sample), -1, -1)
+        matrix = self.updates.index_select(0, k)[0].expand(len(state.sample), -1, -1)
         moved = self._moved(state, prediction, clean, matrix, offset)
-        anchor = self._remember.index_select(0, k)
+        anchor = self.remember.index_select(0, k)
         return moved._replace(history=torch.where(anchor, self._longer(state, prediction), state.history))
 
     def jumped(self, k: Tensor, offset: Tensor, read: Tensor | None, history: Tensor) -> Tensor:
         """The offset of step k, with the jump that ends there if one does."""
         if not self.layers:
             return offset
-        number = self._number.index_select(0, k)
+        number = self.number.index_select(0, k)
 
         def jump() -> Tensor:
             added = self.jump([layer.index_select(0, number)[0] for layer in self.layers], read, history)

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ttscompile.core.correction import HISTORY, Correction, no_correction
-from ttscompile.core.spec import FloatArray, PolicySpec
+from ttscompile.core.spec import PolicySpec
 from ttscompile.core.update import clips, matrices
 
 from . import devices
-
-LAYERS = ("inner", "middle", "outer")
-"""Of a correction's jumps, by the names of their tensors."""
 
 
 class State(NamedTuple):
@@ -34,59 +29,48 @@ class State(NamedTuple):
     memory: Tensor
 
 
-class Advance:
+class Advance(devices.OnTensors):
     """The steps of a policy's sampler with one correction.
 
     Attributes:
+        updates: the matrices, ``[K, G, R, (1 + S) T]``.
         horizon: T.
         memories: S.
         reading: ``[N, F]``, what the correction reads of the condition; None if it reads nothing.
         observed: ``[F, K D T]``, what that adds; None if it reads nothing.
-        layers: inner, middle and outer of its jumps; none if it has none.
         jumps: by anchor, the number of its jump, and the step after which that is added.
     """
+
+    TENSORS: tuple[str, ...] = ("updates", "reading", "observed", "inner", "middle", "outer")
 
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
         table, (self.horizon, dimensions) = spec.sampler, spec.sample
         self.memories, self.steps = table.memories, table.steps
         used = correction or no_correction(table.steps, spec.sample)
         self._anchors: list[bool] = used.anchors.tolist()
-        self._plain = devices.placed(matrices(table, used), device)
-        self._of_step = [one.expand(dimensions, -1, -1) for one in self._plain]
+        self.updates = devices.placed(matrices(table, used), device)
+        self._of_step = [one.expand(dimensions, -1, -1) for one in self.updates]
         self._clip = table.clip if clips(table) else None
         self._to_clean = list(zip(table.sample_to_x0.tolist(), table.out_to_x0.tolist(), strict=True))
-        self.reading = self.observed = None
+        self.reading = self.observed = self.inner = self.middle = self.outer = None
         if correction is not None and correction.reads:
             self.reading = devices.placed(correction.reading, device)
             self.observed = devices.placed(correction.observed.reshape(correction.reads, -1), device)
-        self.layers: tuple[Tensor, ...] = ()
         if used.jumps:
-            self.layers = tuple(devices.placed(array, device) for array in (used.inner, used.middle, used.outer))
+            layers = used.inner, used.middle, used.outer
+            self.inner, self.middle, self.outer = (devices.placed(array, device) for array in layers)
         self.jumps = used.jumps
 
     @property
-    def updates(self) -> FloatArray:
-        """The matrices, float32 ``[K, G, R, (1 + S) T]``, a copy."""
-        return np.array(self._plain.cpu().numpy(), dtype=np.float32)
+    def layers(self) -> tuple[Tensor, ...]:
+        """Inner, middle and outer of its jumps; none if it has none."""
+        return tuple(each for each in (self.inner, self.middle, self.outer) if each is not None)
 
-    def write(self, updates: FloatArray) -> None:
-        """Put other matrices in the place of these."""
-        self._plain.copy_(torch.from_numpy(updates))
-
-    def on(self, tensors: Mapping[str, Tensor]) -> Advance:
-        """The same with other tensors in the place of ``tensors()``."""
-        other = copy(self)
-        other._plain = tensors["updates"]
-        other._of_step = [one.expand(len(each), -1, -1) for one, each in zip(other._plain, self._of_step, strict=True)]
-        other.reading, other.observed = tensors.get("reading"), tensors.get("observed")
-        other.layers = tuple(tensors[name] for name in LAYERS if name in tensors)
+    def on(self, tensors: Mapping[str, Tensor]) -> Self:
+        """See ``OnTensors.on``."""
+        other = super().on(tensors)
+        other._of_step = [one.expand(len(each), -1, -1) for one, each in zip(other.updates, self._of_step, strict=True)]
         return other
-
-    def tensors(self) -> dict[str, Tensor]:
-        """What it computes with, by name."""
-        named = {"updates": self._plain, "reading": self.reading, "observed": self.observed}
-        named |= zip(LAYERS, self.layers, strict=False)
-        return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     def of_condition(self, condition: Tensor) -> tuple[Tensor, Tensor]:
         """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``.

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
+from tests.runtimes.recorded import everything_recorded
 from ttscompile.calibration import execute
 from ttscompile.calibration.calls import Calls, Split, sample_calls, window_of
 from ttscompile.calibration.execute import Executor, whole_windows
@@ -144,7 +145,7 @@ def test_training_runs_what_the_executor_runs(make_task: MakeTask) -> None:
     assert len(samples) == 10
 
 
-def test_gradients_of_gates_are_those_of_the_reference_where_all_is_computed(make_task: MakeTask) -> None:
+def test_gradients_of_gates_are_those_of_the_whole_formula_where_all_is_computed(make_task: MakeTask) -> None:
     """There what a block would compute is what the dense call computed: but for the type it is kept in."""
     task = make_task(calls=2)
     calls = in_windows(task, 2, window=1)
@@ -157,7 +158,7 @@ def test_gradients_of_gates_are_those_of_the_reference_where_all_is_computed(mak
 
     ours, theirs = one_hot(plans), one_hot(plans)
     found = gradient(Practice(task.executor, calls).samples(plans, ours, np.arange(2))[-1], ours)
-    reference = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, theirs).sample
-    expected = gradient(reference, theirs)
+    whole = everything_recorded(task.executor.model, calls.contexts, calls.initial, calls.noise, theirs, {})
+    expected = gradient(whole, theirs)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(found[:, 1:] / scale, expected[:, 1:] / scale, atol=0.01)

@@ -15,10 +15,12 @@ from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.program import Program
-from ttscompile.runtimes.reference.model import Contexts, ReferenceModel, RolloutCache
+from ttscompile.runtimes.reference.model import ReferenceModel, RolloutCache
+from ttscompile.runtimes.reference.reuse import Caches, Cell, reuse
 
 from .literal import Episode
 from .plans import random_plan
+from .recorded import everything_recorded
 from .toys import as_functions, model_of, pencil_program, pruner_weights, toy_program
 
 C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
@@ -93,32 +95,7 @@ def one_hot(plan: PlanArray) -> torch.Tensor:
     return torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float()
 
 
-def everything_recorded(
-    contexts: Contexts, noise: Noise, gates: torch.Tensor, cache: RolloutCache | None, write_gradients: bool
-) -> torch.Tensor:
-    """The call as one differentiable formula: all candidates of all cells, recorded, mixed by the gates."""
-    assert noise.steps is not None
-    carried, steps = MODEL.sampler.begin(torch.from_numpy(noise.initial)), torch.from_numpy(noise.steps)
-    forward: dict[int, torch.Tensor] = {}
-    timestep: dict[int, torch.Tensor] = {}
-    zero = torch.zeros(())
-    for k in range(MODEL.steps):
-        h = MODEL.stem(carried.sample, k, contexts)
-        for b, group in enumerate(MODEL.groups):
-            g = [gates[:, k, b, source].reshape(-1, 1, 1) for source in Source]
-            computed = MODEL.block(b, k, h, contexts)
-            rollout = zero if cache is None else cache.residuals.get((k, b), zero)
-            old_forward, old_timestep = forward.get(group, zero), timestep.get(b, zero)
-            h = h + g[0] * computed + g[1] * old_forward + g[2] * old_timestep + g[3] * rollout
-            write = g[0] if write_gradients else g[0].detach()
-            forward[group] = write * computed + (1 - write) * old_forward
-            timestep[b] = write * computed + (1 - write) * old_timestep
-        carried = MODEL.sampler.advance(carried, MODEL.tail(h, k, contexts), steps[k], k)
-    return carried.sample
-
-
-@pytest.mark.parametrize("write_gradients", [True, False])
-def test_gradients_are_those_of_the_whole_formula(write_gradients: bool) -> None:
+def test_gradients_of_gates_are_those_of_the_whole_formula() -> None:
     rng = np.random.default_rng(7)
     obs, noise = inputs(rng, 2)
     assert noise.steps is not None
@@ -126,29 +103,35 @@ def test_gradients_are_those_of_the_whole_formula(write_gradients: bool) -> None
     dense = np.zeros((2, MODEL.steps, MODEL.blocks), np.int8)
     initial, steps = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
     cache = MODEL.denoise(contexts, initial, steps, dense).cache
+    assert not any(residual.requires_grad for residual in cache.residuals.values())
     plans = np.stack([random_plan(rng, MODEL.steps, MODEL.groups, cells) for cells in cache.written])
     assert len(set(map(int, plans[:, 1:].reshape(-1)))) == 4
 
-    gates = one_hot(plans).requires_grad_()
-    result = MODEL.denoise(contexts, initial, steps, gates, cache, write_gradients=write_gradients)
-    result.sample.square().sum().backward()
+    gates, caches = one_hot(plans).requires_grad_(), Caches(dict(cache.residuals))
+
+    def blocks(k: int, stream: torch.Tensor) -> torch.Tensor:
+        for b, group in enumerate(MODEL.groups):
+            cell = Cell(k, b, group, plans[:, k, b], gates[:, k, b], TOY.blocks[b].type)
+            stream = stream + reuse(cell, MODEL.block(b, k, stream, contexts), caches)
+        return stream
+
+    *_, last = MODEL.steps_of(contexts, initial, steps, blocks)
+    last.sample.square().sum().backward()
     whole = one_hot(plans).requires_grad_()
     with Counted() as counted:
-        sample = everything_recorded(contexts, noise, whole, cache, write_gradients)
+        sample = everything_recorded(MODEL, contexts, initial, steps, whole, cache.residuals)
         sample.square().sum().backward()
 
-    assert_equal_but_for_rounding(result.sample, sample, counted.terms)
+    assert_equal_but_for_rounding(last.sample, sample, counted.terms)
+    assert_equal_but_for_rounding(MODEL.denoise(contexts, initial, steps, plans, cache).sample, sample, counted.terms)
     assert gates.grad is not None
     assert whole.grad is not None
     # Before step 0 nothing is cached, and the gates of what is not cached are never asked for.
     assert_equal_but_for_rounding(gates.grad[:, 1:], whole.grad[:, 1:], counted.terms)
     assert gates.grad[:, 1:].abs().min(0).values.max() > 1e-3
-    assert len(result.samples) == MODEL.steps
-    assert torch.equal(result.samples[-1], result.sample)
-    assert not any(residual.requires_grad for residual in result.cache.residuals.values())
 
 
-def test_without_gradients_only_computed_blocks_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_computed_blocks_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(3)
     obs, noise = inputs(rng, 2)
     plans = np.full((2, MODEL.steps, MODEL.blocks), T, np.int8)
@@ -176,18 +159,6 @@ def test_the_pruners_logits_are_differentiable_in_given_weights() -> None:
     logits[:, 1:].sum().backward()
     assert weights["pruner.b"].grad is not None
     assert torch.equal(weights["pruner.b"].grad, torch.tensor([0.0, 2.0])[(torch.arange(100) >= 20).long()])
-
-
-def test_gates_that_are_not_one_hot_are_refused() -> None:
-    contexts = MODEL.prologue(inputs(np.random.default_rng(0), 1)[0])
-    initial = torch.zeros(1, *TOY.spec.sample)
-    gates = one_hot(np.zeros((1, MODEL.steps, MODEL.blocks), np.int8))
-    soft = gates.clone()
-    soft[0, 2, 1] = torch.tensor([0.5, 0, 0.5, 0])
-    with pytest.raises(IllegalPlanError, match="one-hot"):
-        MODEL.denoise(contexts, initial, None, soft)
-    with pytest.raises(IllegalPlanError, match=r"\(1, 4, 5, 4\); expected"):
-        MODEL.denoise(contexts, initial, None, gates[:, :-1])
 
 
 def test_a_program_without_pieces_or_pruner_is_refused() -> None:

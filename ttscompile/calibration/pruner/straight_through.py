@@ -68,7 +68,7 @@ class Practice:
                 if (before := _earlier(column, computed.detach(), axis, calls.window)) is not None:
                     caches.rollout[k, b] = before
                 cell = Cell(k, b, model.groups[b], column, gates[:, k, b], executor.types[b])
-                stream = stream + reuse(cell, computed, caches, write_gradients=True)
+                stream = stream + reuse(cell, computed, caches)
                 caches.rollout.pop((k, b), None)  # nobody reads it after this cell
             return stream
 
