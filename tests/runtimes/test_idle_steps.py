@@ -106,7 +106,7 @@ def test_a_network_of_another_form_has_no_such_steps(make_artifact: MakeArtifact
     program = toy_program()
     tail = program.pieces.tail
     (out,) = tail.graph.outputs
-    bent = Node("bent", "aten.tanh.default", (Ref(out),), (), (tail.type,))
+    bent = Node("bent", "aten.tanh.default", (Ref(out),), (), (tail.graph.types()[out],))
     graph = replace(tail.graph, nodes=(*tail.graph.nodes, bent), outputs=("bent",))
     pieces = replace(program.pieces, tail=replace(tail, graph=graph))
     toy_artifact = make_artifact(replace(program, pieces=pieces))
