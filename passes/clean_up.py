@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy.typing as npt
 import torch
 
-from ttscompile.ir.dataflow import reaching
 from ttscompile.ir.evaluate import evaluator
-from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType
+from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Phase, mapped
 
@@ -76,16 +76,20 @@ def forget_examples(graph: Graph) -> Graph:
 def drop_identities(graph: Graph) -> Graph:
     """Replace the uses of operations that return their first argument."""
     types = graph.types()
+    return _without(graph, lambda node: next(node.refs()) if _is_identity(node, types) else None)
+
+
+def _without(graph: Graph, same_as: Callable[[Node], str | None]) -> Graph:
+    """The graph without the nodes for which there is another value: that is read in their place. Outputs stay."""
     same: dict[str, str] = {}
     nodes = []
     for node in graph.nodes:
         node = node.renamed(lambda name: same.get(name, name))
-        if node.name not in graph.outputs and _is_identity(node, types):
-            source = node.args[0]
-            assert isinstance(source, Ref)
-            same[node.name] = source.name
-        else:
+        other = same_as(node)
+        if other is None or node.name in graph.outputs:
             nodes.append(node)
+        else:
+            same[node.name] = other
     return replace(graph, nodes=tuple(nodes))
 
 
@@ -130,25 +134,15 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
 def merge_repeated(graph: Graph) -> Graph:
     """Compute equal expressions once."""
     seen: dict[tuple[object, ...], str] = {}
-    same: dict[str, str] = {}
-    nodes = []
-    for node in graph.nodes:
-        node = node.renamed(lambda name: same.get(name, name))
+
+    def first(node: Node) -> str | None:
         # 1 == True == 1.0 in Python; their texts differ
-        key = (node.op, repr(node.args), repr(node.kwargs), node.types)
-        if key in seen and node.name not in graph.outputs:
-            same[node.name] = seen[key]
-        else:
-            seen.setdefault(key, node.name)
-            nodes.append(node)
-    return replace(graph, nodes=tuple(nodes))
+        name = seen.setdefault((node.op, repr(node.args), repr(node.kwargs), node.types), node.name)
+        return None if name == node.name else name
+
+    return _without(graph, first)
 
 
 def drop_dead(graph: Graph) -> Graph:
     """Drop nodes and constants that no output needs; inputs stay, they are the graph's signature."""
-    live = reaching(graph, graph.outputs)
-    return replace(
-        graph,
-        constants={n: t for n, t in graph.constants.items() if n in live},
-        nodes=tuple(n for n in graph.nodes if n.name in live),
-    )
+    return replace(backward_slice(graph, graph.outputs, {}), inputs=graph.inputs)

@@ -97,10 +97,9 @@ def _item(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorT
     axis = _axis(types[source], split.args[2] if len(split.args) > 2 else 0)
     if axis is None:
         return None
-    sizes = [part.shape[axis] for part in split.types]
-    if not all(isinstance(size, Batch) for size in sizes):
+    multiples = [size.multiple for part in split.types if isinstance(size := part.shape[axis], Batch)]
+    if len(multiples) < len(split.types):
         return None
-    multiples = [size.multiple for size in sizes if isinstance(size, Batch)]
     start = sum(multiples[: node.args[1]])
     return source, axis, start, start + multiples[node.args[1]]
 

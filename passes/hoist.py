@@ -101,9 +101,8 @@ def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
     renamed = {name: f"{name}.value" for name in prologue.inputs}
     inputs = prologue.inputs.items()
     copies = [Node(renamed[name], "aten.clone.default", (Ref(name),), (), (type_,)) for name, type_ in inputs]
-    nodes = [node.renamed(lambda name: renamed.get(name, name)) for node in prologue.nodes]
-    outputs = tuple(renamed.get(name, name) for name in prologue.outputs)
-    return replace(prologue, nodes=(*copies, *nodes), outputs=outputs), renamed
+    reading = prologue.renamed(renamed)
+    return replace(reading, inputs=prologue.inputs, nodes=(*copies, *reading.nodes)), renamed
 
 
 def _step_graph(

@@ -140,13 +140,8 @@ class _Changed:
                 self._gather(node.name, axes[node.name])
         for name in own.outputs:
             self._whole(name)
-        graph = Graph(
-            {PIXELS: pixels, **index, **self.inputs},
-            own.constants,
-            tuple(self.nodes),
-            (*own.outputs, *self.outputs),
-        )
-        return graph
+        given = {PIXELS: pixels, **index, **self.inputs}
+        return Graph(given, own.constants, tuple(self.nodes), (*own.outputs, *self.outputs))
 
     def _part(self, type_: TensorType, axis: int) -> TensorType:
         """The type of a value with the rows of some tokens alone."""

@@ -1,19 +1,20 @@
-"""Split a concatenation of tokens with different binding times, as far down as the work on it is token-wise."""
+"""Split what is concatenated of parts with different binding times: tokens, and the features of a linear layer."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby
 
 from ttscompile.ir.binding import bindings, input_bindings, join
-from ttscompile.ir.graph import GETITEM, Argument, Batch, Graph, Node, Ref, Size, TensorType
-from ttscompile.ir.operations import Movement, axes_along, operation, permutation
+from ttscompile.ir.graph import Argument, Graph, Node, Ref, TensorType
+from ttscompile.ir.operations import Movement, axis_after, operation
 from ttscompile.ir.program import Binding, Cut
 
 from .base import Pass, PassResult
+
+_CAT, _LINEAR = "aten.cat.default", "aten.linear.default"
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class _Splitter:
         return replace(self.graph, nodes=tuple(self.nodes))
 
     def _visit(self, node: Node) -> None:
-        if node.op == "aten.cat.default" and self._split_cat(node):
+        if node.op == _CAT and self._split_cat(node):
             return
         operands = [name for name in dict.fromkeys(node.refs()) if name in self.parts]
         if operands:
@@ -98,7 +99,7 @@ class _Splitter:
             return
         self.whole.add(name)
         args = (tuple(Ref(part) for part in parts.names), parts.axis)
-        self.nodes.append(Node(name, "aten.cat.default", args, (), (self.types[name],), "sunk by SplitTokens"))
+        self.nodes.append(Node(name, _CAT, args, (), (self.types[name],), "sunk by SplitTokens"))
 
     def emit(self, node: Node, index: int, args: tuple[Argument, ...], types: tuple[TensorType, ...]) -> str:
         """Add the ``index``-th part of ``node`` and return its name."""
@@ -112,14 +113,7 @@ class _Splitter:
     def _split_cat(self, node: Node) -> bool:
         if self.bindings[node.name] is not Binding.STEP:
             return False  # all of it leaves the loop as it is
-        operands = node.args[0]
-        assert isinstance(operands, tuple)
-        names = [o.name for o in operands if isinstance(o, Ref)]
-        if any(self.types[name].dtype != node.type.dtype for name in names):
-            return False  # apart, what is another dtype in the whole would be computed with in its own
-        axis = node.args[1] if len(node.args) > 1 else 0
-        assert isinstance(axis, int)
-        axis %= len(node.type.shape)
+        names, axis = _joined(node, self.types)
         pieces: list[tuple[str, int]] = []
         for name in names:
             inner = self.parts.get(name)
@@ -165,23 +159,13 @@ def _parts(splitter: _Splitter, node: Node) -> _Parts | None:
     split = [name for name in node.refs() if name in splitter.parts]
     if split != list(node.refs())[:1] or node.args[0] != Ref(split[0]):
         return None  # it reads more than one value in parts, or not in the first place
-    source, type_ = splitter.parts[split[0]], splitter.types[split[0]]
-    axis, rank, new = source.axis, len(type_.shape), node.type.shape
-    if row.movement is Movement.RESHAPE:
-        return _reshaped(splitter, node, source, type_)
-    if row.movement is Movement.PERMUTE:
-        return _per_part(splitter, node, source, permutation(node, rank).index(axis))
+    source, shape = splitter.parts[split[0]], splitter.types[split[0]].shape
     if row.name == "expand":
-        axis += len(new) - rank
-        return _per_part(splitter, node, source, axis, shaped=True)
-    if row.along is not None and len(along := axes_along(node, rank)) == 1:
-        (across,) = along
-        # A selection leaves its axis out.
-        return None if across == axis else _per_part(splitter, node, source, axis - (len(new) < rank and across < axis))
-    if row.mixes is not None:
-        mixed = row.mixes(node, splitter.types)
-        return None if mixed is None or axis >= rank - mixed else _per_part(splitter, node, source, axis)
-    return _per_part(splitter, node, source, axis) if node.op == GETITEM else None
+        return _per_part(splitter, node, source, source.axis + len(node.type.shape) - len(shape), shaped=True)
+    axis, shaped = axis_after(node, source.axis, splitter.types), row.movement is Movement.RESHAPE
+    if shaped:
+        node = replace(node, op="aten.reshape.default", kwargs=())
+    return None if axis is None else _per_part(splitter, node, source, axis, shaped)
 
 
 def _per_part(splitter: _Splitter, node: Node, source: _Parts, axis: int, shaped: bool = False) -> _Parts:
@@ -192,22 +176,6 @@ def _per_part(splitter: _Splitter, node: Node, source: _Parts, axis: int, shaped
         args = (Ref(name), types[0].shape) if shaped else (Ref(name), *node.args[1:])
         names.append(splitter.emit(node, i, args, types))
     return _Parts(axis, tuple(names), source.sizes)
-
-
-def _reshaped(splitter: _Splitter, node: Node, source: _Parts, type_: TensorType) -> _Parts | None:
-    """The split is kept if the token axis survives: the sizes before it, and itself, have the same product."""
-    new, before = node.type.shape, _factors(type_.shape[: source.axis])
-    kept = [a for a, size in enumerate(new) if size == type_.shape[source.axis] and _factors(new[:a]) == before]
-    if not kept:
-        return None
-    node = replace(node, op="aten.reshape.default", kwargs=())
-    return _per_part(splitter, node, source, kept[0], shaped=True)
-
-
-def _factors(shape: Sequence[Size]) -> tuple[int, int]:
-    """Numbers and batches in a product of sizes."""
-    numbers = math.prod(n.multiple if isinstance(n, Batch) else n for n in shape)
-    return numbers, sum(isinstance(n, Batch) for n in shape)
 
 
 def _elementwise(splitter: _Splitter, node: Node) -> _Parts | None:
@@ -233,3 +201,86 @@ def _elementwise(splitter: _Splitter, node: Node) -> _Parts | None:
             args.append(argument)
         names.append(splitter.emit(node, i, tuple(args), (_resized(node.type, axis, size),)))
     return _Parts(axis, tuple(names), sizes)
+
+
+class SplitFeatures(Pass[Cut, Cut]):
+    """Let each part of a feature vector meet its columns of the weight at its own binding time.
+
+    The modulations of adaLN are linear in [timestep, observation]. Before::
+
+        %f = aten.cat.default([%time, %observation], 1)          # step
+        %m = aten.linear.default(%f, %w, %b)                     # step: all of it, for every step
+
+    After::
+
+        %m.part0 = aten.linear.default(%time, %w[:, :t], %b)     # a table in the artifact
+        %m.part1 = aten.linear.default(%observation, %w[:, t:])  # once a call
+        %m       = aten.add.Tensor(%m.part0, %m.part1)           # for every step, an addition
+
+    The result differs from the original by rounding only.
+    """
+
+    def call(self, program: Cut) -> PassResult[Cut]:
+        """Split in the prologue."""
+        prologue, spec = program.prologue, program.spec
+        known, producers, types = bindings(prologue, input_bindings(spec)), prologue.producers(), prologue.types()
+        nodes: list[Node] = []
+        split = 0
+        for node in prologue.nodes:
+            parts = _features(node, producers, types) if node.op == _LINEAR else []
+            if len({known[part] for part in parts}) < 2:
+                nodes.append(node)
+                continue
+            nodes += _sum(node, parts, types)
+            split += 1
+        if not split:
+            return PassResult(program)
+        note = f"{split} linear layers of features with different binding times became sums"
+        return PassResult(replace(program, prologue=replace(prologue, nodes=tuple(nodes))), (note,))
+
+
+def _features(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> list[str]:
+    """The features that a linear layer reads, if they are concatenated along its last axis; else none."""
+    source, weight = node.args[0], node.args[1]
+    cat = producers.get(source.name) if isinstance(source, Ref) else None
+    if cat is None or cat.op != _CAT or not isinstance(weight, Ref) or len(types[weight.name].shape) != 2:
+        return []
+    names, axis = _joined(cat, types)
+    fits = axis == len(cat.type.shape) - 1 and all(isinstance(types[name].shape[-1], int) for name in names)
+    return names if fits else []
+
+
+def _joined(cat: Node, types: Mapping[str, TensorType]) -> tuple[list[str], int]:
+    """What a concatenation joins, and along which axis.
+
+    Nothing if one part has another dtype: apart it would be computed with in its own.
+    """
+    operands, axis = cat.args[0], cat.args[1] if len(cat.args) > 1 else 0
+    assert isinstance(operands, tuple) and isinstance(axis, int)
+    names = [operand.name for operand in operands if isinstance(operand, Ref)]
+    alike = all(types[name].dtype == cat.type.dtype for name in names)
+    return names if alike else [], axis % len(cat.type.shape)
+
+
+def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType]) -> list[Node]:
+    weight = node.args[1]
+    assert isinstance(weight, Ref)
+    matrix, nodes = types[weight.name], list[Node]()
+
+    def emit(name: str, op: str, args: tuple[Argument, ...], type_: TensorType) -> Ref:
+        nodes.append(Node(name, op, args, (), (type_,), node.source))
+        return Ref(name)
+
+    start, total = 0, Ref("")
+    for index, part in enumerate(parts):
+        size = types[part].shape[-1]
+        assert isinstance(size, int)
+        cut = (weight, 1, start, start + size)
+        columns = emit(f"{node.name}.columns{index}", "aten.slice.Tensor", cut, _resized(matrix, 1, size))
+        made = TensorType((*types[part].shape[:-1], matrix.shape[0]), node.type.dtype)
+        args = (Ref(part), columns, *(node.args[2:] if index == 0 else ()))  # the bias once
+        linear = emit(f"{node.name}.part{index}", _LINEAR, args, made)
+        name = node.name if index == len(parts) - 1 else f"{node.name}.sum{index}"
+        total = emit(name, "aten.add.Tensor", (total, linear), node.type) if index else linear
+        start += size
+    return nodes

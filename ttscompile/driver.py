@@ -47,9 +47,8 @@ from .passes.one_block import OneBlock
 from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
 from .passes.reuse_tokens import ReuseTokens
-from .passes.split_features import SplitFeatures
 from .passes.split_frames import SplitFrames
-from .passes.split_tokens import SplitTokens
+from .passes.split_tokens import SplitFeatures, SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
 from .verification.record_golden import record_original

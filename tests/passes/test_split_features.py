@@ -21,8 +21,7 @@ from ttscompile.passes.clean_up import CleanUp
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.partition import Partition
-from ttscompile.passes.split_features import SplitFeatures, _parts
-from ttscompile.passes.split_tokens import SplitTokens
+from ttscompile.passes.split_tokens import SplitFeatures, SplitTokens, _features
 
 
 class _Modulated(nn.Module):
@@ -81,9 +80,9 @@ def test_features_of_another_dtype_stay_together() -> None:
     parts = (b.input("time", B, 2), b.input("count", B, 3, dtype="int64"))
     b.op("gate", "linear.default", (B, 4), b.op("both", "cat.default", (B, 5), parts, 1), b.constant("w", 4, 5))
     graph = b.graph(Ref("gate"))
-    assert _parts(graph.nodes[1], graph.producers(), graph.types()) == []
+    assert _features(graph.nodes[1], graph.producers(), graph.types()) == []
     floats = {name: replace(type_, dtype="float32") for name, type_ in graph.types().items()}
-    assert _parts(graph.nodes[1], graph.producers(), floats) == ["time", "count"]
+    assert _features(graph.nodes[1], graph.producers(), floats) == ["time", "count"]
 
 
 @pytest.mark.slow

@@ -13,24 +13,7 @@ from typing import Any
 
 from ..core.plan import DENSE, ORIGINAL
 from ..errors import ArtifactError
-from ..ir.pieces import (
-    ADVANCE,
-    CONDITION,
-    FRAMES,
-    INDEX,
-    OF_ALL_BLOCKS,
-    PIXELS,
-    PRUNER,
-    STEM,
-    block_name,
-    frame_pieces,
-    of_loop,
-    of_tokens,
-    part_of,
-    pixels_name,
-    renewed_name,
-    tokens_name,
-)
+from ..ir import pieces as names
 from . import typed_json
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, PrecisionRecord, WeightsRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
@@ -137,7 +120,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     Returns:
         Two sha256 of 64 digits.
     """
-    document, own = to_json(manifest), (PRUNER, of_loop(PRUNER, ""))
+    document, own = to_json(manifest), (names.PRUNER, names.of_loop(names.PRUNER, ""))
     pieces, stores = document["pieces"], {k: v for k, v in document["stores"].items() if k not in _GOLDEN}
     of_model = {name: piece for name, piece in pieces.items() if name != own[0] and not name.startswith(own[1])}
     read = {stores["program"], stores["weights"], *(piece["file"] for piece in of_model.values())}
@@ -212,8 +195,8 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
     blocks = len(manifest.blocks)
     if len(manifest.flops.blocks) != blocks:
         fields["flops"].fail(f"FLOPs of {blocks} blocks")
-    missing = {CONDITION, STEM, ADVANCE, *OF_ALL_BLOCKS, *map(block_name, range(blocks))} - set(manifest.pieces)
-    if missing:
+    wanted = {names.CONDITION, names.STEM, names.ADVANCE, *names.OF_ALL_BLOCKS, *map(names.block_name, range(blocks))}
+    if missing := wanted - set(manifest.pieces):
         fields["pieces"].fail(f"the pieces {sorted(missing)} too")
     for name, piece in manifest.pieces.items():
         if piece.stream is not None and piece.stream not in piece.inputs:
@@ -221,17 +204,17 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
         if not set(piece.contexts) <= set(manifest.contexts):
             fields["pieces"].fail(f"contexts of {name} that are among {list(manifest.contexts)}")
     # The pruner may read what no piece of the loop does.
-    known = {*manifest.contexts, *manifest.pieces[CONDITION].outputs}
+    known = {*manifest.contexts, *manifest.pieces[names.CONDITION].outputs}
     if not set(manifest.features) <= known:
         fields["features"].fail(f"some of the contexts {sorted(known)}")
-    rows = manifest.pieces[FRAMES].outputs if FRAMES in manifest.pieces else ()
-    read = [name for piece in frame_pieces(manifest.pieces) for name in manifest.pieces[piece].inputs]
+    rows = manifest.pieces[names.FRAMES].outputs if names.FRAMES in manifest.pieces else ()
+    read = [name for piece in names.frame_pieces(manifest.pieces) for name in manifest.pieces[piece].inputs]
     if sorted(read) != sorted(rows):
         fields["pieces"].fail(f"frame pieces that read {sorted(rows)}, each once")
     _check_tokens(manifest, fields)
-    has_pruner = PRUNER in manifest.pieces
-    wanted = {of_loop(PRUNER, loop) for loop in manifest.loop_pruners}
-    if wanted != {name for name in manifest.pieces if name.startswith(of_loop(PRUNER, ""))}:
+    has_pruner = names.PRUNER in manifest.pieces
+    wanted = {names.of_loop(names.PRUNER, loop) for loop in manifest.loop_pruners}
+    if wanted != {name for name in manifest.pieces if name.startswith(names.of_loop(names.PRUNER, ""))}:
         fields["loop_pruners"].fail("a file for each pruner of a further loop")
     if has_pruner != (manifest.stores.pruner is not None):
         fields["stores"].fail("a file of pruner weights exactly when there is a piece called pruner")
@@ -247,18 +230,20 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
 
 def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
     """Each tower with tokens has its two pieces, which fit it and what is kept; and there are no others."""
-    known = {name: i for i, name in enumerate(frame_pieces(manifest.pieces))}
+    known = {name: i for i, name in enumerate(names.frame_pieces(manifest.pieces))}
     if not set(manifest.tokens) <= set(known):
         fields["tokens"].fail(f"some of the frame pieces {sorted(known)}")
-    wanted = [make(known[name]) for name in manifest.tokens for make in (pixels_name, tokens_name)]
-    if sorted(wanted) != sorted(filter(of_tokens, manifest.pieces)):
+    wanted = [make(known[name]) for name in manifest.tokens for make in (names.pixels_name, names.tokens_name)]
+    if sorted(wanted) != sorted(filter(names.of_tokens, manifest.pieces)):
         fields["pieces"].fail(f"for the sake of tokens exactly {sorted(wanted)}")
     for name, record in manifest.tokens.items():
-        frame, pixels, part = (manifest.pieces[p] for p in (name, pixels_name(known[name]), tokens_name(known[name])))
+        frame, pixels, part = (
+            manifest.pieces[p] for p in (name, names.pixels_name(known[name]), names.tokens_name(known[name]))
+        )
         rows = [kind.at(1)[:1] for kind in record.kept.values()]
-        fits = pixels.inputs == frame.inputs and pixels.outputs == (PIXELS,) and 0 <= record.fixed < record.tokens
-        fits = fits and sorted(part.inputs) == sorted((PIXELS, INDEX, *record.kept))
-        renewed = tuple(map(renewed_name, record.kept))
+        fits = pixels.inputs == frame.inputs and pixels.outputs == (names.PIXELS,) and 0 <= record.fixed < record.tokens
+        fits = fits and sorted(part.inputs) == sorted((names.PIXELS, names.INDEX, *record.kept))
+        renewed = tuple(map(names.renewed_name, record.kept))
         if not fits or part.outputs[len(frame.outputs) :] != renewed or set(rows) != {(record.tokens,)}:
             fields["tokens"].members()[name].fail("what the pieces of its tokens read and give")
 
@@ -281,22 +266,22 @@ def _require_alone(value: Value, files: Iterable[str], uses: Mapping[str, int]) 
 
 
 def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value, uses: Mapping[str, int]) -> None:
-    blocks = set(map(block_name, range(len(manifest.blocks))))
-    known = {piece for piece in manifest.pieces if part_of(piece) is not None} | blocks
+    blocks = set(map(names.block_name, range(len(manifest.blocks))))
+    known = {piece for piece in manifest.pieces if names.part_of(piece) is not None} | blocks
     models = set(record.models)
     if not models or not models <= known:
         value.fail(f"models of some of {', '.join(sorted(known))} and of nothing else")
-    if (all_blocks := set(OF_ALL_BLOCKS) & models) and not blocks & models:
+    if (all_blocks := set(names.OF_ALL_BLOCKS) & models) and not blocks & models:
         value.fail(f"models of some blocks beside {' and '.join(sorted(all_blocks))}")
-    if blocks & models and len(all_blocks) < len(OF_ALL_BLOCKS):
-        value.fail(f"models called {' and '.join(OF_ALL_BLOCKS)} too")
-    if not set(record.asked) <= {part_of(piece) for piece in known} - {part_of(piece) for piece in models}:
+    if blocks & models and len(all_blocks) < len(names.OF_ALL_BLOCKS):
+        value.fail(f"models called {' and '.join(names.OF_ALL_BLOCKS)} too")
+    if not set(record.asked) <= {names.part_of(piece) for piece in known} - {names.part_of(piece) for piece in models}:
         value.fail("parts of the policy that none of its models belongs to, as those that stay fp32")
     _require_alone(value, (record.weights, *record.models.values()), uses)
 
 
 def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value, uses: Mapping[str, int]) -> None:
-    known = {*map(block_name, range(len(manifest.blocks))), *OF_ALL_BLOCKS}
+    known = {*map(names.block_name, range(len(manifest.blocks))), *names.OF_ALL_BLOCKS}
     if set(record.models) != known:
         value.fail(f"a model of each of {', '.join(sorted(known))}")
     other = manifest.precision

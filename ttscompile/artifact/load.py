@@ -20,20 +20,8 @@ from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
 from ..core.spec import BF16, FP16, FP32, INT8
 from ..errors import ArtifactError, IllegalPlanError
+from ..ir import pieces as names
 from ..ir.graph import Graph
-from ..ir.pieces import (
-    BLOCKS,
-    CONDITION,
-    FRAMES,
-    PRUNER,
-    STEM,
-    STEP,
-    TAIL,
-    LoopPiece,
-    block_name,
-    frame_pieces,
-    of_loop,
-)
 from ..ir.program import Binding, Pieces
 from . import tensors
 from .archive import Unpacked, is_checkpoint, unpack
@@ -91,15 +79,15 @@ class Artifact:
         return self._folder.files
 
     @contextmanager
-    def reading(self, *names: str) -> Iterator[None]:
+    def reading(self, *given: str) -> Iterator[None]:
         """Within the block these files, in ``files``, are those that were checked.
 
         Raises:
             ArtifactChangedError: a file was changed or replaced since it was checked.
         """
-        names = names or tuple(self.manifest.files)
-        with self._folder.unchanged(names) as now:
-            for name in names:
+        wanted = given or tuple(self.manifest.files)
+        with self._folder.unchanged(wanted) as now:
+            for name in wanted:
                 if now[name] == self._stamps.get(name):
                     continue
                 try:
@@ -137,7 +125,7 @@ class Artifact:
             return self.plans[own]
         if name not in self._derived:
             record, plan = self.manifest.precision, self.plans[own].exact
-            held = record.kept if precision == INT8 and record is not None else (BLOCKS,)
+            held = record.kept if precision == INT8 and record is not None else (names.BLOCKS,)
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(held, precision))
             self._derived[name] = replace(plan)  # another object than the one in fp32 may be
         return self._derived[name]
@@ -163,7 +151,7 @@ class Artifact:
         Raises:
             ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
         """
-        graphs, own = {}, {of_loop(PRUNER, loop): one for loop, one in self.loop_pruners.items()}
+        graphs, own = {}, {names.of_loop(names.PRUNER, loop): one for loop, one in self.loop_pruners.items()}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)
             constants, stored = graphs[name].constants, own.get(name, {**self.pruner, **self.weights})
@@ -182,24 +170,24 @@ class Artifact:
         """The pieces as the reference runtime executes them. Raises ArtifactError: see ``graphs``."""
         streams = self._document.keys("graphs", "streams")["streams"].members()
 
-        def inside(name: str) -> LoopPiece:
+        def inside(name: str) -> names.LoopPiece:
             graph = self.graph(name)
             if name not in streams:
                 raise ArtifactError(f"{self.path}: has no stream of {name!r}; it has {list(streams)}. {REMEDY}")
-            return LoopPiece(graph, streams[name].text(*graph.inputs))
+            return names.LoopPiece(graph, streams[name].text(*graph.inputs))
 
         return Pieces(
-            stem=inside(STEM),
-            blocks=tuple(inside(block_name(b)) for b in range(len(self.manifest.blocks))),
-            tail=inside(TAIL),
-            condition=self.graph(CONDITION),
-            step=self.graphs.get(STEP),
-            pruner=self.graphs.get(PRUNER),
+            stem=inside(names.STEM),
+            blocks=tuple(inside(names.block_name(b)) for b in range(len(self.manifest.blocks))),
+            tail=inside(names.TAIL),
+            condition=self.graph(names.CONDITION),
+            step=self.graphs.get(names.STEP),
+            pruner=self.graphs.get(names.PRUNER),
             tables=self.tables,
             bindings={name: context.binding for name, context in self.manifest.contexts.items()},
             features=self.manifest.features,
-            frames=self.graphs.get(FRAMES),
-            towers=tuple(self.graph(name) for name in frame_pieces(self.graphs)),
+            frames=self.graphs.get(names.FRAMES),
+            towers=tuple(self.graph(name) for name in names.frame_pieces(self.graphs)),
         )
 
 

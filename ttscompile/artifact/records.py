@@ -143,11 +143,9 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
             continue
         if not PLAN_NAME.holds(name):
             raise ArtifactError(f"plan {name!r}: expected {PLAN_NAME.expected}.")
-        otherwise = None
-        if plan.otherwise is not None:
-            otherwise = next((other for other, one in plans.items() if one is plan.otherwise), None)
-            if otherwise is None:
-                raise ArtifactError(f"plan {name!r}: its plan for calls without a chunk is none of {sorted(plans)}.")
+        otherwise = next((other for other, one in plans.items() if one is plan.otherwise), None)
+        if otherwise is None and plan.otherwise is not None:
+            raise ArtifactError(f"plan {name!r}: its plan for calls without a chunk is none of {sorted(plans)}.")
         fields = {
             "loop": plan.loop,
             "weights": plan.weights,

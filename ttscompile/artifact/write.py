@@ -20,33 +20,13 @@ from ..ir.pieces import ADVANCE, PRUNER, of_loop
 from ..ir.program import Binding, Program
 from ..ir.verify import verify_pieces
 from ..measure.versions import VERSION
-from . import records, tensors
+from . import files, records, stores, tensors
 from .bind import LoweredPieces, Place, bind, places_of, store_pieces
 from .codec import decode, encode, identities
-from .files import (
-    PARTIAL,
-    describe,
-    lock_folder,
-    new_folder,
-    recover,
-    replace_file,
-    replace_folder,
-    sync_directory,
-    write_synced,
-)
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import Artifact, load_artifact, read_manifest, require_artifact_path, table_prefix
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, StartRecord, Stores, abbreviated
-from .stores import (
-    BlockWeights,
-    plan_arrays_of,
-    pruner_name,
-    store_arrays,
-    store_pruner,
-    store_weights,
-    without_weights,
-)
 from .strict_json import dump_compact
 
 if TYPE_CHECKING:
@@ -58,7 +38,7 @@ GOLDEN = "golden.safetensors"
 
 _STALE = re.compile(
     rf"(pruner-[0-9a-f]+\.(onnx|safetensors)|(golden_)?plans-[0-9a-f]+\.safetensors"
-    rf"|(blocks|distilled)-[0-9a-f]+-[A-Za-z0-9_]+\.(onnx|safetensors)|\..+{re.escape(PARTIAL)})"
+    rf"|(blocks|distilled)-[0-9a-f]+-[A-Za-z0-9_]+\.(onnx|safetensors)|\..+{re.escape(files.PARTIAL)})"
 )
 BESIDE = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
 """Files for LeRobot that may stand in an artifact. Nothing here reads them, the manifest does not list them, and no
@@ -102,14 +82,14 @@ def write_artifact(
     require_replaceable(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        recover(target)
-        with locked(target) if target.is_dir() else nullcontext(), new_folder(target) as partial:
+        files.recover(target)
+        with locked(target) if target.is_dir() else nullcontext(), files.new_folder(target) as partial:
             manifest = _fill(partial, program, models, lowered, golden, loop)
             for name, content in (beside or {}).items():
                 assert name in BESIDE
-                write_synced(partial / name, content)
-            sync_directory(partial)
-            replace_folder(partial, target)
+                files.write_synced(partial / name, content)
+            files.sync_directory(partial)
+            files.replace_folder(partial, target)
     except OSError as error:
         raise ArtifactError(
             f"{target}: the artifact cannot be written: {error}. What was there is unharmed."
@@ -125,7 +105,7 @@ def update_plans(
     *,
     pruner_weights: Mapping[str, npt.NDArray[Any]] | None = None,
     pruner_loop: str = ORIGINAL,
-    weights: Mapping[str, BlockWeights] | None = None,
+    weights: Mapping[str, stores.BlockWeights] | None = None,
     starts: Mapping[str, StartRecord] | None = None,
     envelope: Envelope | None = None,
     model_identity: str | None = None,
@@ -173,33 +153,28 @@ def update_plans(
             if default_plan not in {DENSE, *manifest.plans}:
                 raise ArtifactError(f"default plan {default_plan!r}: expected one of {[DENSE, *manifest.plans]}.")
             manifest = replace(manifest, default_plan=default_plan, calibration=told)
-            manifest = store_arrays(
-                directory, manifest, "plans", plan_arrays_of(manifest, plans, envelope or artifact.envelope)
+            manifest = stores.store_arrays(
+                directory, manifest, "plans", stores.plan_arrays_of(manifest, plans, envelope or artifact.envelope)
             )
+            trained = {**artifact.block_weights, **{name: own.weights for name, own in (weights or {}).items()}}
             pruners = dict[str, Mapping[str, npt.NDArray[Any]]]()
             if pruner_weights is not None:
                 own = pruner_loop if pruner_loop in manifest.loop_pruners else ORIGINAL
-                manifest = store_pruner(artifact, manifest, pruner_weights, own)
+                manifest = stores.store_pruner(artifact, manifest, pruner_weights, own)
                 pruners[own] = pruner_weights
             after = replace(
                 artifact,
-                block_weights={
-                    name: (weights or {})[name].weights if name in (weights or {}) else artifact.block_weights[name]
-                    for name in manifest.weights
-                },
+                block_weights={name: trained[name] for name in manifest.weights},
                 manifest=manifest,
-                plans={
-                    DENSE: artifact.plans[DENSE],
-                    **{name: replace(plans[name], repair=True) for name in manifest.plans},
-                },
+                plans={DENSE: artifact.plans[DENSE], **{n: replace(plans[n], repair=True) for n in manifest.plans}},
                 pruner=pruners.pop(ORIGINAL, artifact.pruner),
                 loop_pruners={**artifact.loop_pruners, **pruners},
             )
-            manifest = store_arrays(
+            manifest = stores.store_arrays(
                 directory, manifest, "golden_plans", {} if golden is None else plan_arrays(golden(after))
             )
             manifest, content = finished(manifest)
-            replace_file(directory / MANIFEST, content)
+            files.replace_file(directory / MANIFEST, content)
         except OSError as error:
             raise ArtifactError(
                 f"{directory}: cannot be updated: {error}. It has its old plans or the new ones, whole."
@@ -212,15 +187,15 @@ def update_plans(
 def _store_named(
     artifact: Artifact,
     plans: Mapping[str, Plan],
-    weights: Mapping[str, BlockWeights],
+    weights: Mapping[str, stores.BlockWeights],
     starts: Mapping[str, StartRecord],
 ) -> Manifest:
     """The manifest with the weights and starts that plans name, and no others."""
     manifest, loops = artifact.manifest, {plan.loop for plan in plans.values()}
     named = {plan.weights for plan in plans.values()}
-    manifest = without_weights(manifest, named - set(weights))
+    manifest = stores.without_weights(manifest, named - set(weights))
     for name, own in weights.items():
-        manifest = store_weights(artifact, manifest, name, own)
+        manifest = stores.store_weights(artifact, manifest, name, own)
     return replace(manifest, starts={n: one for n, one in {**manifest.starts, **starts}.items() if n in loops})
 
 
@@ -240,7 +215,7 @@ def _fill(
     requires = records.requirements(models)
     # The names of loops need not be names of files.
     numbered = {of_loop(ADVANCE, of): f"{ADVANCE}_{i:02d}" for i, of in enumerate(program.spec.loops, start=1)}
-    files = {name: f"{numbered.get(name, name)}.onnx" for name in models}
+    onnx_files = {name: f"{numbered.get(name, name)}.onnx" for name in models}
 
     pruner = {name: value for name, value in values.items() if name.startswith(records.PRUNER_PREFIX)}
     stored = {name: value for name, value in values.items() if name not in pruner}
@@ -254,27 +229,27 @@ def _fill(
     further = {of_loop(PRUNER, loop): program.loop_weights[loop] for loop in program.pieces.loop_pruners}
     for piece, constants in {**own, **further}.items():
         content = tensors.serialize(constants)
-        name = pruner_name(piece, content)
-        pruner_files[piece], files[piece] = f"{name}.safetensors", f"{name}.onnx"
-        write_synced(folder / pruner_files[piece], content)
+        name = stores.pruner_name(piece, content)
+        pruner_files[piece], onnx_files[piece] = f"{name}.safetensors", f"{name}.onnx"
+        files.write_synced(folder / pruner_files[piece], content)
         pruner_places[piece] = places_of(folder / pruner_files[piece], constants)
 
-    pieces = records.piece_records(program, models, files)
+    pieces = records.piece_records(program, models, onnx_files)
     for name in pieces:
-        write_synced(folder / files[name], bind(models[name], places | pruner_places.get(name, {}), name))
+        files.write_synced(folder / onnx_files[name], bind(models[name], places | pruner_places.get(name, {}), name))
     precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
     plans = dict[str, PlanRecord]()
     if precision is not None or loop != ORIGINAL:
         held = {} if precision is None else dict.fromkeys(precision.kept, precision.name)
         plans[FULL] = PlanRecord("all", loop=loop, precision=held)
     if golden is not None:
-        write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
+        files.write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
     graphs |= {of_loop(PRUNER, loop): graph for loop, graph in program.pieces.loop_pruners.items()}
     document = {
         "graphs": {name: graph_to_json(graph) for name, graph in graphs.items()},
         "streams": {name: piece.stream for name, piece in program.pieces.loop.items()},
     }
-    write_synced(folder / PROGRAM, dump_compact(document))
+    files.write_synced(folder / PROGRAM, dump_compact(document))
 
     manifest, content = finished(
         Manifest(
@@ -295,13 +270,13 @@ def _fill(
                 PROGRAM, WEIGHTS, pruner_files.pop(PRUNER, None), None, golden=None if golden is None else GOLDEN
             ),
             requires=requires,
-            files={path.name: describe(path) for path in sorted(folder.iterdir())},
+            files={path.name: files.describe(path) for path in sorted(folder.iterdir())},
             precision=precision,
             loop_pruners={loop: pruner_files[of_loop(PRUNER, loop)] for loop in program.pieces.loop_pruners},
             tokens=records.tokens_records(program),
         )
     )
-    write_synced(folder / MANIFEST, content)
+    files.write_synced(folder / MANIFEST, content)
     return manifest
 
 
@@ -351,7 +326,7 @@ def locked(directory: Path) -> Iterator[None]:
     """
     with ExitStack() as held:
         try:
-            held.enter_context(lock_folder(directory))
+            held.enter_context(files.lock_folder(directory))
         except BlockingIOError:
             raise ArtifactError(
                 f"{directory}: another process is changing the artifact: it calibrates it, or converts a checkpoint to"

@@ -114,9 +114,7 @@ class Evaluator:
         self._graph = graph
         self._device = torch.device(device)
         self._bound = any(isinstance(n, Batch) for t in graph.inputs.values() for n in t.shape)
-        self._slots: dict[str, int] = {}
-        for name in (*graph.inputs, *graph.constants):
-            self._slots[name] = len(self._slots)
+        self._slots = {name: slot for slot, name in enumerate((*graph.inputs, *graph.constants))}
         self._constants = [weights.get(name) for name in graph.constants]
         for (name, type_), value in zip(graph.constants.items(), self._constants, strict=True):
             if value is None:

@@ -200,7 +200,6 @@ def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wid
 
 
 def _wide(graph: Graph) -> Graph:
-
     def wide(type_: TensorType) -> TensorType:
         return replace(type_, dtype="float64") if type_.dtype == "float32" else type_
 

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from ..errors import CaptureError
-from .graph import GETITEM, Argument, Node, Ref, TensorType
+from .graph import GETITEM, Argument, Batch, Node, Ref, Size, TensorType
 
 Types: TypeAlias = Mapping[str, TensorType]
 
@@ -93,6 +93,32 @@ def axes_along(node: Node, rank: int) -> frozenset[int]:
     axes = node.args[row.along] if len(node.args) > row.along else dict(node.kwargs).get("dim", missing)
     several = axes if isinstance(axes, tuple) else (axes,)
     return frozenset(a % max(rank, 1) for a in several if isinstance(a, int)) or frozenset(range(rank))
+
+
+def axis_after(node: Node, axis: int, types: Types) -> int | None:
+    """Where an axis of its first argument is in the result of a node; None if it is mixed or cut, or nobody knows.
+
+    What lies along the axis is treated alike and each for itself, if no other argument differs along it.
+    """
+    row, before, after = operation(node.op), types[next(node.refs())].shape, node.type.shape
+    if row.movement is Movement.RESHAPE:
+        # It survives if the sizes before it, and itself, have the same product.
+        same = (a for a, n in enumerate(after) if n == before[axis] and _factors(after[:a]) == _factors(before[:axis]))
+        return next(same, None)
+    if row.movement is Movement.PERMUTE:
+        return permutation(node, len(before)).index(axis)
+    if row.mixes is not None:
+        mixed = row.mixes(node, types)
+        return None if mixed is None or axis >= len(before) - mixed else axis
+    if row.along is not None and axis not in (along := axes_along(node, len(before))):
+        return axis - (len(after) < len(before) and min(along) < axis)  # select and unbind take their axis away
+    return axis if node.op == GETITEM else None
+
+
+def _factors(shape: Sequence[Size]) -> tuple[int, int]:
+    """Numbers and batches in a product of sizes."""
+    numbers = math.prod(n.multiple if isinstance(n, Batch) else n for n in shape)
+    return numbers, sum(isinstance(n, Batch) for n in shape)
 
 
 def permutation(node: Node, rank: int) -> list[int]:

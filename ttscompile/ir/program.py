@@ -139,21 +139,17 @@ class Pieces(Loop):
 
 def mapped(record: Value, function: Callable[[Graph], Graph]) -> Value:
     """A record of this module with another graph in place of each that it holds, of the same inputs and outputs."""
-    return cast(Value, _mapped(record, function))
-
-
-def _mapped(value: Any, function: Callable[[Graph], Graph]) -> Any:
-    match value:
+    made: Any = record
+    match made:
         case Graph():
-            return function(value)
+            made = function(made)
         case LoopPiece() | Loop() | Phase():
-            own = {each.name: getattr(value, each.name) for each in fields(value)}
-            return replace(value, **{name: _mapped(one, function) for name, one in own.items()})
+            made = replace(made, **{each.name: mapped(getattr(made, each.name), function) for each in fields(made)})
         case tuple():
-            return tuple(_mapped(one, function) for one in value)
+            made = tuple(mapped(one, function) for one in made)
         case Mapping():
-            return {name: _mapped(one, function) for name, one in value.items()}
-    return value
+            made = {name: mapped(one, function) for name, one in made.items()}
+    return cast(Value, made)
 
 
 def frame_values(

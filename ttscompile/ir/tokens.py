@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -13,8 +12,8 @@ import torch
 from .dataflow import reachable_from
 from .evaluate import evaluator
 from .flops import graph_flops, node_flops
-from .graph import GETITEM, Argument, Graph, Node, Ref, TensorType, backward_slice
-from .operations import Movement, axes_along, operation, permutation
+from .graph import Argument, Graph, Node, Ref, TensorType, backward_slice
+from .operations import axis_after, operation
 
 LEAST_TOKENS = 16
 """Of a tower: with fewer there is hardly a part of them to compute."""
@@ -153,31 +152,14 @@ def _axes(tower: Graph, entry: str, tokens: int) -> dict[str, int]:
 
 def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Mapping[str, TensorType]) -> int | None:
     """The axis of tokens in what a node gives; None if it brings tokens together, or nobody knows."""
-    row, rank = operation(node.op), len(types[read[0]].shape)
-    axis, result = axes[read[0]], node.type.shape
+    result = node.type.shape
     if node.op == ATTENTION:
         plain = len(read) == 3 and all(value in (None, 0.0, False) for value in node.args[3:])
         inner = all(axes[name] == len(types[name].shape) - 2 for name in read)
         known = {name for name, _ in node.kwargs} <= {"scale"}
         return len(result) - 2 if plain and inner and known else None
-    if row.elementwise:
+    if operation(node.op).elementwise:
         behind = {len(types[name].shape) - axes[name] for name in read}
         return len(result) - behind.pop() if len(behind) == 1 else None
-    if read != list(node.refs())[:1]:
-        return None  # the token's own row is to be the first factor, and nothing else
-    if row.movement is Movement.RESHAPE:
-        before = math.prod(types[read[0]].at(1)[:axis])
-        sizes = node.type.at(1)
-        places = [
-            a for a in range(len(sizes)) if math.prod(sizes[:a]) == before and sizes[a] == types[read[0]].shape[axis]
-        ]
-        return places[0] if places else None
-    if row.movement is Movement.PERMUTE:
-        return permutation(node, rank).index(axis)
-    if row.mixes is not None and (mixed := row.mixes(node, types)) is not None:
-        return axis if axis < rank - mixed else None
-    if node.op == GETITEM:
-        return axis
-    if row.along is not None and axis not in (along := axes_along(node, rank)):
-        return axis - (len(result) < rank and min(along) < axis)  # select and unbind take their axis away
-    return None
+    # The token's own row is to be the first factor, and nothing else.
+    return axis_after(node, axes[read[0]], types) if read == list(node.refs())[:1] else None

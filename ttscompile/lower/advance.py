@@ -12,32 +12,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..core.correction import HISTORY as HISTORY_ENTRIES
-from ..core.correction import groups_of
+from ..core.correction import HISTORY, groups_of
 from ..core.spec import PolicySpec
 from ..core.update import clips, columns, rows
 from ..errors import LoweringError
+from ..ir import pieces as names
 from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
-from ..ir.pieces import (
-    ADVANCE,
-    HISTORY,
-    MEMORY,
-    MEMORY_NEXT,
-    OFFSET,
-    PREDICTION,
-    SAMPLE,
-    SAMPLE_NEXT,
-    STEM,
-    STREAM,
-    STREAM_NEXT,
-    TAIL,
-    UPDATE,
-    X0_COLUMNS,
-    LoopPiece,
-    advance_context,
-    advance_outputs,
-    of_loop,
-)
 from ..ir.program import Program
 
 
@@ -45,11 +25,11 @@ def advances(program: Program) -> dict[str, Graph]:
     """``advance`` of the original loop, and ``advance@NAME`` of each further loop whose own is another graph."""
     pieces, spec = program.pieces, program.spec
     own = fuse_advance(pieces.tail, pieces.stem, spec)
-    others = {of_loop(ADVANCE, name): fuse_advance(pieces.tail, pieces.stem, spec.in_loop(name)) for name in spec.loops}
-    return {ADVANCE: own, **{name: graph for name, graph in others.items() if graph != own}}
+    others = {n: fuse_advance(pieces.tail, pieces.stem, spec.in_loop(n)) for n in spec.loops}
+    return {names.ADVANCE: own, **{names.of_loop(names.ADVANCE, n): one for n, one in others.items() if one != own}}
 
 
-def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
+def fuse_advance(tail: names.LoopPiece, stem: names.LoopPiece, spec: PolicySpec) -> Graph:
     """Concatenate tail, sampler update and stem.
 
     The update is that of ``core.update``, with what belongs to the step as inputs. A term of the denoised sample
@@ -70,23 +50,24 @@ def fuse_advance(tail: LoopPiece, stem: LoopPiece, spec: PolicySpec) -> Graph:
     Raises:
         LoweringError: a constant of the program has the name of one of these inputs.
     """
-    inputs = {STREAM: tail.type, **_update_types(spec)}
-    for name, piece in ((TAIL, tail), (STEM, stem)):
-        inputs |= {advance_context(name, context): type_ for context, type_ in piece.contexts.items()}
+    inputs = {names.STREAM: tail.type, **_update_types(spec)}
+    for name, piece in ((names.TAIL, tail), (names.STEM, stem)):
+        inputs |= {names.advance_context(name, context): type_ for context, type_ in piece.contexts.items()}
     constants = {**tail.graph.constants, **stem.graph.constants}
-    results = advance_outputs(spec.sampler)
+    results = names.advance_outputs(spec.sampler)
     if clash := sorted(constants.keys() & {*inputs, *results}):
         what = f"the module has weights called {clash}, which are names of the compiled loop's own values"
         raise LoweringError(f"{what}. Rename these parameters or buffers in the module.")
     taken = {*inputs, *constants, *results}
-    nodes, prediction = _moved(tail, TAIL, STREAM, taken)
-    turned = inputs[SAMPLE]
-    nodes.append(Node(PREDICTION, "aten.permute.default", (Ref(prediction), (2, 0, 1)), (), (turned,)))
+    nodes, prediction = _moved(tail, names.TAIL, names.STREAM, taken)
+    turned = inputs[names.SAMPLE]
+    nodes.append(Node(names.PREDICTION, "aten.permute.default", (Ref(prediction), (2, 0, 1)), (), (turned,)))
     nodes += _update(taken, turned, spec)
     following = _fresh("stem.sample", taken)
-    nodes.append(Node(following, "aten.permute.default", (Ref(SAMPLE_NEXT), (1, 2, 0)), (), (stem.type,)))
-    more, stream = _moved(stem, STEM, following, taken)
-    nodes += [*more, Node(STREAM_NEXT, "aten.clone.default", (Ref(stream),), (), (stem.graph.types()[stem.result],))]
+    nodes.append(Node(following, "aten.permute.default", (Ref(names.SAMPLE_NEXT), (1, 2, 0)), (), (stem.type,)))
+    more, stream = _moved(stem, names.STEM, following, taken)
+    made = stem.graph.types()[stem.result]
+    nodes += [*more, Node(names.STREAM_NEXT, "aten.clone.default", (Ref(stream),), (), (made,))]
     return Graph(inputs, constants, tuple(nodes), results)
 
 
@@ -95,21 +76,21 @@ def _update_types(spec: PolicySpec) -> dict[str, TensorType]:
     sample = TensorType((dimensions, Batch(), horizon), "float32")
     update = (groups_of(sampler.steps, spec.sample), rows(sampler, horizon), columns(sampler, horizon))
     types = {
-        SAMPLE: sample,
-        OFFSET: sample,
-        HISTORY: TensorType((dimensions, Batch(), HISTORY_ENTRIES * horizon), "float32"),
-        UPDATE: TensorType(update, "float32"),
-        **dict.fromkeys(X0_COLUMNS, TensorType((1,), "float32")),
+        names.SAMPLE: sample,
+        names.OFFSET: sample,
+        names.HISTORY: TensorType((dimensions, Batch(), HISTORY * horizon), "float32"),
+        names.UPDATE: TensorType(update, "float32"),
+        **dict.fromkeys(names.X0_COLUMNS, TensorType((1,), "float32")),
     }
     if sampler.memories:
-        types[MEMORY] = TensorType((dimensions, Batch(), sampler.memories * horizon), "float32")
+        types[names.MEMORY] = TensorType((dimensions, Batch(), sampler.memories * horizon), "float32")
     return types
 
 
-def _moved(piece: LoopPiece, prefix: str, stream: str, taken: set[str]) -> tuple[list[Node], str]:
+def _moved(piece: names.LoopPiece, prefix: str, stream: str, taken: set[str]) -> tuple[list[Node], str]:
     """The nodes of a piece under new names, reading ``stream``; and the new name of its result."""
     renamed = {name: name for name in piece.graph.constants} | {piece.stream: stream}
-    renamed |= {name: advance_context(prefix, name) for name in piece.contexts}
+    renamed |= {name: names.advance_context(prefix, name) for name in piece.contexts}
     renamed |= {node.name: _fresh(f"{prefix}.{node.name}", taken) for node in piece.graph.nodes}
     return list(piece.graph.renamed(renamed).nodes), renamed[piece.result]
 
@@ -126,26 +107,26 @@ def _update(taken: set[str], turned: TensorType, spec: PolicySpec) -> list[Node]
         nodes.append(Node(_fresh(name, taken), op, args, (), of_size(size)))
         return nodes[-1].name
 
-    parts = [SAMPLE, PREDICTION, HISTORY]
+    parts = [names.SAMPLE, names.PREDICTION, names.HISTORY]
     if clips(sampler):  # what the prediction says of the sample without noise
         assert sampler.clip is not None
         terms = [
             write("update.term", "aten.mul.Tensor", (Ref(value), Ref(column)))
-            for column, value in zip(X0_COLUMNS, (SAMPLE, PREDICTION), strict=True)
+            for column, value in zip(names.X0_COLUMNS, (names.SAMPLE, names.PREDICTION), strict=True)
             if getattr(sampler, column).any()
         ]
         total = terms[0] if len(terms) == 1 else write("update.sum", "aten.add.Tensor", tuple(map(Ref, terms)))
         parts.append(write("update.denoised", "aten.clamp.default", (Ref(total), -sampler.clip, sampler.clip)))
     if sampler.memories:
-        parts.append(MEMORY)
+        parts.append(names.MEMORY)
     read, made = rows(sampler, horizon), columns(sampler, horizon)
     features = write("update.features", "aten.cat.default", (tuple(map(Ref, parts)), 2), read)
-    product = write("update.product", "aten.matmul.default", (Ref(features), Ref(UPDATE)), made)
+    product = write("update.product", "aten.matmul.default", (Ref(features), Ref(names.UPDATE)), made)
     if sampler.memories:
         cut = (Ref(product), 2, horizon, made)
-        nodes.append(Node(MEMORY_NEXT, "aten.slice.Tensor", cut, (), of_size(made - horizon)))
+        nodes.append(Node(names.MEMORY_NEXT, "aten.slice.Tensor", cut, (), of_size(made - horizon)))
         product = write("update.sample", "aten.slice.Tensor", (Ref(product), 2, 0, horizon))
-    return [*nodes, Node(SAMPLE_NEXT, "aten.add.Tensor", (Ref(product), Ref(OFFSET)), (), (turned,))]
+    return [*nodes, Node(names.SAMPLE_NEXT, "aten.add.Tensor", (Ref(product), Ref(names.OFFSET)), (), (turned,))]
 
 
 def _fresh(name: str, taken: set[str]) -> str:

@@ -130,8 +130,7 @@ class StreamContexts:
         if all(isinstance(n, int) for n in type_.shape):
             return value
         if name not in self._conditions:
-            gathered = self._w.op("Gather", value, self._members, axis=_batch_axis(name, type_))
-            self._conditions[name] = gathered
+            self._conditions[name] = self._w.op("Gather", value, self._members, axis=_batch_axis(name, type_))
         return self._conditions[name]
 
 

@@ -23,21 +23,7 @@ import numpy as np
 from onnx import GraphProto, ModelProto
 
 from ..core.correction import INNER, MIDDLE, OUTER
-from ..ir.pieces import (
-    ADVANCE,
-    HISTORY,
-    MEMORY,
-    OFFSET,
-    SAMPLE,
-    STEM,
-    STREAM,
-    TAIL,
-    UPDATE,
-    X0_COLUMNS,
-    LoopPiece,
-    advance_context,
-    block_name,
-)
+from ..ir import pieces as names
 from ..ir.program import Program
 from .contexts import StreamContexts
 from .graph_writer import GraphWriter, Weights, sequence, tensor
@@ -130,10 +116,10 @@ class DenoisingLoop:
         """
         main = self._main
         self._plan, self._inputs = plan, inputs
-        columns = {name: getattr(self._sampler, name)[:, None] for name in X0_COLUMNS}
+        columns = {name: getattr(self._sampler, name)[:, None] for name in names.X0_COLUMNS}
         self._x0_columns = {name: main.constant(column, np.float32) for name, column in columns.items()}
         stem = self._feeds(main, self._pieces.stem, inputs.initial, main.constant(0))
-        (stream,) = main.inline(self._models[STEM], stem, self._weights)
+        (stream,) = main.inline(self._models[names.STEM], stem, self._weights)
         self._shape = main.op("Shape", stream)
         width = main.op("ReduceProd", self._shape, keepdims=1)
         self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
@@ -153,14 +139,9 @@ class DenoisingLoop:
         i, on, table, done = (w.fresh(n) for n in ("i", "on", "table", "done"))
         state = self._fresh_state(w)
         k = w.op("Gather", plan.steps, i)
-        step = _Step(
-            k=k,
-            computed=w.op("Gather", plan.computed, k),
-            position=w.op("Gather", plan.position, k),
-            in_step=w.op("Gather", plan.in_step, k),
-            first_row=w.op("Gather", plan.first_row, k),
-            sums=self._sums(w, k, table),
-        )
+        rows = (plan.computed, plan.position, plan.in_step, plan.first_row)
+        computed, position, in_step, first_row = (w.op("Gather", row, k) for row in rows)
+        step = _Step(k, computed, position, in_step, first_row, self._sums(w, k, table))
         value, made = state.stream, list[str]()
         starts = range(0, len(self._groups), GROUP)
         flags = _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts)))
@@ -226,7 +207,7 @@ class DenoisingLoop:
         w = self._main.inner()
         value, made = stream, list[str]()
         for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
-            block, reused = self._block(step, value, [*before, *made], b), self._reused(w, value, block_name(b))
+            block, reused = self._block(step, value, [*before, *made], b), self._reused(w, value, names.block_name(b))
             value, residual = w.choose(flag, block, reused)
             made.append(residual)
         return w.body(f"group_{members.start}", value, _joined(w, made))
@@ -237,7 +218,7 @@ class DenoisingLoop:
         gap = w.op("Gather", step.sums, w.op("Gather", step.position, w.constant(b)))
         value = w.op("Add", stream, w.op("Reshape", gap, self._shape))
         value = self._add_in_step(w, step, value, before, b)
-        name, piece = block_name(b), self._pieces.blocks[b]
+        name, piece = names.block_name(b), self._pieces.blocks[b]
         (residual,) = w.inline(self._models[name], self._feeds(w, piece, value, step.k), self._weights)
         value = w.op("Add", value, residual)
         return w.body(name, value, w.op("Reshape", residual, w.constant([1, -1])))
@@ -267,21 +248,21 @@ class DenoisingLoop:
         return w.choose(in_step, reads.body("in_step", added), plain.body("plain", same))[0]
 
     def _fresh_state(self, w: GraphWriter) -> _State:
-        memory = (w.fresh(MEMORY),) if self._sampler.memories else ()
+        memory = (w.fresh(names.MEMORY),) if self._sampler.memories else ()
         return _State(w.fresh("sample"), w.fresh("stream"), w.fresh("history"), memory)
 
     def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
-        by_step = {OFFSET: self._inputs.offset, UPDATE: self._inputs.update, **self._x0_columns}
-        feeds = {STREAM: state.stream, SAMPLE: state.sample, HISTORY: state.history}
-        feeds |= zip([MEMORY] * len(state.memory), state.memory, strict=True)
+        by_step = {names.OFFSET: self._inputs.offset, names.UPDATE: self._inputs.update, **self._x0_columns}
+        feeds = {names.STREAM: state.stream, names.SAMPLE: state.sample, names.HISTORY: state.history}
+        feeds |= zip([names.MEMORY] * len(state.memory), state.memory, strict=True)
         feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
         if self._inputs.jumps is not None:
-            feeds[OFFSET] = self._jumped(w, self._inputs.jumps, feeds[OFFSET], state.history, k)
-        for name, piece in ((TAIL, self._pieces.tail), (STEM, self._pieces.stem)):
+            feeds[names.OFFSET] = self._jumped(w, self._inputs.jumps, feeds[names.OFFSET], state.history, k)
+        for name, piece in ((names.TAIL, self._pieces.tail), (names.STEM, self._pieces.stem)):
             for context, type_ in piece.contexts.items():
-                at = k if name == TAIL else self._following(w, k)
-                feeds[advance_context(name, context)] = self._contexts.value(w, context, at, type_)
-        sample, stream, prediction, *memory = w.inline(self._models[ADVANCE], feeds, self._weights)
+                at = k if name == names.TAIL else self._following(w, k)
+                feeds[names.advance_context(name, context)] = self._contexts.value(w, context, at, type_)
+        sample, stream, prediction, *memory = w.inline(self._models[names.ADVANCE], feeds, self._weights)
         is_anchor = w.op("Gather", self._inputs.anchors, k)
         history = self._remembered(w, is_anchor, state.sample, prediction, state.history)
         return _State(sample, stream, history, tuple(memory))
@@ -322,7 +303,7 @@ class DenoisingLoop:
         """The next step; of the last one itself, whose stream nobody reads."""
         return w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
 
-    def _feeds(self, w: GraphWriter, piece: LoopPiece, stream: str, k: str) -> dict[str, str]:
+    def _feeds(self, w: GraphWriter, piece: names.LoopPiece, stream: str, k: str) -> dict[str, str]:
         """A value for each input of the stem or a block: the sample or stream, then contexts."""
         contexts = {name: self._contexts.value(w, name, k, type_) for name, type_ in piece.contexts.items()}
         return {piece.stream: stream, **contexts}

@@ -24,13 +24,7 @@ from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
-from .integer_convolution import (
-    DOMAIN,
-    DYNAMIC_PRODUCT,
-    INTEGER_PRODUCT,
-    integer_convolution,
-    shapes_of,
-)
+from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, integer_convolution, shapes_of
 from .onnx_model import live_nodes
 
 if TYPE_CHECKING:

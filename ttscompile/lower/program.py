@@ -1,15 +1,14 @@
 """Graphs to ONNX models, by torch's own exporter.
 
-A graph becomes an ``fx.GraphModule`` whose weights are *inputs*, so that the exporter can neither fold nor rename them;
-the exporter translates its operations, and ``name_model`` turns the weights' inputs into initializers without data.
+A graph becomes a module whose weights are *inputs*, so that the exporter can neither fold nor rename them; the exporter
+translates its operations, and ``name_model`` turns the weights' inputs into initializers without data.
 """
 
 from __future__ import annotations
 
 import logging
-import operator
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
@@ -20,8 +19,8 @@ import onnx
 import torch
 
 from ..errors import LoweringError
-from ..ir.evaluate import resolve_op, without_stack_traces
-from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
+from ..ir.evaluate import Evaluator, without_stack_traces
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ..ir.layers import layers_graph
 from ..ir.pieces import IDLE, LAYERS, PRUNER, TAIL, of_loop
 from ..ir.program import Program
@@ -144,62 +143,41 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
             sizes = [(axis, n.multiple) for axis, n in enumerate(type_.shape) if isinstance(n, Batch)]
             dynamic.append({axis: multiple * streams if multiple > 1 else streams for axis, multiple in sizes})
     with _quiet(), without_stack_traces(), torch.no_grad():
-        module, shapes = _build(graphs), tuple(dynamic)
-        program = torch.export.export(module, tuple(examples), dynamic_shapes=shapes, strict=False)
+        shapes = (tuple(dynamic),)
+        program = torch.export.export(_SideBySide(graphs), tuple(examples), dynamic_shapes=shapes, strict=False)
         result = torch.onnx.export(
-            program,
-            (),
-            dynamo=True,
-            opset_version=OPSET,
-            verbose=False,
-            custom_translation_table=dict(TRANSLATIONS),
+            program, (), dynamo=True, opset_version=OPSET, verbose=False, custom_translation_table=dict(TRANSLATIONS)
         )
     assert result is not None
     return result.model_proto
 
 
-def _build(graphs: list[Graph]) -> torch.fx.GraphModule:
-    """An fx module whose arguments are each graph's inputs and then its constants, graph after graph."""
-    fx_graph = torch.fx.Graph()
-    arguments: list[dict[str, torch.fx.Node]] = []
-    for i, graph in enumerate(graphs):
-        names = (*graph.inputs, *graph.constants)
-        arguments.append({name: fx_graph.placeholder(f"g{i}v{j}") for j, name in enumerate(names)})
-    results: list[torch.fx.Node] = []
-    for graph, values in zip(graphs, arguments, strict=True):
-        _inline(graph, fx_graph, values)
-        results += [values[name] for name in graph.outputs]
-    fx_graph.output(tuple(results))
-    return torch.fx.GraphModule(torch.nn.Module(), fx_graph)
+class _SideBySide(torch.nn.Module):
+    """Graphs as one module: its arguments are each graph's inputs and then its constants, graph after graph."""
+
+    def __init__(self, graphs: list[Graph]) -> None:
+        super().__init__()
+        self._runs = []
+        for graph in graphs:
+            types = graph.types()
+            nodes = tuple(replace(node, args=_without_symbols(node, types)) for node in graph.nodes)
+            given = {**graph.inputs, **graph.constants}
+            self._runs.append((given, Evaluator(replace(graph, inputs=given, constants={}, nodes=nodes), {})))
+
+    def forward(self, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        left, results = iter(values), list[torch.Tensor]()
+        for types, run in self._runs:
+            given = list(islice(left, len(types)))
+            results += run.run(given, _streams(types.values(), given))
+        return tuple(results)
 
 
-def _inline(graph: Graph, fx_graph: torch.fx.Graph, values: dict[str, torch.fx.Node]) -> None:
-    """Append the nodes of a graph; ``values`` has its inputs and constants, and gets the results."""
-    types = graph.types()
-    streams = _streams(graph, fx_graph, values)
-
-    def convert(argument: Argument) -> Any:
-        if isinstance(argument, Ref):
-            return values[argument.name]
-        if isinstance(argument, Batch):
-            multiple = argument.multiple
-            return streams if multiple == 1 else fx_graph.call_function(operator.mul, (streams, multiple))
-        if isinstance(argument, Enum):
-            return torch.device("cpu") if argument.kind == "device" else getattr(torch, argument.name)
-        return [convert(item) for item in argument] if isinstance(argument, tuple) else argument
-
-    for node in graph.nodes:
-        args = tuple(convert(a) for a in _without_symbols(node, types))
-        values[node.name] = fx_graph.call_function(resolve_op(node), args, {k: convert(a) for k, a in node.kwargs})
-
-
-def _streams(graph: Graph, fx_graph: torch.fx.Graph, values: dict[str, torch.fx.Node]) -> torch.fx.Node | int:
+def _streams(types: Iterable[TensorType], values: Iterable[torch.Tensor]) -> int:
     """The number of streams, read from the shape of an input; one if nothing depends on it."""
-    for name, type_ in graph.inputs.items():
+    for type_, value in zip(types, values, strict=True):
         for axis, size in enumerate(type_.shape):
             if isinstance(size, Batch):
-                node = fx_graph.call_function(torch.ops.aten.sym_size.int, (values[name], axis))
-                return node if size.multiple == 1 else fx_graph.call_function(operator.floordiv, (node, size.multiple))
+                return value.shape[axis] if size.multiple == 1 else value.shape[axis] // size.multiple
     return 1
 
 

@@ -54,23 +54,7 @@ from collections.abc import Mapping
 import numpy as np
 from onnx import ModelProto, ValueInfoProto, helper
 
-from ..core.correction import (
-    ANCHORS,
-    CORRECTION,
-    CORRECTION_BIAS,
-    FEATURES,
-    HIDDEN,
-    HISTORY,
-    INNER,
-    JUMPS,
-    MIDDLE,
-    OBSERVED,
-    OUTER,
-    READING,
-    may_jump,
-    no_correction,
-    numbers_of,
-)
+from ..core import correction
 from ..core.envelope import CENTER, ENVELOPE, FAR, PLAIN
 from ..core.lattice import Source
 from ..core.spec import ORIGINAL, PolicySpec
@@ -122,7 +106,7 @@ def lower_single_file(
     plans = write_executed_plans(main, "plan", "rollout_index", streams, lattice, pruner, far)
     update, plain = _update(main, spec)
     offset = _offset(main, spec, streams, condition, far)
-    history, memories = _zeros(main, spec, streams, HISTORY), spec.sampler.memories
+    history, memories = _zeros(main, spec, streams, correction.HISTORY), spec.sampler.memories
     memory = _zeros(main, spec, streams, memories) if memories else None
     count = main.op("Shape", "rollout_rows", start=0, end=1)
     rows = main.op("Concat", count, main.constant(residual_sizes(program)), axis=0)
@@ -132,12 +116,12 @@ def lower_single_file(
         offset=offset,
         update=update,
         plain=plain,
-        anchors=ANCHORS,
+        anchors=correction.ANCHORS,
         history=history,
         memory=memory,
         rows=rows,
         index=main.op("Transpose", "rollout_index", perm=[1, 2, 0]),
-        jumps=JUMPS if may_jump(spec.sample) else None,
+        jumps=correction.JUMPS if correction.may_jump(spec.sample) else None,
         condition=condition,
     )
     sample, *kept = write_streams(main, program, models, weights, contexts, plans, values, "rollout_keep")
@@ -180,7 +164,7 @@ def _offset(main: GraphWriter, spec: PolicySpec, streams: str, condition: str | 
     """What all steps add to the sample, ``[K, D, B, T]``; without a correction where a stream is far outside."""
     (horizon, dimensions), sampler = spec.sample, spec.sampler
     sizes = main.constant([sampler.steps, dimensions]), streams, main.constant([horizon])
-    offset = main.op("Expand", CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
+    offset = main.op("Expand", correction.CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
     if condition is not None:
         offset = main.op("Add", offset, _observed(main, spec, condition))
     of_stream = main.op("Reshape", far, main.constant([-1, 1]))
@@ -202,15 +186,16 @@ def _update(main: GraphWriter, spec: PolicySpec) -> tuple[str, str]:
     each = main.constant(np.eye(horizon)[:, None], np.float32)
     own = main.op("Mul", main.constant(places, np.float32), each)
     own = main.op("Reshape", own, main.constant([sampler.steps, 1, high, wide]))
-    pads = [0, 0, 0, 0, 0, 0, high - FEATURES * horizon, wide - horizon]  # the correction's weights are at the top left
-    return main.op("Add", main.op("Pad", CORRECTION, main.constant(pads)), own), own
+    # The correction's weights are at the top left.
+    pads = [0, 0, 0, 0, 0, 0, high - correction.FEATURES * horizon, wide - horizon]
+    return main.op("Add", main.op("Pad", correction.CORRECTION, main.constant(pads)), own), own
 
 
 def _observed(main: GraphWriter, spec: PolicySpec, condition: str) -> str:
     """``Correction.from_condition`` in ONNX: ``[K, D, B, T]`` of the condition's numbers ``[B, N]``."""
     (horizon, dimensions), steps = spec.sample, spec.sampler.steps
-    rows = main.op("Reshape", OBSERVED, main.constant([-1, steps * dimensions * horizon]))
-    added = main.op("MatMul", main.op("MatMul", condition, READING), rows)
+    rows = main.op("Reshape", correction.OBSERVED, main.constant([-1, steps * dimensions * horizon]))
+    added = main.op("MatMul", main.op("MatMul", condition, correction.READING), rows)
     split = main.op("Reshape", added, main.constant([-1, steps, dimensions, horizon]))
     return main.op("Transpose", split, perm=[1, 2, 0, 3])
 
@@ -263,13 +248,17 @@ def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tu
     inputs, outputs = _of_every_policy(program)
     if pieces.pruner is not None:
         inputs += _of_pruner(main, pieces.pruner, weights)
-    given = no_correction(spec.sampler.steps, spec.sample)
-    own = {ANCHORS: given.anchors, CORRECTION: given.weights, CORRECTION_BIAS: given.bias}
+    given = correction.no_correction(spec.sampler.steps, spec.sample)
+    own = {
+        correction.ANCHORS: given.anchors,
+        correction.CORRECTION: given.weights,
+        correction.CORRECTION_BIAS: given.bias,
+    }
     own[PLAIN] = np.zeros((spec.sampler.steps, len(program.blocks)), np.int8)
     inputs += [main.default(name, array) for name, array in own.items()]
     if numbers := condition_numbers(program):
         inputs += _of_condition(main, spec, numbers)
-    if may_jump(spec.sample):
+    if correction.may_jump(spec.sample):
         inputs += _of_jumps(main, spec, numbers)
     if clash := sorted(set(spec.observations) & {value.name for value in (*inputs, *outputs)}):
         what = f"the observations {clash} have names of the single file's own inputs or outputs"
@@ -280,7 +269,7 @@ def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tu
 def condition_numbers(program: Program) -> int:
     """N: how many numbers of one stream's condition a correction may read; 0 where there are too many."""
     types = program.pieces.condition.types()
-    return numbers_of(types[name].at(1) for name in program.pieces.features)
+    return correction.numbers_of(types[name].at(1) for name in program.pieces.features)
 
 
 def _of_every_policy(program: Program) -> tuple[Values, Values]:
@@ -317,19 +306,19 @@ def _of_pruner(main: GraphWriter, head: Graph, weights: Weights) -> Values:
 def _of_condition(main: GraphWriter, spec: PolicySpec, numbers: int) -> Values:
     """Those of a correction that reads N numbers of the condition; they read one that adds nothing by default."""
     (horizon, dimensions), steps = spec.sample, spec.sampler.steps
-    return [
-        main.default(ENVELOPE, np.zeros((numbers, 1), np.float32), [numbers, "E"]),
-        main.default(CENTER, np.zeros(1, np.float32), ["E"]),
-        main.default(READING, np.zeros((numbers, 1), np.float32), [numbers, "F"]),
-        main.default(
-            OBSERVED, np.zeros((1, steps, dimensions, horizon), np.float32), ["F", steps, dimensions, horizon]
-        ),
-    ]
+    shapes: dict[str, list[int | str]] = {ENVELOPE: [numbers, "E"], CENTER: ["E"]}
+    shapes |= {correction.READING: [numbers, "F"], correction.OBSERVED: ["F", steps, dimensions, horizon]}
+    zeros = {name: [1 if isinstance(n, str) else n for n in shape] for name, shape in shapes.items()}
+    return [main.default(name, np.zeros(zeros[name], np.float32), shape) for name, shape in shapes.items()]
 
 
 def _of_jumps(main: GraphWriter, spec: PolicySpec, numbers: int) -> Values:
     """Those of jumps that read N numbers of the condition; by default there are none."""
     steps, chunk = spec.sampler.steps, math.prod(spec.sample)
-    layers = {INNER: (numbers + HISTORY * chunk + 1, HIDDEN), MIDDLE: (HIDDEN + 1, HIDDEN), OUTER: (HIDDEN + 1, chunk)}
-    inputs = [main.default(JUMPS, np.full(steps, -1, np.int64))]
+    layers = {
+        correction.INNER: (numbers + correction.HISTORY * chunk + 1, correction.HIDDEN),
+        correction.MIDDLE: (correction.HIDDEN + 1, correction.HIDDEN),
+        correction.OUTER: (correction.HIDDEN + 1, chunk),
+    }
+    inputs = [main.default(correction.JUMPS, np.full(steps, -1, np.int64))]
     return inputs + [main.default(n, np.zeros((1, *shape), np.float32), ["J", *shape]) for n, shape in layers.items()]

@@ -90,14 +90,11 @@ def write_streams(
 
 def _uncorrected(w: GraphWriter, inputs: LoopInputs, far: str) -> LoopInputs:
     """Without the matrices and jumps of a correction where streams are far outside; offsets are without already."""
-    jumps = inputs.jumps
-    if jumps is not None:
-        jumps = w.op("Where", far, w.constant(-1), jumps)
+    jumps = None if inputs.jumps is None else w.op("Where", far, w.constant(-1), inputs.jumps)
     return replace(inputs, update=w.op("Where", far, inputs.plain, inputs.update), jumps=jumps)
 
 
 def _of_members(w: GraphWriter, inputs: LoopInputs, members: str) -> LoopInputs:
-
     def of(value: str, axis: int) -> str:
         return w.op("Gather", value, members, axis=axis)
 

@@ -32,12 +32,7 @@ def _sizes(value: ir.Value) -> list[int]:
 
 
 def group_norm(
-    input: Any,
-    num_groups: int,
-    weight: Any = None,
-    bias: Any = None,
-    eps: float = 1e-5,
-    cudnn_enabled: bool = True,
+    input: Any, num_groups: int, weight: Any = None, bias: Any = None, eps: float = 1e-5, cudnn_enabled: bool = True
 ) -> Any:
     """``aten.group_norm`` by InstanceNormalization, of which each group is a channel."""
     channels, *inner = _sizes(input)
