@@ -10,9 +10,8 @@ from typing import Any
 
 from .artifact.load import load_artifact, read_manifest
 from .calibration.budget import SPARSITY, Goal
-from .calibration.pipeline import calibrate
+from .calibration.pipeline import CalibrationResult, calibrate
 from .calibration.proposer import LOOPS, Request, rows_of
-from .calibration.result import CalibrationResult
 from .calibration.state import FILE as STATE
 from .core.spec import INT8
 from .driver import Explain, convert

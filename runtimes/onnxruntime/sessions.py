@@ -36,6 +36,7 @@ from ttscompile.ir.graph import TensorType
 from ttscompile.ir.joint import Joint, join
 from ttscompile.ir.pieces import (
     ADVANCE,
+    CONDITION,
     DENSE_STEP,
     IDLE,
     JOINT,
@@ -44,6 +45,7 @@ from ttscompile.ir.pieces import (
     PRUNER,
     RESIDUAL,
     STEM,
+    STEP,
     STREAM,
     block_name,
     is_of_loop,
@@ -52,6 +54,7 @@ from ttscompile.ir.pieces import (
     renewed_name,
 )
 from ttscompile.measure.machine import has_integer_dot_product
+from ttscompile.runtimes.contexts import ContextValues
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -364,6 +367,18 @@ def _failed(error: Exception) -> ArtifactError:
     )
 
 
-def repeat_streams(array: Array, axis: int | None, streams: int) -> Array:
-    """A contiguous copy with an axis of size 1 repeated to the number of streams; no axis, no repetition."""
-    return array.copy() if axis is None else np.repeat(array, streams, axis=axis)
+def run_prologue(
+    sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], obs: Mapping[str, Array], contexts: ContextValues
+) -> None:
+    """Keep what the normalised observations ``[B, ...]`` decide before the loop.
+
+    Raises:
+        ArtifactError: the graphs do not do what the manifest says.
+    """
+    condition, step = pieces[CONDITION], pieces.get(STEP)
+    if condition.outputs:
+        feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}
+        contexts.keep(run_named(sessions[CONDITION], condition.outputs, feed).items())
+    if step is not None:
+        feed = dict(zip(step.inputs, contexts.for_step_piece(step.inputs), strict=True))
+        contexts.keep_steps(run_named(sessions[STEP], step.outputs, feed).items())

@@ -19,13 +19,13 @@ from ttscompile.core.correction import HISTORY, Correction, no_correction, remem
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
 from ttscompile.ir import pieces
-from ttscompile.ir.pieces import ADVANCE, CONDITION, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STEP, STREAM, block_name
+from ttscompile.ir.pieces import ADVANCE, CONTEXT, DENSE_STEP, IDLE, PRUNER, STEM, STREAM, block_name
 from ttscompile.runtimes.backend import fill_initial, fill_offset, hold_known, stream_type
 from ttscompile.runtimes.contexts import ContextValues
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .idle_steps import IdleSteps
-from .sessions import FIRST_STEP, Array, Bound, run_named
+from .sessions import FIRST_STEP, Array, Bound, run_named, run_prologue
 
 
 class Workspace:
@@ -99,24 +99,13 @@ class Workspace:
             self._memory[0].fill(0)
         fill_offset(self._offset, self._sampler, noise, correction)
         if obs:
-            self._prologue(obs)
+            run_prologue(self._sessions, self._manifest.pieces, obs, self._contexts)
         self._read = np.zeros((self.streams, 0), np.float32)
         if correction is not None and correction.reads:
             self._read = correction.read(self.condition())
             self._offset += correction.from_condition(self._read)
         if known is not None:
             hold_known(self._offset, known)
-
-    def _prologue(self, obs: Mapping[str, FloatArray]) -> None:
-        """What the normalised observations ``[B, ...]`` decide before the loop."""
-        contexts, found = self._contexts, self._manifest.pieces
-        condition, step = found[CONDITION], found.get(STEP)
-        if condition.outputs:
-            feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}
-            contexts.keep(run_named(self._sessions[CONDITION], condition.outputs, feed).items())
-        if step is not None:
-            feed = dict(zip(step.inputs, contexts.for_step_piece(step.inputs), strict=True))
-            contexts.keep_steps(run_named(self._sessions[STEP], step.outputs, feed).items())
 
     def condition(self) -> FloatArray:
         """What a correction reads of the observation, ``[B, N]``."""

@@ -16,7 +16,7 @@ from ttscompile.artifact.files import exchange, lock_folder
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import locked
 from ttscompile.calibration import pipeline
-from ttscompile.calibration.result import CalibrationResult
+from ttscompile.calibration.pipeline import CalibrationResult
 from ttscompile.errors import ArtifactError
 
 from . import policies

@@ -14,9 +14,8 @@ from ttscompile.calibration import budget as budgets
 from ttscompile.calibration import pipeline, schedule
 from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules, budget_of_error
 from ttscompile.calibration.whole_steps import Errors, WholeSteps

@@ -15,8 +15,7 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.result import CalibrationResult
+from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.calibration.state import FILE
 from ttscompile.calibration.trials import DRAWS
 from ttscompile.core.lattice import Source, uniform_plan

@@ -11,8 +11,7 @@ import pytest
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import step_counts
-from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.result import CalibrationResult
+from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
 

@@ -18,9 +18,8 @@ from ttscompile.artifact.ceiling import FARTHEST
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.judge import Score, other_noise, other_observations
-from ttscompile.calibration.pipeline import UNHEARD, heeds
+from ttscompile.calibration.pipeline import UNHEARD, CalibrationResult, heeds
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import DRAWS, Trials
 from ttscompile.report import facts

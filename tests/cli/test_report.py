@@ -24,8 +24,8 @@ from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ReportError
 from ttscompile.measure.units import plain
 from ttscompile.report import Given, build, facts, pictures, render, verified
-from ttscompile.report.measure import run_episode
 from ttscompile.report.page import Table
+from ttscompile.report.usage import run_episode
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode

@@ -19,7 +19,7 @@ from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import verify
-from ttscompile.verification.engaged import ENGAGED
+from ttscompile.verification.reuse import ENGAGED
 
 Array = npt.NDArray[Any]
 Obs = dict[str, Array]

@@ -12,8 +12,7 @@ import ttscompile
 from ttscompile.artifact.golden import load_golden
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.verification import engaged
-from ttscompile.verification.episodes import ROUNDING, allowed
+from ttscompile.verification.reuse import ROUNDING, allowed, check_engaged
 from ttscompile.verification.rung import FAILED, PASSED, Rung
 
 
@@ -51,7 +50,7 @@ def judged(
     plans = dict.fromkeys(filter(None, ("schedule", name)), artifact.manifest.plans["schedule"])
     artifact = replace(artifact, manifest=replace(artifact.manifest, plans=plans, default_plan=default))
     policy = Timed(ttscompile.load(directory, seed=0), {"dense": dense, "schedule": schedule, name: schedule}, busy)
-    rung = engaged.check_engaged(artifact, load_golden(artifact), policy, lambda: policy.now)  # type: ignore[arg-type]
+    rung = check_engaged(artifact, load_golden(artifact), policy, lambda: policy.now)  # type: ignore[arg-type]
     return rung, policy.calls
 
 

@@ -22,8 +22,7 @@ from ttscompile.ir.layers import layers, layers_graph
 from ttscompile.ir.operations import operation
 from ttscompile.ir.program import Program
 from ttscompile.runtimes.onnxruntime import sessions
-from ttscompile.verification.network import RESIDUAL, relative
-from ttscompile.verification.probe import Probe
+from ttscompile.verification.network import RESIDUAL, Probe, relative
 from ttscompile.verification.rung import Rung
 
 from .broken import edit_manifest, edited

@@ -7,7 +7,7 @@ import pytest
 
 from ttscompile.core.sampler import SamplerTable
 from ttscompile.samplers.flow import flow_matching_table
-from ttscompile.verification.episodes import Unpaired
+from ttscompile.verification.reuse import Unpaired
 
 
 @pytest.mark.parametrize(("moved", "least", "most"), [(0.0, 0.0, 0.25), (0.5, 0.2, 0.6), (3.0, 1.2, 3.0)])

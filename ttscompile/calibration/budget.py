@@ -19,11 +19,11 @@ from ..artifact.view import view_of
 from ..core.coercion import integer
 from ..core.lattice import dense_plan, uniform_plan
 from ..core.plan import Plan
-from ..core.spec import Noise
 from ..errors import CalibrationError
 from ..measure.timer import Timer
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.random_calls import normalized, random_call
 from ..runtimes.runtime import Runtime
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
@@ -195,14 +195,9 @@ def median_ms(call: Callable[[], object]) -> float:
 
 def _pruner_ms(manifest: Manifest, runtime: Runtime, base: Plan) -> float:
     """For how long the loop waits for the pruner's plan, in milliseconds; whatever the plan is."""
-    spec, plan = manifest.spec, replace(base, cells=None, repair=True)
-    obs = {
-        key: np.zeros((1, *one.shape), one.dtype if one.normalizer is None else np.float32)
-        for key, one in spec.observations.items()
-    }
-    noise = Noise(np.zeros((1, *spec.sample), np.float32), np.zeros((spec.sampler.steps, 1, *spec.sample), np.float32))
-    waits = []
+    plan, waits, (obs, noise) = replace(base, cells=None, repair=True), list[float](), random_call(manifest.spec, 0, 0)
+    given = normalized(manifest.spec, obs)
     for _ in range(WARM_UP + FEWEST):
-        waits.append(runtime.predict(obs, noise, plan)[1].timings.wait_pruner)
+        waits.append(runtime.predict(given, noise, plan)[1].timings.wait_pruner)
         runtime.reset()
     return float(np.median(waits[WARM_UP:]))

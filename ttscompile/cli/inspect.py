@@ -22,8 +22,8 @@ from ttscompile.plots.maps import plot_plan
 from ttscompile.report import Given, build, render, verified
 from ttscompile.report import Section as OfPage
 from ttscompile.report.build import NOT_RUN
-from ttscompile.report.measure import run_episode
 from ttscompile.report.page import require_packages
+from ttscompile.report.usage import run_episode
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode, load_trajectories

@@ -21,10 +21,10 @@ from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
 from ..verification import Verification
-from .measure import Course, run_episode
 from .page import Page, Picture, Section, Table, require_packages
 from .pictures import plain
 from .timing import Measurement, latency, measure_plans
+from .usage import Course, run_episode
 
 NOT_RUN = Section("Verification", ("Not run for this page: --verify adds it, ttscompile verify DIR runs it alone.",))
 

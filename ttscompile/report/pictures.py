@@ -14,9 +14,9 @@ from ..core.lattice import PlanArray, Source, sparsity
 from ..measure.units import ms
 from ..plots.figure import STEPS_AXIS, beside, encoded, new_figure, plain_powers, with_grid
 from ..plots.maps import COLOURS, plot_plan
-from .measure import Course
 from .page import Picture
 from .timing import Measurement
+from .usage import Course
 
 _PARTS = {
     "prologue": ("#0072b2", "prologue"),

@@ -24,10 +24,9 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from ..errors import TrajectoryError
+from .array_files import hdf5_recording, zarr_recording
 from .frames import AS_NPZ, BLOCK_BYTES, Array, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
-from .hdf5_file import hdf5_recording
 from .lerobot_dataset import lerobot_recording
-from .zarr_buffer import zarr_recording
 
 MORE_BYTES, MORE_SECONDS = 2**30, 4
 """Memory and processor time of a reader beyond what its imports take; more for large files, see ``limit``."""

@@ -22,8 +22,7 @@ from ..runtimes.frames import FrameWork
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.runtime import Runtime
-from .network import CONVERT, block_errors, describe_blocks, largest
-from .probe import Probe
+from .network import CONVERT, Probe, block_errors, describe_blocks, largest
 from .rung import FAILED, PASSED, SKIPPED, Rung, finite, judged
 
 DENSE_CALL, RUNTIMES, PLANS = "dense call", "runtimes", "plans"

@@ -32,11 +32,9 @@ from .calls import (
     check_runtimes,
     check_tokens,
 )
-from .engaged import ENGAGED, check_engaged
-from .episodes import SPARSITY, Progress, check_episodes, choose
-from .network import BLOCK, EVALUATION, PREPROCESSING, check_blocks, check_evaluation, check_preprocessing
+from .network import BLOCK, EVALUATION, PREPROCESSING, Probe, check_blocks, check_evaluation, check_preprocessing
 from .precision import PLANS_PRECISION, PRECISION, check_plans_precision, check_precision
-from .probe import Probe
+from .reuse import ENGAGED, SPARSITY, Progress, check_engaged, check_episodes, choose
 from .rung import FAILED, PASSED, ErrorMap, Rung, Verification
 
 INTEGRITY = "integrity"

@@ -23,10 +23,9 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.artifact.view import View, view_of
 from ttscompile.calibration.kept import Kept
-from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.calibration.proposers import weights as student
 from ttscompile.calibration.proposers.weights import NAME, SAVED, Weights
-from ttscompile.calibration.result import CalibrationResult
 from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.calibration.state import FILE
 from ttscompile.calibration.trials import Trials
@@ -40,8 +39,8 @@ from ttscompile.runtimes.open import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.verification import verify
-from ttscompile.verification.engaged import ENGAGED
 from ttscompile.verification.record_golden import record_plans
+from ttscompile.verification.reuse import ENGAGED
 
 from .trying import proposed, request, trials_of
 

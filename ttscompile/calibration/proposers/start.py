@@ -77,16 +77,10 @@ def candidates(artifact: Artifact, plan: Plan) -> list[Proposal]:
     for last in (n for n in LAST_STEPS if n <= steps // 2):
         rests = [dense_plan(last, blocks)]
         if plan.cells is not None:
-            rests.append(rest_of_cells(plan.cells, last))
+            rests.append(plan.cells[-last:].copy())
+            rests[-1][0] = Source.COMPUTE
         found |= {rest.tobytes(): begun(plan, last, rest) for rest in rests}
     return sorted(found.values(), key=lambda one: np.count_nonzero(one.plan.cells == Source.COMPUTE))
-
-
-def rest_of_cells(cells: PlanArray, last: int) -> PlanArray:
-    """The cells of the last steps, the first of which is computed."""
-    rest = cells[-last:].copy()
-    rest[0] = Source.COMPUTE
-    return rest
 
 
 def begun(plan: Plan, last: int, cells: PlanArray) -> Proposal:

@@ -1,4 +1,8 @@
-"""A robomimic data set: an HDF5 file with ``data/DEMO/obs/NAME [F, ...]``, a group for each demonstration."""
+"""Recordings that are arrays in one file: replay buffers of Diffusion Policy, and data sets of robomimic.
+
+The former are a zarr group with ``data/NAME [F, ...]`` and ``meta/episode_ends [E]``, the latter an HDF5 file with
+``data/DEMO/obs/NAME [F, ...]``, a group for each demonstration.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,61 @@ from typing import Any
 import numpy as np
 
 from ..errors import TrajectoryError
-from .frames import AS_NPZ, Array, Recording, blocks, one_error, require_files, require_proportion
+from .frames import AS_NPZ, Array, Recording, blocks, bytes_of, one_error, require_files, require_proportion
+
+CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
+"""Compression that only computes. zarr also knows codecs that unpickle what they read."""
+
+
+def zarr_recording(path: Path) -> Recording:
+    """Open a replay buffer, a directory or zipped.
+
+    Raises:
+        TrajectoryError: not one, damaged, or in an encoding that is not read.
+    """
+    import zarr
+
+    require_files(path)
+    hint = "; expected a zarr group with data/NAME [F, ...] and meta/episode_ends [E]"
+    with one_error(f"{path}: cannot be read as a replay buffer of Diffusion Policy", hint):
+        store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
+        group = zarr.open_group(store, mode="r")
+        data: Any = group["data"]
+        ends = group["meta/episode_ends"]
+        names = tuple(sorted(name for name, _ in data.arrays()))
+    size = bytes_of(path)
+
+    def read(name: str) -> tuple[int, Iterator[Array]]:
+        array = data[name]
+        _require_plain_zarr(path, array, size)
+        return array.shape[0], _zarr_blocks(path, array)
+
+    _require_plain_zarr(path, ends, size)
+    return Recording(names, read, np.concatenate(list(_zarr_blocks(path, ends))))
+
+
+def _require_plain_zarr(path: Path, array: Any, size: int) -> None:
+    """Raise unless nothing but numbers and compression is in an array, and not more than the files can hold."""
+    kind, codecs = np.dtype(array.dtype).kind, _codecs(array.metadata)
+    if kind not in "biuf" or not codecs <= CODECS or not array.shape:
+        what = f"compressed by {', '.join(sorted(codecs - CODECS))}" if kind in "biuf" else f"of dtype {array.dtype}"
+        told = f"{what if array.shape else 'a single value'}; expected rows of numbers, compressed by one of"
+        told += f" {', '.join(sorted(CODECS))}. Write it again with another compressor, or {AS_NPZ}"
+        raise TrajectoryError(f"{path}: {array.path!r} is {told}")
+    require_proportion(path, math.prod(array.shape) * array.dtype.itemsize, size)
+
+
+def _zarr_blocks(path: Path, array: Any) -> Iterator[Array]:
+    with one_error(f"{path}: {array.path!r} is damaged", ". Copy it again"):  # truncated chunks and the like
+        yield from blocks(array)
+
+
+def _codecs(metadata: Any) -> set[str]:
+    """Names of whatever turns stored bytes into numbers, of either version of the format."""
+    if metadata.zarr_format == 2:
+        return {str(one.codec_id) for one in (*(metadata.filters or ()), metadata.compressor) if one is not None}
+    return {str(one.to_dict()["name"]).removeprefix("numcodecs.") for one in metadata.codecs}
+
 
 FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 """Compression that h5py has itself; others are libraries of their own."""
@@ -30,17 +88,17 @@ def hdf5_recording(path: Path) -> Recording:
         names = sorted(set.intersection(*(set(group) for group in groups)))
     total = sum(lengths)
     ends = np.cumsum(lengths) if total < 2**62 else np.zeros(0, np.int64)
-    return Recording(names, lambda name: (total, _blocks(path, demos, name)), ends)
+    return Recording(names, lambda name: (total, _hdf5_blocks(path, demos, name)), ends)
 
 
-def _blocks(path: Path, demos: list[str], name: str) -> Iterator[Array]:
+def _hdf5_blocks(path: Path, demos: list[str], name: str) -> Iterator[Array]:
     """Rows of all demonstrations; sizes are compared with the file's before the first is read."""
     import h5py
 
     with one_error(f"{path}: {name!r} is damaged"), h5py.File(path, "r") as file:
         arrays = [_inside(path, file, f"data/{demo}/obs/{name}") for demo in demos]
         for array in arrays:
-            _require_plain(path, array)
+            _require_plain_hdf5(path, array)
         total = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
         require_proportion(path, total, path.stat().st_size)
         for array in arrays:
@@ -78,7 +136,7 @@ def _length(path: Path, group: Any) -> int:
     return int(lengths.pop())
 
 
-def _require_plain(path: Path, array: Any) -> None:
+def _require_plain_hdf5(path: Path, array: Any) -> None:
     """Raise unless an array is numbers that are in the file itself, compressed by what is known."""
     numbers = np.dtype(array.dtype).kind in "biuf"
     if not numbers or array.is_virtual or array.external:
