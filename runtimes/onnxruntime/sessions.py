@@ -32,34 +32,16 @@ from ttscompile.artifact.tensors import MAPPED
 from ttscompile.artifact.view import View
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
+from ttscompile.ir import pieces as kinds
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.joint import Joint, join
-from ttscompile.ir.pieces import (
-    ADVANCE,
-    CONDITION,
-    DENSE_STEP,
-    IDLE,
-    JOINT,
-    LAYERS,
-    OF_ALL_BLOCKS,
-    PRUNER,
-    RESIDUAL,
-    STEM,
-    STEP,
-    STREAM,
-    block_name,
-    is_of_loop,
-    of_tokens,
-    part_of,
-    renewed_name,
-)
 from ttscompile.measure.machine import has_integer_dot_product
 from ttscompile.runtimes.contexts import ContextValues
 
 Array: TypeAlias = npt.NDArray[Any]
 
 
-SINGLE_THREADED = frozenset({STEM, ADVANCE, PRUNER, IDLE})
+SINGLE_THREADED = frozenset({kinds.STEM, kinds.ADVANCE, kinds.PRUNER, kinds.IDLE})
 """Pieces too small for a second thread."""
 
 FIRST_STEP = "first_step"
@@ -100,13 +82,16 @@ class Sessions:
             ArtifactError: onnxruntime refuses a graph.
         """
         manifest = view.manifest
-        single = {block_name(b) for b in range(len(manifest.blocks))}
+        single = {kinds.block_name(b) for b in range(len(manifest.blocks))}
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
-        unused = filter(of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
-        others = set(filter(is_of_loop, manifest.pieces))
-        once, contents = set(manifest.pieces) - single - {JOINT, LAYERS} - set(unused) - others, _contents(view)
+        unused = filter(kinds.of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
+        others = set(filter(kinds.is_of_loop, manifest.pieces))
+        once, contents = (
+            set(manifest.pieces) - single - {kinds.JOINT, kinds.LAYERS} - set(unused) - others,
+            _contents(view),
+        )
         sessions = {piece: self._session(view, piece, contents) for piece in sorted(once)}
-        sessions[FIRST_STEP] = self._session(view, DENSE_STEP, contents, first_step=True)
+        sessions[FIRST_STEP] = self._session(view, kinds.DENSE_STEP, contents, first_step=True)
         return sessions | self._of_blocks(view, contents) if blocks else sessions
 
     def of_blocks(self, view: View) -> dict[str, Any]:
@@ -125,14 +110,14 @@ class Sessions:
             ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
         """
         with view.artifact.reading():
-            return {LAYERS: self._session(view, LAYERS, _contents(view))}
+            return {kinds.LAYERS: self._session(view, kinds.LAYERS, _contents(view))}
 
     def _of_blocks(self, view: View, contents: Mapping[str, bytes]) -> dict[str, Any]:
         manifest = view.manifest
-        names = [block_name(b) for b in range(len(manifest.blocks))]
+        names = [kinds.block_name(b) for b in range(len(manifest.blocks))]
         if self.threads == 1:
             return {name: self._session(view, name, contents) for name in names}
-        session, blanks = self._session(view, JOINT, contents), dict[int, dict[str, Array]]()
+        session, blanks = self._session(view, kinds.JOINT, contents), dict[int, dict[str, Array]]()
         pieces = [manifest.pieces[name] for name in names]
         joint = join([tuple(manifest.contexts[name].type for name in piece.contexts) for piece in pieces])
         return {
@@ -143,9 +128,9 @@ class Sessions:
     def _session(self, view: View, piece: str, contents: Mapping[str, bytes], first_step: bool = False) -> Any:
         file = view.onnx_file(piece, first_step)
         threads = 1 if piece in SINGLE_THREADED else self.threads
-        spins = piece in OF_ALL_BLOCKS
+        spins = piece in kinds.OF_ALL_BLOCKS
         if (file, threads, spins) not in self._known:
-            precision = view.precision.get(str(part_of(piece)), FP32)
+            precision = view.precision.get(str(kinds.part_of(piece)), FP32)
             if precision not in self._careful:
                 self._careful[precision] = needs_care(precision)
             session = _open_file(view, file, threads, spins, self._careful[precision], contents)
@@ -271,7 +256,7 @@ class JointBlock:
         places = zip(self.piece.contexts, self.joint.places[self.index], strict=True)
         return {
             **{name: _TURNS[turn] for name, turn in zip(self.joint.switches, turns, strict=True)},
-            STREAM: stream,
+            kinds.STREAM: stream,
             **self.blanks[streams],
             **{slot: inputs[name] for name, slot in places},
         }
@@ -288,7 +273,7 @@ class Bound:
     def __init__(self, session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> None:
         if isinstance(session, JointBlock):
             (residual,) = outputs.values()
-            session, inputs, outputs = session.session, session.feeds(inputs), {RESIDUAL: residual}
+            session, inputs, outputs = session.session, session.feeds(inputs), {kinds.RESIDUAL: residual}
         self._arrays = (*inputs.values(), *outputs.values())  # the binding holds bare addresses
         assert all(array.flags.c_contiguous for array in self._arrays)
         self._session = session
@@ -347,7 +332,7 @@ def renew_piece(
     Raises:
         ArtifactError: the graph does not do what the manifest says. What is kept may have some of the new rows.
     """
-    into = {renewed_name(key): array for key, array in kept.items()}
+    into = {kinds.renewed_name(key): array for key, array in kept.items()}
     given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]
     assert all(array.flags.c_contiguous for array in given.values())
     try:
@@ -375,10 +360,10 @@ def run_prologue(
     Raises:
         ArtifactError: the graphs do not do what the manifest says.
     """
-    condition, step = pieces[CONDITION], pieces.get(STEP)
+    condition, step = pieces[kinds.CONDITION], pieces.get(kinds.STEP)
     if condition.outputs:
         feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}
-        contexts.keep(run_named(sessions[CONDITION], condition.outputs, feed).items())
+        contexts.keep(run_named(sessions[kinds.CONDITION], condition.outputs, feed).items())
     if step is not None:
         feed = dict(zip(step.inputs, contexts.for_step_piece(step.inputs), strict=True))
-        contexts.keep_steps(run_named(sessions[STEP], step.outputs, feed).items())
+        contexts.keep_steps(run_named(sessions[kinds.STEP], step.outputs, feed).items())

@@ -15,19 +15,9 @@ from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.calibration.proposer import near
+from ttscompile.cli import options
 from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
 from ttscompile.cli.contestants import Way, contestants, originals
-from ttscompile.cli.options import (
-    LOOP_OPTIONS,
-    artifact_argument,
-    count_option,
-    encoders_option,
-    json_option,
-    loop_options,
-    names_option,
-    number_option,
-    several_threads_option,
-)
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table, warn_if_busy
 from ttscompile.cli.sections import Section, SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_facts
@@ -53,13 +43,13 @@ WORTH = 0.1
 
 SECTIONS = (
     Section("Beside the original network", ("checkpoint", "encoders"), ("checkpoint",)),
-    Section("In a control loop", ("control_hz", *LOOP_OPTIONS), ("control_hz",)),
+    Section("In a control loop", ("control_hz", *options.LOOP_OPTIONS), ("control_hz",)),
     Section("Action error, on recorded episodes", ("trajectories", "sources", "picture"), ("trajectories",)),
 )
 
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)
-@artifact_argument
+@options.artifact_argument
 @click.option(
     "--plan",
     "plans",
@@ -77,7 +67,7 @@ SECTIONS = (
     help="Look at plans of these artifacts of the same checkpoint, too, which may have another sampler. Every word up"
     " to the next option is one.",
 )
-@names_option(
+@options.names_option(
     "--runtime",
     ("onnxruntime", "torch"),
     default="onnxruntime",
@@ -85,25 +75,25 @@ SECTIONS = (
     " onnxruntime,torch.",
 )
 @click.option("--device", type=TEXT, help="Have torch compute on this device, as it calls it: cpu, cuda.")
-@several_threads_option(
+@options.several_threads_option(
     "Threads that each plan computes with. Of several, as in 1,2,4, each plan is timed with each of these, and the rest"
     " is done with the first."
 )
-@count_option("--calls", "Count so many calls of each plan.", default=20, most=MOST_CALLS)
-@json_option
+@options.count_option("--calls", "Count so many calls of each plan.", default=20, most=MOST_CALLS)
+@options.json_option
 @click.option(
     "--checkpoint",
     type=PATH,
     help="Time the checkpoint that DIRECTORY was made from, in PyTorch: in the loop that it was saved with, and in the"
     " artifact's if that is another.",
 )
-@encoders_option
-@number_option(
+@options.encoders_option
+@options.number_option(
     "--control-hz",
     RATE,
     "Say which plans keep up with a control loop of this rate in Hz. The exit status is 1 if none does.",
 )
-@loop_options
+@options.loop_options
 @trajectories_options(
     required=False, what="Hold the actions of the plans against those of the dense policy on these recorded episodes."
 )

@@ -12,16 +12,8 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.proposer import NAMES as LEARNED
 from ttscompile.calibration.proposer import PROPOSERS
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
+from ttscompile.cli import options
 from ttscompile.cli.ending import Status
-from ttscompile.cli.options import (
-    artifact_argument,
-    json_option,
-    names_option,
-    number_option,
-    ray_option,
-    seed_option,
-    threads_option,
-)
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.sections import SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_artifact
@@ -29,44 +21,44 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
 
 
 @click.command(cls=SectionedCommand)
-@artifact_argument
+@options.artifact_argument
 @trajectories_options()
-@names_option(
+@options.names_option(
     "--learn",
     LEARNED,
     default="schedule",
     help=f"Learn these, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
 )
-@number_option(
+@options.number_option(
     "--target-sparsity",
     SHARE,
     "Reuse this share of the cells. Without any budget it is 0.95, or what leaves five steps to compute.",
 )
-@number_option(
+@options.number_option(
     "--target-flops",
     SHARE,
     "Save this share of the FLOPs of a dense call, prologue and pruner counted, in place of --target-sparsity.",
 )
-@number_option(
+@options.number_option(
     "--latency-ms",
     MILLISECONDS,
     "Have a call take no longer than this with onnxruntime on this machine, measured at the start, in place of"
     " --target-sparsity.",
 )
-@number_option(
+@options.number_option(
     "--max-action-error",
     ERROR,
     "Take the sparsest plan whose mean action error on held-out episodes, in the units of the actions, is not"
     " above this, in place of --target-sparsity.",
 )
-@number_option(
+@options.number_option(
     "--max-distance",
     ERROR,
     "Take a cheaper plan if it is no further than this from the original than a dearer one, in units of what other"
     " noise changes; without this option it is what each that learns allows. With --learn loops: distance from the"
     " original that the default plan may have.",
 )
-@threads_option("Threads of the calls that --latency-ms is about.")
+@options.threads_option("Threads of the calls that --latency-ms is about.")
 @click.option(
     "--strategy",
     type=click.Choice(NAMES),
@@ -74,7 +66,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     show_default=True,
     help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
-@seed_option("Seed of the split, the noise and the training.")
+@options.seed_option("Seed of the split, the noise and the training.")
 @click.option(
     "--max-minutes",
     cls=NumberOption,
@@ -90,8 +82,8 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     help="Compute calls on this device, as torch calls it: cuda, mps. Without this option it is the CPU.",
 )
 @click.option("--resume", is_flag=True, help="Go on where a calibration that was interrupted stopped.")
-@ray_option
-@json_option
+@options.ray_option
+@options.json_option
 def calibrate(
     directory: Path,
     trajectories: tuple[Path, ...],

@@ -22,16 +22,7 @@ from rich.console import Console
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.options import (
-    LOOP_OPTIONS,
-    artifact_argument,
-    count_option,
-    loop_options,
-    number_option,
-    runtime_options,
-    threads_option,
-    together,
-)
+from ttscompile.cli import options as shared
 from ttscompile.cli.output import only_results_on_stdout, progress, say
 from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.types import ADDRESS, ANY_TEXT, FILE, RATE, TEXT
@@ -62,7 +53,7 @@ def _papers(_: click.Context, __: click.Parameter, files: tuple[Path, ...]) -> t
     return files
 
 
-server_options = together(
+server_options = shared.together(
     click.option(
         "--host",
         type=ADDRESS,
@@ -71,7 +62,7 @@ server_options = together(
         help="Listen on this IP address of this machine, or on localhost. One that other machines may reach needs a"
         " token and a certificate.",
     ),
-    count_option("--port", "Listen on this port; 0 takes any that is free.", default=8765, least=0, most=65535),
+    shared.count_option("--port", "Listen on this port; 0 takes any that is free.", default=8765, least=0, most=65535),
     click.option(
         "--token-file",
         type=FILE,
@@ -179,7 +170,7 @@ BATCHES_WAITING = 16
 """Requests of a fleet that may be under way, in full batches of every copy; further ones are refused at once."""
 
 SECTIONS = (
-    Section("One robot", LOOP_OPTIONS, ("control_hz",)),
+    Section("One robot", shared.LOOP_OPTIONS, ("control_hz",)),
     Section("The policy in this process", ("runtime", "device"), ("control_hz", "openpi")),
     Section("Many robots", ("ray",), ("copies",)),
     Section("Who may connect", SERVER_OPTIONS),
@@ -187,9 +178,9 @@ SECTIONS = (
 
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)
-@artifact_argument
-@number_option("--control-hz", RATE, "Drive one robot, whose control loop has this rate in Hz.")
-@count_option(
+@shared.artifact_argument
+@shared.number_option("--control-hz", RATE, "Drive one robot, whose control loop has this rate in Hz.")
+@shared.count_option(
     "--copies", "Answer many robots, with so many copies of the policy, which run on Ray.", default=None, most=4096
 )
 @click.option("--openpi", is_flag=True, help="Answer clients of openpi, in openpi's protocol.")
@@ -202,9 +193,9 @@ SECTIONS = (
     " slowest plan to the fastest: a faster one is run when calls are late. With --copies it is the plan of requests"
     " that name none, with --openpi that of all.",
 )
-@threads_option("Threads that the policy, or each copy of it, computes with.")
-@loop_options
-@runtime_options
+@shared.threads_option("Threads that the policy, or each copy of it, computes with.")
+@shared.loop_options
+@shared.runtime_options
 @click.option(
     "--ray",
     type=ANY_TEXT,

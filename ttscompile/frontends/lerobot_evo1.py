@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.spec import Affine, ChunkSpec, Instruction, PolicySpec, SamplerTable
+from . import lerobot_vla as vla
 from .clip import ACTIVATIONS
 from .encoded import EncodedDenoiser
 from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
@@ -26,19 +27,6 @@ from .instruction import encoder_folders, language_model_folder, task_tokens, to
 from .internvl import InternVitConfig, InternVLConfig, Prompt
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
-from .lerobot_vla import (
-    Gathered,
-    flow_matching,
-    padded_size,
-    part_of,
-    positive_number,
-    read_language,
-    read_vla_config,
-    read_vla_processors,
-    require_square,
-    rope_of,
-    vla_spec,
-)
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
@@ -70,8 +58,8 @@ _BY_KIND = re.compile(r"\.(action_encoder\.(first|second|third)|(mlp_head|state_
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
-    shared = read_vla_config(directory, entries, options)
-    settings, processors = shared.settings, read_vla_processors(shared)
+    shared = vla.read_vla_config(directory, entries, options)
+    settings, processors = shared.settings, vla.read_vla_processors(shared)
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     folder = language_model_folder(name, encoder_folders(options.encoders, directory), "internvl")
     model = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")
@@ -90,9 +78,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         task = torch.tensor([tokens[told.skipped :][:length]])
     weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
     network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
-    encoder = Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
+    encoder = vla.Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
     side = config.language.vision.image_size
-    spec = vla_spec(shared, processors, (side, side), "stretch", sizes, options, partial(_sampler, settings), told)
+    spec = vla.vla_spec(shared, processors, (side, side), "stretch", sizes, options, partial(_sampler, settings), told)
     spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform")
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
@@ -107,7 +95,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
         raise settings.refusal("binarize_gripper", expected)
     language = _read_language(settings, model)
     resolution = settings.size("image_resolution", [448, 448], MOST_PIXELS) or (448, 448)
-    require_square(settings, "image_resolution", resolution, language.vision.patch_size * language.scale)
+    vla.require_square(settings, "image_resolution", resolution, language.vision.patch_size * language.scale)
     if resolution[0] != language.vision.image_size:
         raise settings.refusal("image_resolution", f"the language model's image_size, {language.vision.image_size}")
     heads, width = settings.number("num_heads", 8, MOST), language.text.width
@@ -117,8 +105,8 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
         language=language,
         chunk_size=shared.horizon,
         actions=shared.action_dim,
-        max_action_dim=padded_size(settings, "max_action_dim", shared.action_dim, 24),
-        max_state_dim=padded_size(settings, "max_state_dim", shared.state_dim, 24),
+        max_action_dim=vla.padded_size(settings, "max_action_dim", shared.action_dim, 24),
+        max_state_dim=vla.padded_size(settings, "max_state_dim", shared.state_dim, 24),
         hidden_dim=settings.number("hidden_dim", 1024, MOST),
         state_hidden_dim=settings.number("state_hidden_dim", 1024, MOST),
         num_heads=heads,
@@ -129,14 +117,14 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
 
 def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     """Of the language model's entries; defaults are those of transformers."""
-    image, text = part_of(model, "vision_config"), part_of(model, "text_config")
+    image, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
     image.require(norm_type="layer_norm", use_qk_norm=False, use_absolute_position_embeddings=True, num_channels=3)
     model.require(vision_feature_layer=-1, vision_feature_select_strategy="default")
     text.require(model_type="qwen2", hidden_act="silu", use_sliding_window=False)
     names = {field for field in InternVitConfig.__dataclass_fields__ if field in image.values}
     sizes = {name: _side(image, name) for name in names & {"image_size", "patch_size"}}
     vision = InternVitConfig(**{name: image.values[name] for name in names} | sizes)
-    ratio = positive_number(model, "downsample_ratio", 0.5)
+    ratio = vla.positive_number(model, "downsample_ratio", 0.5)
     scale = max(int(1 / ratio), 1)
     if abs(scale * ratio - 1) > 1e-6 or vision.side % scale:
         raise model.refusal("downsample_ratio", f"one of so many of the {vision.side} patches along a side", 0.5)
@@ -144,7 +132,7 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     if wanted is not None and type(wanted) is not int:
         raise settings.refusal("vlm_num_layers", "a whole number, or null for all", 14)
     heads = text.number("num_attention_heads", 32, MOST)
-    language = read_language(text, len(range(there)[:wanted]), text.number("hidden_size", 4096, MOST) // heads)
+    language = vla.read_language(text, len(range(there)[:wanted]), text.number("hidden_size", 4096, MOST) // heads)
     language = replace(language, biased=True)
     config = InternVLConfig(
         vision=vision,
@@ -161,14 +149,14 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
 
 def _rotary_base(text: Settings, longest: int) -> float:
     """Of the rotary embedding; a dynamic one is another only where more words than in training are read."""
-    rope = rope_of(text, 10_000.0)
+    rope = vla.rope_of(text, 10_000.0)
     name = "rope_type" if "rope_type" in rope.values else "type"
     if rope.choice(name, "default", "dynamic") == "dynamic":
         most = text.number("max_position_embeddings", 32768)
         if longest > most:
             raise text.refusal("max_position_embeddings", f"at least max_text_length, {longest}, with a dynamic one")
     rope.require(partial_rotary_factor=1)
-    return positive_number(rope, "rope_theta", 10_000.0)
+    return vla.positive_number(rope, "rope_theta", 10_000.0)
 
 
 def _side(image: Settings, name: str) -> int:
@@ -205,7 +193,7 @@ def _chunk(settings: Settings, chunk: ChunkSpec) -> ChunkSpec:
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     """From noise at time 0 to actions at 1; a time is a row of its embedding, rounded as lerobot does."""
     count = integration_steps(settings, options, "num_inference_timesteps", 32)
-    table = flow_matching(count, options, start=0.0, end=1.0)
+    table = vla.flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
     return replace(table, timesteps=np.minimum((times * (TIMES - 1)).astype(np.int64), TIMES - 1))
 
@@ -226,7 +214,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, config: Evo1Config, mo
         if kinds > 1 and _BY_KIND.search(name) and len(value) == kinds:
             value = value[own].T.contiguous() if value.ndim == 3 else value[own].clone()
         found[name] = value
-    if not part_of(model, "vision_config").flag("attention_bias", False):
+    if not vla.part_of(model, "vision_config").flag("attention_bias", False):
         width = config.language.vision.hidden_size
         for layer in range(config.language.vision.num_hidden_layers):
             start = f"embedder.vision_tower.encoder.layers.{layer}.self_attn."

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from ..core.spec import Instruction, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
+from . import lerobot_vla as vla
 from .clip import ACTIVATIONS, TowerConfig
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
@@ -29,16 +30,6 @@ from .internvl import Prompt
 from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
 from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
-from .lerobot_vla import (
-    Gathered,
-    flow_matching,
-    part_of,
-    positive_number,
-    read_language,
-    read_vla_config,
-    rope_of,
-    vla_spec,
-)
 from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
@@ -73,7 +64,7 @@ _RENAMED = (
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
-    shared = read_vla_config(directory, entries, options)
+    shared = vla.read_vla_config(directory, entries, options)
     settings, processors = shared.settings, read_groot_processors(directory, shared.features)
     _require_version(settings)
     folders = encoder_folders(options.encoders, directory)
@@ -93,10 +84,10 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         task = torch.tensor([tokens[told.skipped :]])
     weights = _weights(shared, options, config, processors.embodiment)
     network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
-    encoder = Gathered(shared, processors, Prefix(network, Seen(processors.geometry)), config.state, task)
+    encoder = vla.Gathered(shared, processors, Prefix(network, Seen(processors.geometry)), config.state, task)
     edge, own = processors.geometry.edge, {name: each for name, each in entries.items() if each is not None}
     table = partial(_sampler, Settings({**base.values, **own}, settings.where), processors.bounded)
-    spec = vla_spec(shared, processors, (edge, edge), "stretch", sizes, options, table, told)
+    spec = vla.vla_spec(shared, processors, (edge, edge), "stretch", sizes, options, table, told)
     spec = replace(spec, source={**spec.source, "embodiment": processors.kind})
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
@@ -114,11 +105,11 @@ def _require_version(settings: Settings) -> None:
 def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -> None:
     """Raise unless images and words come to the backbone as is rebuilt here."""
     settings = Settings(read_json(folder / (name := "preprocessor_config.json")), f"{folder / name}: ")
-    vision, half = part_of(model, "vision_config"), [0.5] * 3
+    vision, half = vla.part_of(model, "vision_config"), [0.5] * 3
     patch, merge = vision.number("patch_size", 16, MOST), vision.number("spatial_merge_size", 2, MOST)
     own = Settings({"patch_size": None, "merge_size": None, **settings.values}, settings.where)
     own.require(patch_size=patch, merge_size=merge, image_mean=half, image_std=half, do_normalize=True, do_rescale=True)
-    side, size = processors.geometry.target, part_of(settings, "size")
+    side, size = processors.geometry.target, vla.part_of(settings, "size")
     least, most = (size.number(f"{entry}_edge", most=2**31) for entry in ("shortest", "longest"))
     if side % (patch * merge) or not least <= side**2 <= most:
         raise CheckpointError(
@@ -135,9 +126,9 @@ def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -
 
 def read_config(base: Settings, model: Settings, processors: GrootProcessors) -> GrootConfig:
     """Sizes and variant, of the entries of the base model and of its backbone."""
-    language, dit = _read_language(base, model, processors.geometry.target), part_of(base, "diffusion_model_cfg")
+    language, dit = _read_language(base, model, processors.geometry.target), vla.part_of(base, "diffusion_model_cfg")
     layers, width = _tower(dit), language.text.width
-    mixing = part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
+    mixing = vla.part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
     mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None
     (state, actions), out = processors.padded, dit.number("output_dim", 26, MOST)
     base.require(backbone_embedding_dim=width, input_embedding_dim=layers.hidden_size, hidden_size=out)
@@ -181,14 +172,14 @@ def _tower(own: Settings) -> TowerConfig:
         num_hidden_layers=own.number("num_layers", 12, _MOST_LAYERS),
         num_attention_heads=heads,
         hidden_act="gelu_pytorch_tanh",
-        layer_norm_eps=positive_number(own, "norm_eps", 1e-5),
+        layer_norm_eps=vla.positive_number(own, "norm_eps", 1e-5),
     )
 
 
 def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
     """Of the backbone's entries; defaults are those of transformers."""
-    image, text = part_of(model, "vision_config"), part_of(model, "text_config")
-    rope = rope_of(text, 5e5)
+    image, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
+    rope = vla.rope_of(text, 5e5)
     image.require(in_channels=3, out_hidden_size=text.values.get("hidden_size"))
     text.require(hidden_act="silu", attention_bias=False)
     rope.require(rope_type="default", mrope_interleaved=True)
@@ -216,9 +207,9 @@ def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
     if vision.hidden_size // vision.num_attention_heads % 4:
         raise image.refusal("num_heads", "heads of a multiple of 4 channels")
     layers = min(text.number("num_hidden_layers", 32, _MOST_LAYERS), base.number("select_layer", 16))
-    language = replace(read_language(text, layers, 128), normed=True)
+    language = replace(vla.read_language(text, layers, 128), normed=True)
     vocabulary = text.number("vocab_size", 151936, _MOST_VOCABULARY)
-    angle = positive_number(rope, "rope_theta", 5e5)
+    angle = vla.positive_number(rope, "rope_theta", 5e5)
     return Qwen3VLConfig(vision, language, vocabulary, (sections[1], sections[2]), angle)
 
 
@@ -247,7 +238,7 @@ def _prompt(
 def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
     """From noise at time 0 to actions at 1; a time is a bucket of many. Actions may be clipped at the end."""
     count = integration_steps(settings, options, "num_inference_timesteps", 4)
-    table = flow_matching(count, options, start=0.0, end=1.0)
+    table = vla.flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
     table = replace(table, timesteps=(times * settings.number("num_timestep_buckets", 1000, 2**20)).astype(np.int64))
     if not bounded:

@@ -15,26 +15,15 @@ from torch import Tensor, nn
 
 from ..core.tokenizer import TASK
 from ..errors import CheckpointError
+from . import lerobot_processors as lerobot
 from .image_geometry import ResizeCrop
 from .lerobot_config import ACTION, MOST_PIXELS, STATE
-from .lerobot_processors import (
-    POSTPROCESSOR,
-    PREPROCESSOR,
-    RELATIVE,
-    Features,
-    Processors,
-    Statistics,
-    as_statistic,
-    read_steps,
-    renamed_observations,
-    state_of,
-)
 from .settings import Settings
 
 _PACK, _ENCODE = "groot_n1_7_pack_inputs_v1", "groot_n1_7_vlm_encode_v1"
 _UNPACK, _DECODE = "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
-_COMMON = ("rename_observations_processor", "to_batch_processor", "device_processor", *RELATIVE)
+_COMMON = ("rename_observations_processor", "to_batch_processor", "device_processor", *lerobot.RELATIVE)
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _MOST_LETTERS, _EPSILON = 64, 400, 1e-8
 _CAMERA = "observation.images."
@@ -43,7 +32,7 @@ _LIBERO, _LIBERO_STEPS = "libero_sim", 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class GrootProcessors(Processors):
+class GrootProcessors(lerobot.Processors):
     """What the two pipelines of a policy do.
 
     Attributes:
@@ -95,10 +84,10 @@ class Seen(nn.Module):
         return self.zoom(pixels).clamp(0, 255).round() / 127.5 - 1  # type: ignore[no-any-return]
 
 
-def read_groot_processors(directory: Path, features: Features) -> GrootProcessors:
+def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootProcessors:
     """The pipelines of a policy with these features."""
-    before = read_steps(directory, PREPROCESSOR, only=(*_COMMON, _PACK, _ENCODE, *_OLD))
-    after = read_steps(directory, POSTPROCESSOR, only=(*_COMMON, _UNPACK, _DECODE, *_OLD))
+    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, only=(*_COMMON, _PACK, _ENCODE, *_OLD))
+    after = lerobot.read_steps(directory, lerobot.POSTPROCESSOR, only=(*_COMMON, _UNPACK, _DECODE, *_OLD))
     if old := next((step["registry_name"] for step in (*before, *after) if step["registry_name"] in _OLD), None):
         raise CheckpointError(f"{directory}: the step {old} is {OLD}.")
     pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
@@ -114,7 +103,7 @@ def read_groot_processors(directory: Path, features: Features) -> GrootProcessor
             " weights. Set embodiment_tag to the robot that the policy was trained for"
         )
     read = packing.flag("normalize_min_max", True)
-    state = _statistics(directory, state_of(directory, pack) if read else {}, STATE, features)
+    state = _statistics(directory, lerobot.state_of(directory, pack) if read else {}, STATE, features)
     action, bounded, executed = _actions(directory, decode, features)
     if kind == _LIBERO and executed is not None:
         executed = min(executed, _LIBERO_STEPS)
@@ -122,7 +111,7 @@ def read_groot_processors(directory: Path, features: Features) -> GrootProcessor
     return GrootProcessors(
         normalizers={} if state is None else {STATE: state},
         action=action,
-        renamed=renamed_observations(directory, before, features),
+        renamed=lerobot.renamed_observations(directory, before, features),
         tokenizer={"tokenizer_name": encoding.text("model_name", "nvidia/Cosmos-Reason2-2B", _MOST_LETTERS)},
         cameras=_cameras(packing, features),
         frames=1 if packing.values.get("video_horizon") is None else packing.number("video_horizon", most=_MOST_FRAMES),
@@ -147,7 +136,7 @@ def _settings(directory: Path, step: Mapping[str, Any]) -> Settings:
     return Settings(step["config"], f"{directory}: {step['registry_name']}.")
 
 
-def _cameras(packing: Settings, features: Features) -> tuple[str, ...]:
+def _cameras(packing: Settings, features: lerobot.Features) -> tuple[str, ...]:
     """In the order of the base's own names, of which lerobot knows one by another; or in alphabetical order."""
     there = sorted(key for key, (kind, _) in features.items() if kind == "VISUAL")
     own, found = packing.values.get("video_modality_keys") or [], list[str]()
@@ -176,14 +165,14 @@ def _geometry(encoding: Settings) -> Geometry:
 
 
 def _actions(
-    directory: Path, step: Mapping[str, Any], features: Features
-) -> tuple[Statistics | None, bool, int | None]:
+    directory: Path, step: Mapping[str, Any], features: lerobot.Features
+) -> tuple[lerobot.Statistics | None, bool, int | None]:
     """How actions are unnormalised, whether they are clipped before, and how many of a chunk mean something."""
     settings, count = _settings(directory, step), features[ACTION][1][0]
     if settings.values.get("env_action_dim", 0) not in (0, count):
         raise settings.refusal("env_action_dim", f"{count}, as many as an action has, or 0")
     if step["registry_name"] == _UNPACK:
-        tensors = state_of(directory, step) if settings.flag("normalize_min_max", True) else {}
+        tensors = lerobot.state_of(directory, step) if settings.flag("normalize_min_max", True) else {}
         statistics = _statistics(directory, tensors, ACTION, features)
         if tensors and statistics is None:
             raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
@@ -202,11 +191,13 @@ def _actions(
     return _statistics(directory, tensors, ACTION, features), True, steps
 
 
-def _statistics(directory: Path, tensors: Mapping[str, Tensor], key: str, features: Features) -> Statistics | None:
+def _statistics(
+    directory: Path, tensors: Mapping[str, Tensor], key: str, features: lerobot.Features
+) -> lerobot.Statistics | None:
     """The range of a feature; None where nothing is known of it."""
     names = [f"{key}.{name}" for name in ("min", "max")]
     if not all(name in tensors for name in names):
         return None
     kind, shape = features[key]
-    low, high = (as_statistic(directory, name, tensors[name], kind, shape) for name in names)
-    return Statistics("MIN_MAX", low, high, _EPSILON, clipped=True)
+    low, high = (lerobot.as_statistic(directory, name, tensors[name], kind, shape) for name in names)
+    return lerobot.Statistics("MIN_MAX", low, high, _EPSILON, clipped=True)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
+from . import lerobot_vla as vla
 from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
@@ -24,15 +25,6 @@ from .instruction import encoder_folders, task_tokens
 from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
 from .lerobot_policy import read_weights
-from .lerobot_vla import (
-    Gathered,
-    padded_size,
-    positive_number,
-    read_vla_config,
-    read_vla_processors,
-    require_square,
-    vla_spec,
-)
 from .pi import Expert, Pi, PiConfig, Prefix
 from .saved_weights import filled
 from .siglip import SiglipConfig
@@ -48,8 +40,8 @@ _VISION_HEADS = 16
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
-    shared = read_vla_config(directory, entries, options)
-    processors, adaptive = read_vla_processors(shared), entries["type"] == "pi05"
+    shared = vla.read_vla_config(directory, entries, options)
+    processors, adaptive = vla.read_vla_processors(shared), entries["type"] == "pi05"
     if adaptive and options.task is not None:
         raise CheckpointError(
             f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"
@@ -68,9 +60,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
         task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
-    encoder = Gathered(shared, processors, Prefix(network), config.state, task)
+    encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task)
     side = config.vision.image_size
-    spec = vla_spec(shared, processors, (side, side), "centre", sizes, options)
+    spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options)
     if adaptive:  # the instruction holds it
         own = processors.renamed.get(STATE, STATE)
         others = {key: each for key, each in spec.observations.items() if key != own}
@@ -83,7 +75,7 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
     settings = shared.settings
     patch = _shape(weights, f"{_VISION}embeddings.patch_embedding.weight", 4)
     resolution = settings.size("image_resolution", [224, 224], MOST_PIXELS) or (224, 224)
-    require_square(settings, "image_resolution", resolution, patch[2])
+    vla.require_square(settings, "image_resolution", resolution, patch[2])
     width = _shape(weights, f"{_VISION}encoder.layers.0.mlp.fc1.weight", 2)
     vision = SiglipConfig(
         hidden_size=patch[0],
@@ -101,9 +93,9 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
         text=text,
         vocabulary=_shape(weights, f"{_TEXT}embed_tokens.weight", 2)[0],
         expert=expert,
-        state=None if adaptive else padded_size(settings, "max_state_dim", shared.state_dim),
-        actions=padded_size(settings, "max_action_dim", shared.action_dim),
-        periods=(positive_number(settings, "min_period", 4e-3), positive_number(settings, "max_period", 4.0)),
+        state=None if adaptive else vla.padded_size(settings, "max_state_dim", shared.state_dim),
+        actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
+        periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
     )
 
 

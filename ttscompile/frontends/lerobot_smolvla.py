@@ -13,24 +13,13 @@ import torch
 from torch import nn
 
 from ..core.spec import PolicySpec
+from . import lerobot_vla as vla
 from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .instruction import encoder_folders, language_model_folder, task_tokens
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
 from .lerobot_policy import read_weights
-from .lerobot_vla import (
-    Gathered,
-    padded_size,
-    part_of,
-    positive_number,
-    read_language,
-    read_vla_config,
-    read_vla_processors,
-    require_square,
-    seen_size,
-    vla_spec,
-)
 from .saved_weights import filled
 from .settings import Settings, read_json
 from .siglip import SiglipConfig
@@ -62,8 +51,8 @@ _UNREAD = (".vlm.lm_head.weight", ".text_model.norm.weight")
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
-    shared = read_vla_config(directory, entries, options)
-    settings, processors = shared.settings, read_vla_processors(shared)
+    shared = vla.read_vla_config(directory, entries, options)
+    settings, processors = shared.settings, vla.read_vla_processors(shared)
     folders = encoder_folders(options.encoders, directory)
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))
@@ -76,9 +65,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         task = torch.tensor([task_tokens(text, tokenizer, found, length, config.vocabulary)])
     weights = {name.removeprefix("model."): value for name, value in read_weights(shared, options, *_UNREAD).items()}
     network = filled(lambda: SmolVLA(config), weights, "config.json, or the language model's,", directory)
-    encoder = Gathered(shared, processors, Prefix(network), config.state, task)
+    encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task)
     resize = None if settings.values.get("resize_imgs_with_padding", 0) is None else config.image
-    spec = vla_spec(shared, processors, resize, "start", sizes, options)
+    spec = vla.vla_spec(shared, processors, resize, "start", sizes, options)
     return EncodedDenoiser(encoder, Expert(network)).eval(), spec
 
 
@@ -86,14 +75,14 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     """Sizes and variant, of the policy's entries and those of its language model."""
     settings = shared.settings
     settings.require(add_image_special_tokens=False, use_delta_joint_actions_aloha=False)
-    vision_entries, text = part_of(model, "vision_config"), part_of(model, "text_config")
+    vision_entries, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
     names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
     vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
     layers = _layers(settings, text.number("num_hidden_layers", None, _MOST_LAYERS))
     heads, width = text.number("num_attention_heads", None, MOST), text.number("hidden_size", None, MOST)
     own = Settings({"num_key_value_heads": heads} | dict(text.values), text.where)
-    language = read_language(own, layers, width // heads)
-    expert = expert_of(language, positive_number(settings, "expert_width_multiplier", 0.75))
+    language = vla.read_language(own, layers, width // heads)
+    expert = expert_of(language, vla.positive_number(settings, "expert_width_multiplier", 0.75))
     scale = model.number("scale_factor", 2)
     if not 2 <= expert.width <= MOST or expert.width % 2:
         raise settings.refusal("expert_width_multiplier", f"a share that leaves an even width of {width}", 0.75)
@@ -105,17 +94,17 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
         image=_image(shared, vision.patch_size * scale),
         expert=expert,
         crosses=_crosses(settings, layers),
-        state=padded_size(settings, "max_state_dim", shared.state_dim),
-        actions=padded_size(settings, "max_action_dim", shared.action_dim),
-        periods=(positive_number(settings, "min_period", 4e-3), positive_number(settings, "max_period", 4.0)),
+        state=vla.padded_size(settings, "max_state_dim", shared.state_dim),
+        actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
+        periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
     )
 
 
 def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
     """What the encoder sees; lerobot saves width before height."""
     resize = shared.settings.size("resize_imgs_with_padding", [512, 512], MOST_PIXELS)
-    height, width = seen_size(shared, None if resize is None else (resize[1], resize[0]))
-    require_square(shared.settings, "resize_imgs_with_padding", (height, width), multiple)
+    height, width = vla.seen_size(shared, None if resize is None else (resize[1], resize[0]))
+    vla.require_square(shared.settings, "resize_imgs_with_padding", (height, width), multiple)
     return height, width
 
 

@@ -14,21 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .language_layers import (
-    Attention,
-    FeedForward,
-    LanguageConfig,
-    Norm,
-    Rotation,
-    Seen,
-    Words,
-    added,
-    prefix_mask,
-    read_prefix,
-    rotate,
-    rotation,
-    waves,
-)
+from . import language_layers as layers
 from .siglip import Siglip, SiglipConfig
 
 
@@ -43,9 +29,9 @@ class PiConfig:
     """
 
     vision: SiglipConfig
-    text: LanguageConfig
+    text: layers.LanguageConfig
     vocabulary: int
-    expert: LanguageConfig
+    expert: layers.LanguageConfig
     state: int | None
     actions: int
     periods: tuple[float, float]
@@ -59,7 +45,7 @@ class PiConfig:
 class _AdaptiveNorm(nn.Module):
     """Root mean square normalisation with scale, shift and gate of a condition."""
 
-    def __init__(self, config: LanguageConfig) -> None:
+    def __init__(self, config: layers.LanguageConfig) -> None:
         super().__init__()
         self.dense = nn.Linear(config.width, 3 * config.width)
         self.epsilon = config.epsilon
@@ -76,18 +62,20 @@ class _ExpertLayer(nn.Module):
 
     def __init__(self, config: PiConfig) -> None:
         super().__init__()
-        norm: Any = _AdaptiveNorm if config.adaptive else Norm
+        norm: Any = _AdaptiveNorm if config.adaptive else layers.Norm
         self.adaptive = config.adaptive
         self.input_layernorm, self.post_attention_layernorm = norm(config.expert), norm(config.expert)
-        self.self_attn, self.mlp = Attention(config.expert), FeedForward(config.expert)
+        self.self_attn, self.mlp = layers.Attention(config.expert), layers.FeedForward(config.expert)
 
-    def forward(self, x: Tensor, prefix: Seen, turns: Rotation, mask: Tensor, condition: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, prefix: layers.Seen, turns: layers.Rotation, mask: Tensor, condition: Tensor
+    ) -> Tensor:
         attention = self.self_attn
         normed, gate = self._normed(self.input_layernorm, x, condition)
-        queries = rotate(attention.split(attention.q_proj(normed)), turns)
-        keys = rotate(attention.split(attention.k_proj(normed)), turns)
+        queries = layers.rotate(attention.split(attention.q_proj(normed)), turns)
+        keys = layers.rotate(attention.split(attention.k_proj(normed)), turns)
         pairs = ((prefix.keys, keys), (prefix.values, attention.split(attention.v_proj(normed))))
-        seen = Seen(*(torch.cat([attention.for_all_heads(each) for each in pair], 2) for pair in pairs))
+        seen = layers.Seen(*(torch.cat([attention.for_all_heads(each) for each in pair], 2) for pair in pairs))
         made = attention.attend(queries, seen, mask)
         x = x + (made if gate is None else made * gate)
         normed, gate = self._normed(self.post_attention_layernorm, x, condition)
@@ -113,9 +101,9 @@ class Pi(nn.Module):
         both.paligemma.model.vision_tower = Siglip(config.vision, (side, side))
         both.paligemma.model.multi_modal_projector = nn.Module()
         both.paligemma.model.multi_modal_projector.linear = nn.Linear(config.vision.hidden_size, config.text.width)
-        both.paligemma.model.language_model = Words(config.vocabulary, config.text)
+        both.paligemma.model.language_model = layers.Words(config.vocabulary, config.text)
         both.gemma_expert.model.layers = nn.ModuleList(_ExpertLayer(config) for _ in range(config.expert.layers))
-        both.gemma_expert.model.norm = _AdaptiveNorm(config.expert) if config.adaptive else Norm(config.expert)
+        both.gemma_expert.model.norm = _AdaptiveNorm(config.expert) if config.adaptive else layers.Norm(config.expert)
         self.paligemma_with_expert = both
         self.action_in_proj, self.action_out_proj = nn.Linear(config.actions, width), nn.Linear(width, config.actions)
         if config.state is None:
@@ -150,9 +138,9 @@ class Prefix(nn.Module):
         seen = seen.reshape(-1, len(images) * seen.shape[1], self.width)
         words = self.language_model.embed_tokens(tokens) * math.sqrt(self.width)
         valid = functional.pad(mask, (seen.shape[1], 0), value=True)
-        turns = rotation(torch.cumsum(valid, 1) - 1, self.channels)
+        turns = layers.rotation(torch.cumsum(valid, 1) - 1, self.channels)
         x = torch.cat([seen, words], 1)
-        cache = read_prefix(self.language_model.layers, x, turns, prefix_mask(valid))
+        cache = layers.read_prefix(self.language_model.layers, x, turns, layers.prefix_mask(valid))
         own = [] if self.state_proj is None or state is None else [self.state_proj(state)[:, None]]
         return (valid, *own, *cache)
 
@@ -174,7 +162,7 @@ class Expert(nn.Module):
         """``[B, T, D]``, times ``[B]`` from 1 to 0 and what ``Prefix`` gives -> the velocity ``[B, T, D]``."""
         valid, *cache = encoded
         x = self.action_in_proj(sample)
-        time = waves(timestep, self.config.expert.width, *self.config.periods)
+        time = layers.waves(timestep, self.config.expert.width, *self.config.periods)
         own = torch.zeros(1, 1)
         if self.config.adaptive:
             time = functional.silu(self.mlp_out(functional.silu(self.mlp_in(time))))
@@ -184,13 +172,13 @@ class Expert(nn.Module):
             x = torch.cat([state, self.mlp_out(functional.silu(self.mlp_in(x)))], 1)
             # The state does not see the actions.
             groups = torch.arange(x.shape[1]) > 0
-            own = added(groups[None, :] <= groups[:, None])
+            own = layers.added(groups[None, :] <= groups[:, None])
         count = x.shape[1]
-        turns = rotation(valid.sum(-1, keepdim=True) + torch.arange(count)[None], self.config.expert.channels)
-        before = added(valid[:, None, None, :]).expand(-1, -1, count, -1)
+        turns = layers.rotation(valid.sum(-1, keepdim=True) + torch.arange(count)[None], self.config.expert.channels)
+        before = layers.added(valid[:, None, None, :]).expand(-1, -1, count, -1)
         mask = torch.cat([before, own.expand(len(sample), 1, count, count)], 3)
         for i, layer in enumerate(self.layers):
-            x = layer(x, Seen(cache[2 * i], cache[2 * i + 1]), turns, mask, time)
+            x = layer(x, layers.Seen(cache[2 * i], cache[2 * i + 1]), turns, mask, time)
         actions = x[:, -sample.shape[1] :]
         normed = self.norm(actions, time)[0] if self.config.adaptive else self.norm(actions)
         return self.action_out_proj(normed)  # type: ignore[no-any-return]

@@ -14,21 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .language_layers import (
-    Attention,
-    FeedForward,
-    LanguageConfig,
-    Norm,
-    Rotation,
-    Seen,
-    Words,
-    added,
-    prefix_mask,
-    read_prefix,
-    rotate,
-    rotation,
-    waves,
-)
+from . import language_layers as layers
 from .siglip import Siglip, SiglipConfig, squares
 
 _MULTIPLE = 256
@@ -50,22 +36,22 @@ class SmolVLAConfig:
     """
 
     vision: SiglipConfig
-    text: LanguageConfig
+    text: layers.LanguageConfig
     vocabulary: int
     scale: int
     image: tuple[int, int]
-    expert: LanguageConfig
+    expert: layers.LanguageConfig
     crosses: tuple[bool, ...]
     state: int
     actions: int
     periods: tuple[float, float]
 
 
-def expert_of(text: LanguageConfig, multiplier: float) -> LanguageConfig:
+def expert_of(text: layers.LanguageConfig, multiplier: float) -> layers.LanguageConfig:
     """The expert beside a language model: narrower, with the same heads."""
     width = int(text.width * multiplier)
     hidden = _MULTIPLE * math.ceil(int(4 * int(2 * width / 3)) / _MULTIPLE)
-    return LanguageConfig(width, hidden, text.layers, text.heads, text.groups, text.channels, text.epsilon)
+    return layers.LanguageConfig(width, hidden, text.layers, text.heads, text.groups, text.channels, text.epsilon)
 
 
 class _Connector(nn.Module):
@@ -91,11 +77,13 @@ class _ExpertLayer(nn.Module):
         super().__init__()
         expert = config.expert
         self.crosses = crosses
-        self.input_layernorm, self.post_attention_layernorm = Norm(expert), Norm(expert)
-        self.self_attn = Attention(expert, config.text.groups * config.text.channels if crosses else None)
-        self.mlp = FeedForward(expert)
+        self.input_layernorm, self.post_attention_layernorm = layers.Norm(expert), layers.Norm(expert)
+        self.self_attn = layers.Attention(expert, config.text.groups * config.text.channels if crosses else None)
+        self.mlp = layers.FeedForward(expert)
 
-    def forward(self, x: Tensor, prefix: Seen, turns: Rotation, own_turns: Rotation, mask: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, prefix: layers.Seen, turns: layers.Rotation, own_turns: layers.Rotation, mask: Tensor
+    ) -> Tensor:
         """``prefix`` in groups; ``mask`` of the prefix, or of prefix and actions."""
         attention = self.self_attn
         normed = self.input_layernorm(x)
@@ -103,14 +91,14 @@ class _ExpertLayer(nn.Module):
         if self.crosses:
             keys, values = (each.transpose(1, 2).flatten(2) for each in prefix)
             keys, values = attention.split(attention.k_proj(keys)), attention.split(attention.v_proj(values))
-            seen = Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
-            x = x + attention.attend(rotate(queries, own_turns), seen, mask)
+            seen = layers.Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
+            x = x + attention.attend(layers.rotate(queries, own_turns), seen, mask)
         else:
-            keys = rotate(attention.split(attention.k_proj(normed)), turns)
+            keys = layers.rotate(attention.split(attention.k_proj(normed)), turns)
             values = attention.split(attention.v_proj(normed))
             pairs = ((prefix.keys, keys), (prefix.values, values))
-            seen = Seen(*(torch.cat([attention.for_all_heads(each) for each in pair], 2) for pair in pairs))
-            x = x + attention.attend(rotate(queries, turns), seen, mask)
+            seen = layers.Seen(*(torch.cat([attention.for_all_heads(each) for each in pair], 2) for pair in pairs))
+            x = x + attention.attend(layers.rotate(queries, turns), seen, mask)
         return x + self.mlp(self.post_attention_layernorm(x))  # type: ignore[no-any-return]
 
 
@@ -128,10 +116,10 @@ class SmolVLA(nn.Module):
         both.vlm.model = nn.Module()
         both.vlm.model.vision_model = Siglip(config.vision, config.image)
         both.vlm.model.connector = _Connector(config)
-        both.vlm.model.text_model = Words(config.vocabulary, config.text)
+        both.vlm.model.text_model = layers.Words(config.vocabulary, config.text)
         both.lm_expert = nn.Module()
         both.lm_expert.layers = nn.ModuleList(_ExpertLayer(config, crosses) for crosses in config.crosses)
-        both.lm_expert.norm = Norm(config.expert)
+        both.lm_expert.norm = layers.Norm(config.expert)
         self.vlm_with_expert = both
         self.state_proj = nn.Linear(config.state, config.text.width)
         self.action_in_proj, self.action_out_proj = nn.Linear(config.actions, width), nn.Linear(width, config.actions)
@@ -163,9 +151,9 @@ class Prefix(nn.Module):
         words = self.text_model.embed_tokens(tokens) * scale
         x = torch.cat([seen, words, self.state_proj(state)[:, None]], 1)
         valid = functional.pad(mask, (seen.shape[1], 1), value=True)
-        turns = rotation(torch.cumsum(valid, 1) - 1, self.channels)
+        turns = layers.rotation(torch.cumsum(valid, 1) - 1, self.channels)
         # Images and words do not see the state.
-        return valid, *read_prefix(self.text_model.layers, x, turns, prefix_mask(valid, late=1))
+        return valid, *layers.read_prefix(self.text_model.layers, x, turns, layers.prefix_mask(valid, late=1))
 
 
 class Expert(nn.Module):
@@ -185,17 +173,17 @@ class Expert(nn.Module):
         valid, *seen = encoded
         config, count = self.config, sample.shape[1]
         x = self.action_in_proj(sample)
-        time = waves(timestep, config.expert.width, *config.periods)
+        time = layers.waves(timestep, config.expert.width, *config.periods)
         x = torch.cat([x, time[:, None].expand_as(x)], 2)
         x = self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(x)))
         own = torch.arange(count)[None]
-        own_turns = rotation(own, config.expert.channels)
-        turns = rotation(valid.sum(-1, keepdim=True) + own, config.expert.channels)
-        crossing = added(valid[:, None, None, :])
+        own_turns = layers.rotation(own, config.expert.channels)
+        turns = layers.rotation(valid.sum(-1, keepdim=True) + own, config.expert.channels)
+        crossing = layers.added(valid[:, None, None, :])
         # Actions see the prefix, and each other backwards in time.
-        later = added(torch.ones(count, count, dtype=torch.bool).tril())[None, None]
+        later = layers.added(torch.ones(count, count, dtype=torch.bool).tril())[None, None]
         whole = torch.cat([crossing.expand(-1, -1, count, -1), later.expand(len(sample), -1, -1, -1)], 3)
         for i, layer in enumerate(self.layers):
-            prefix = Seen(seen[2 * i], seen[2 * i + 1])
+            prefix = layers.Seen(seen[2 * i], seen[2 * i + 1])
             x = layer(x, prefix, turns, own_turns, crossing if layer.crosses else whole)
         return self.action_out_proj(self.norm(x))  # type: ignore[no-any-return]
