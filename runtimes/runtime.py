@@ -299,12 +299,7 @@ class Runtime:
             wait([pruning])  # it reads the backend's memory: nobody may go on before it is done, not even with an error
 
     def _settle(
-        self,
-        opened: _Opened,
-        plan: PlanArray,
-        written: BoolArray,
-        dropped: BoolArray,
-        repair: bool,
+        self, opened: _Opened, plan: PlanArray, written: BoolArray, dropped: BoolArray, repair: bool
     ) -> _Settled:
         """Cells that were given.
 

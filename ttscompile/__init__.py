@@ -15,36 +15,34 @@ from .measure.versions import VERSION as __version__
 if TYPE_CHECKING:
     from .builder import build as build
     from .calibration.pipeline import calibrate as calibrate
-    from .core.lattice import Source as Source
-    from .core.lattice import legalize as legalize
-    from .core.plan import Plan as Plan
-    from .core.plan import TokenReuse as TokenReuse
-    from .core.spec import Affine as Affine
-    from .core.spec import ChunkSpec as ChunkSpec
-    from .core.spec import Noise as Noise
-    from .core.spec import ObservationSpec as ObservationSpec
-    from .core.spec import PolicySpec as PolicySpec
-    from .core.spec import SamplerTable as SamplerTable
-    from .driver import compile_denoiser as compile_denoiser
-    from .driver import convert as convert
+    from .core.lattice import Source as Source, legalize as legalize
+    from .core.plan import Plan as Plan, TokenReuse as TokenReuse
+    from .core.spec import (
+        Affine as Affine,
+        ChunkSpec as ChunkSpec,
+        Noise as Noise,
+        ObservationSpec as ObservationSpec,
+        PolicySpec as PolicySpec,
+        SamplerTable as SamplerTable,
+    )
+    from .driver import compile_denoiser as compile_denoiser, convert as convert
     from .errors import TtscompileError as TtscompileError
     from .report.push import push as push
-    from .runtimes.executor import AsyncExecutor as AsyncExecutor
-    from .runtimes.executor import ExecutorSettings as ExecutorSettings
-    from .runtimes.executor import GuardLimits as GuardLimits
-    from .runtimes.executor import Shadow as Shadow
+    from .runtimes.executor import (
+        AsyncExecutor as AsyncExecutor,
+        ExecutorSettings as ExecutorSettings,
+        GuardLimits as GuardLimits,
+        Shadow as Shadow,
+    )
     from .runtimes.info import PolicyInfo as PolicyInfo
     from .runtimes.load import load as load
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
     from .runtimes.report import CallReport as CallReport
     from .runtimes.torch.module import to_module as to_module
-    from .samplers.direct import DirectDenoiser as DirectDenoiser
-    from .samplers.direct import direct_table as direct_table
-    from .samplers.edm import EDMDenoiser as EDMDenoiser
-    from .samplers.edm import edm_table as edm_table
+    from .samplers.direct import DirectDenoiser as DirectDenoiser, direct_table as direct_table
+    from .samplers.edm import EDMDenoiser as EDMDenoiser, edm_table as edm_table
     from .samplers.flow import flow_matching_table as flow_matching_table
-    from .verification import Verification as Verification
-    from .verification import verify as verify
+    from .verification import Verification as Verification, verify as verify
 
 _HOMES = {
     name: home

@@ -21,8 +21,7 @@ from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, INT8, ORIGINAL, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
-from .frontends.copies import own_copy
-from .frontends.encoded import parts
+from .frontends.encoded import own_copy, parts
 from .frontends.examined import examine
 from .frontends.families import LoadOptions
 from .hub import fetch_checkpoint

@@ -71,11 +71,7 @@ def cost(at: Steps, ending: Steps) -> int:
 
 
 def best_family(
-    errors: Mapping[Steps, Array],
-    estimate: Callable[[Steps], Array],
-    evaluations: float,
-    bound: int,
-    returns: bool,
+    errors: Mapping[Steps, Array], estimate: Callable[[Steps], Array], evaluations: float, bound: int, returns: bool
 ) -> Family | None:
     """The family with the smallest mean error that needs at most so many evaluations on average; None if there is none.
 
@@ -102,11 +98,7 @@ def best_family(
 
 
 def _best_endings(
-    at: Steps,
-    by_cost: Mapping[int, Sequence[Steps]],
-    errors: Mapping[Steps, Array],
-    order: Indices,
-    evaluations: float,
+    at: Steps, by_cost: Mapping[int, Sequence[Steps]], errors: Mapping[Steps, Array], order: Indices, evaluations: float
 ) -> tuple[float, Family] | None:
     """The best three endings at most, and their shares, with their mean error; None where all need too much."""
     ends = np.round(np.linspace(0, len(order), CUTS + 1)).astype(int)

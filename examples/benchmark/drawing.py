@@ -60,10 +60,7 @@ def _panel(axes: Axes, rows: Rows, colours: Mapping[int, str]) -> None:
         own = [row for row in sparse if row["threads"] == threads]
         shares = [1 - row["sparsity"] for row in own]
         middle = [row["median_ms"] for row in own]
-        around = [
-            [row["median_ms"] - row["p10_ms"] for row in own],
-            [row["p90_ms"] - row["median_ms"] for row in own],
-        ]
+        around = [[row["median_ms"] - row["p10_ms"] for row in own], [row["p90_ms"] - row["median_ms"] for row in own]]
         axes.errorbar(shares, middle, around, color=colour, marker="o", markersize=4, capsize=2, linewidth=1.6)
         axes.plot(shares, [row["floor_ms"] for row in own], color=colour, linestyle="--", linewidth=1)
         for contestant, style in PYTORCH.items():

@@ -69,9 +69,7 @@ def torch_compile_contestant(network: Network, dense_flops: float, threads: int)
 
 
 def measure_in_passes(
-    by_threads: Mapping[int, Sequence[Contestant]],
-    effort: Effort,
-    on_round: Callable[[], None] = lambda: None,
+    by_threads: Mapping[int, Sequence[Contestant]], effort: Effort, on_round: Callable[[], None] = lambda: None
 ) -> dict[int, list[Measurement]]:
     """Time contestants, one thread count after the other, and all thread counts in every pass.
 

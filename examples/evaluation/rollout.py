@@ -255,8 +255,7 @@ def run_episodes(
     if on_done is not None:
         on_done(len(seeds))
     return Rollout(
-        episodes=tuple(known[seed] for seed in seeds),
-        call_ms=tuple(ms for part in parts for ms in part.call_ms),
+        episodes=tuple(known[seed] for seed in seeds), call_ms=tuple(ms for part in parts for ms in part.call_ms)
     )
 
 

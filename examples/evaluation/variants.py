@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 import ttscompile
 from ttscompile.artifact.load import read_manifest
-from ttscompile.cli.output import results_console as results_console
-from ttscompile.cli.output import run as run
+from ttscompile.cli.output import results_console as results_console, run as run
 from ttscompile.core.plan import DENSE, FULL
 from ttscompile.runtimes.info import PolicyInfo
 

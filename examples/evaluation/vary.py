@@ -48,11 +48,7 @@ from ttscompile.cli.output import identity_of
 from ttscompile.plots.figure import new_figure, require_picture_name, write_picture
 from ttscompile.trajectories import load_trajectories
 
-AXES = {
-    "episodes": "recorded episodes",
-    "minutes": "minutes of calibration at most",
-    "seed": "seed of the calibration",
-}
+AXES = {"episodes": "recorded episodes", "minutes": "minutes of calibration at most", "seed": "seed of the calibration"}
 """What may differ, and what the picture calls it."""
 
 COMPARED = 32

@@ -128,9 +128,7 @@ def scripted_windows(count: int) -> list[FloatArray]:
 
 
 def measure(
-    contestants: Sequence[Contestant],
-    runs: int,
-    on_run: Callable[[], None] = lambda: None,
+    contestants: Sequence[Contestant], runs: int, on_run: Callable[[], None] = lambda: None
 ) -> list[Measurement]:
     """Time the contestants, one call each in turn, ``runs`` times.
 

@@ -66,10 +66,7 @@ class Head(nn.Module):
     def forward(self, sample: Tensor, timestep: Tensor, prefix_mask: Tensor, keys: Tensor, values: Tensor) -> Tensor:
         """The velocity ``[B, T, D]``."""
         return self.model.denoise_step(
-            prefix_pad_masks=prefix_mask,
-            past_key_values=PrefixCache(keys, values),
-            x_t=sample,
-            timestep=timestep,
+            prefix_pad_masks=prefix_mask, past_key_values=PrefixCache(keys, values), x_t=sample, timestep=timestep
         )
 
 

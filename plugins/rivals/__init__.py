@@ -15,10 +15,7 @@ from ttscompile.calibration.strategy import Strategy
 
 RIVALS = (
     Strategy(
-        "interval",
-        "FORA, arXiv 2407.01425; EfficientVLA (arXiv 2506.10100)",
-        "rivals.static:interval",
-        baseline=True,
+        "interval", "FORA, arXiv 2407.01425; EfficientVLA (arXiv 2506.10100)", "rivals.static:interval", baseline=True
     ),
     Strategy("bac", "block-wise adaptive caching (arXiv 2506.13456)", "rivals.bac:bac"),
     Strategy(

@@ -31,8 +31,7 @@ from .protocol import LARGE, Message, Methods, Request, answer, read_request
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
-    from websockets.http11 import Request as Handshake
-    from websockets.http11 import Response
+    from websockets.http11 import Request as Handshake, Response
 
 
 HEALTH, METRICS = "/health", "/metrics"

@@ -163,11 +163,7 @@ class CallModule(nn.Module):
     """
 
     def __init__(
-        self,
-        view: View,
-        weights: Mapping[str, npt.NDArray[Any]],
-        advance: Advance,
-        correction: Correction | None,
+        self, view: View, weights: Mapping[str, npt.NDArray[Any]], advance: Advance, correction: Correction | None
     ) -> None:
         super().__init__()
         manifest, pieces = view.manifest, view.pieces

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import budget as budgets
-from ttscompile.calibration import pipeline, schedule
+from ttscompile.calibration import budget as budgets, pipeline, schedule
 from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.pipeline import CalibrationResult, calibrate

@@ -16,9 +16,7 @@ from tests.plans import store_schedules
 from ttscompile.cli import main
 from ttscompile.core.finding import Finding, Level
 from ttscompile.core.lattice import uniform_plan
-from ttscompile.doctor import diagnosis as doctor
-from ttscompile.doctor import machine as doctor_machine
-from ttscompile.doctor import packages as doctor_packages
+from ttscompile.doctor import diagnosis as doctor, machine as doctor_machine, packages as doctor_packages
 from ttscompile.doctor.target import artifact_findings
 
 

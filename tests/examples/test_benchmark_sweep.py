@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from drawing import draw
-from drawing import main as draw_main
+from drawing import draw, main as draw_main
 from sweep import COMPILED, QUICK, Row, main, networks, results_table
 
 from tests.examples.printed import printed

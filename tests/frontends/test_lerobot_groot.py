@@ -191,11 +191,7 @@ def step(directory: Path, name: str, **changes: Any) -> None:
     [
         ("pack", {"embodiment_tag": "mine"}, "embodiment_tag 'mine' is none of embodiment_mapping.*Set embodiment_tag"),
         ("pack", {"embodiment_tag": None}, "embodiment_tag None is none of"),
-        (
-            "pack",
-            {"embodiment_mapping": {"new_embodiment": 11}},
-            "weight _groot_model.* has no part 11, of the",
-        ),
+        ("pack", {"embodiment_mapping": {"new_embodiment": 11}}, "weight _groot_model.* has no part 11, of the"),
         ("pack", {"clip_outliers": False}, "clip_outliers is False; expected true"),
         ("pack", {"max_state_dim": 7}, "max_state_dim is 6; expected 7"),
         ("pack", {"state_horizon": 2}, "state_horizon is 2; expected 1"),

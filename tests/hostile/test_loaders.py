@@ -24,8 +24,7 @@ from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, 
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config
 from ttscompile.frontends.interpolation import Config
-from ttscompile.trajectories import frames as trajectories_frames
-from ttscompile.trajectories import load_trajectories
+from ttscompile.trajectories import frames as trajectories_frames, load_trajectories
 
 
 @pytest.fixture

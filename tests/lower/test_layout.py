@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tests.lower.modules import ALL, captured, random_values
 from tests.rounding import Counted, assert_equal_but_for_rounding

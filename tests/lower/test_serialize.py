@@ -10,8 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tests.lower.modules import ALL, captured
 from ttscompile.artifact.graph_json import DTYPES, ENUM_KINDS, graph_from_json, graph_to_json

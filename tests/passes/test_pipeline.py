@@ -10,8 +10,7 @@ from tests.passes.modules import MODULES, STREAMS, compiled, evaluate_pieces, ex
 from tests.passes.specs import toy_spec
 from tests.quick import first_quick
 from tests.rounding import Counted, assert_equal_but_for_rounding
-from ttscompile.driver import _run as _pass
-from ttscompile.driver import transform
+from ttscompile.driver import _run as _pass, transform
 from ttscompile.errors import PassError
 from ttscompile.ir.program import Captured, Program
 from ttscompile.passes.base import PassResult

@@ -10,8 +10,7 @@ import pytest
 import torch
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 
-from tests.lower.whole_call import Episode as FileEpisode
-from tests.lower.whole_call import inputs, make
+from tests.lower.whole_call import Episode as FileEpisode, inputs, make
 from tests.rounding import Counted, amplified, assert_equal_but_for_rounding, bound
 from ttscompile import Noise, SamplerTable, Source, flow_matching_table
 from ttscompile.artifact import Artifact, load_artifact

@@ -21,8 +21,7 @@ from ttscompile.artifact.golden import load_golden_plans
 from ttscompile.artifact.load import read_manifest
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactChangedError, ArtifactError
-from ttscompile.runtimes import load as loading
-from ttscompile.runtimes import open as opening
+from ttscompile.runtimes import load as loading, open as opening
 from ttscompile.runtimes.onnxruntime import sessions
 
 from .replaced import CHANGES, COMMANDS, answer, load_often, prepared, prepared_by_commands, reuse

@@ -15,8 +15,7 @@ import zarr
 from tests.hostile.pickles import Runs
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import TrajectoryError
-from ttscompile.trajectories import Episode, load_trajectories, sandbox
-from ttscompile.trajectories import frames as trajectories_frames
+from ttscompile.trajectories import Episode, frames as trajectories_frames, load_trajectories, sandbox
 
 from .data_sets import ENDS, IMAGES, LOW, SOURCES, arrays, as_hdf5, as_lerobot, as_npz, as_zarr, read_here
 

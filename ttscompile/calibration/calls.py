@@ -55,9 +55,7 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
 
 
 def load_episodes(
-    spec: PolicySpec,
-    trajectories: Sequence[str | os.PathLike[str]],
-    observation: Mapping[str, Sequence[str]] | None,
+    spec: PolicySpec, trajectories: Sequence[str | os.PathLike[str]], observation: Mapping[str, Sequence[str]] | None
 ) -> list[Episode]:
     """The recorded episodes, as the policy observes them; see ``load_trajectories``.
 

@@ -7,7 +7,7 @@ import pkgutil
 from ..errors import CalibrationError
 from .strategy import Strategy
 
-OWN = (
+STRATEGIES: tuple[Strategy, ...] = (
     Strategy(
         "tts",
         "whole steps with a correction, the same for every observation; this project's own",
@@ -21,9 +21,8 @@ OWN = (
         uses_pruner=True,
         consecutive=True,
     ),
+    *pkgutil.resolve_name("ttscompile.rivals:RIVALS"),
 )
-
-STRATEGIES: tuple[Strategy, ...] = (*OWN, *pkgutil.resolve_name("ttscompile.rivals:RIVALS"))
 """In the order in which they are listed; the first one is the default."""
 
 NAMES = tuple(one.name for one in STRATEGIES)

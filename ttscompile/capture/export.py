@@ -24,7 +24,7 @@ from torch.export.graph_signature import InputKind, OutputKind
 
 from ..core.spec import PolicySpec
 from ..errors import CaptureError
-from ..frontends.copies import sharing_copy
+from ..frontends.encoded import sharing_copy
 from ..ir.evaluate import evaluator, without_stack_traces
 from ..ir.graph import GETITEM, Argument, Enum, Graph, Node, Ref, TensorType
 from .batch import BATCHES, REMEDY, unify_batch

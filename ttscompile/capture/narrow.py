@@ -14,8 +14,8 @@ from torch import nn
 
 from ..core.spec import PolicySpec
 from ..errors import SpecError
-from ..frontends.copies import sharing_copy
 from ..frontends.eager import evaluation
+from ..frontends.encoded import sharing_copy
 
 TOLERANCE = 1e-4
 """Of the prediction's deviation. Rounding is a hundredth of it; a network that attends to later steps is far above."""

@@ -9,8 +9,7 @@ import click
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.proposer import NAMES as LEARNED
-from ttscompile.calibration.proposer import PROPOSERS
+from ttscompile.calibration.proposer import NAMES as LEARNED, PROPOSERS
 from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
 from ttscompile.cli import options
 from ttscompile.cli.ending import Status

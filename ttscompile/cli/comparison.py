@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 def compare(
-    directory: Path,
-    artifacts: Mapping[str, Artifact],
-    others: Sequence[Path],
-    trajectories: Sequence[Path],
-    **how: Any,
+    directory: Path, artifacts: Mapping[str, Artifact], others: Sequence[Path], trajectories: Sequence[Path], **how: Any
 ) -> Comparison:
     """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
 

@@ -19,8 +19,7 @@ from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
 from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
-from ttscompile.report import Given, build, render, verified
-from ttscompile.report import Section as OfPage
+from ttscompile.report import Given, Section as OfPage, build, render, verified
 from ttscompile.report.build import NOT_RUN
 from ttscompile.report.page import require_packages
 from ttscompile.report.usage import run_episode
@@ -167,11 +166,7 @@ def write_page(
 
 
 def checked(
-    directory: Path,
-    identity: str,
-    trajectories: Sequence[Path],
-    sources: Sources,
-    progress: Callable[[str], None],
+    directory: Path, identity: str, trajectories: Sequence[Path], sources: Sources, progress: Callable[[str], None]
 ) -> tuple[bool, OfPage]:
     """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
 

@@ -32,12 +32,7 @@ from ttscompile.cli.types import FILE, TEXT
 @click.option("--private", is_flag=True, help="Make the repository private, if it is made now.")
 @click.option("--dry-run", is_flag=True, help="Print the card, and upload nothing.")
 def push(
-    directory: Path,
-    repository: str,
-    evaluations: tuple[Path, ...],
-    licence: str | None,
-    private: bool,
-    dry_run: bool,
+    directory: Path, repository: str, evaluations: tuple[Path, ...], licence: str | None, private: bool, dry_run: bool
 ) -> None:
     """Upload the artifact DIRECTORY to REPOSITORY (org/name) on the Hugging Face hub, with a model card.
 

@@ -22,11 +22,7 @@ from ttscompile.report.build import figure
 @json_option
 @click.pass_context
 def verify(
-    context: click.Context,
-    directory: Path,
-    trajectories: tuple[Path, ...],
-    sources: Sources,
-    as_json: bool,
+    context: click.Context, directory: Path, trajectories: tuple[Path, ...], sources: Sources, as_json: bool
 ) -> None:
     """Check the artifact DIRECTORY against the answers of the original network that it holds.
 
@@ -36,10 +32,7 @@ def verify(
     console = progress()
     with only_results_on_stdout(), console.status("verifying") as status:
         found = ttscompile.verify(
-            directory,
-            trajectories,
-            sources=sources,
-            progress=lambda what: status.update(f"verifying: {what}"),
+            directory, trajectories, sources=sources, progress=lambda what: status.update(f"verifying: {what}")
         )
     for rung in found.skipped:
         say(console, f"warning: {rung.name} was skipped: {rung.told.rstrip('.')}. {rung.remedy}")

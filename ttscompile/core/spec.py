@@ -17,8 +17,7 @@ from ..errors import SpecError
 from .coercion import integer, numbers
 from .pictures import in_bytes
 from .rules import LOOP_NAME, OMITTED, DType, LoopName, Positive, Shape
-from .sampler import FloatArray as FloatArray
-from .sampler import SamplerTable as SamplerTable
+from .sampler import FloatArray as FloatArray, SamplerTable as SamplerTable
 
 FP32, INT8, BF16, FP16 = "fp32", "int8", "bf16", "fp16"
 PRECISIONS = (FP32, INT8)

@@ -15,9 +15,7 @@ from torch import nn
 
 from ..core.spec import ChunkSpec, PolicySpec
 from ..errors import CheckpointError
-from . import diffusion_policy_transformer as transformer
-from . import diffusion_policy_unet as unet
-from . import dp3
+from . import diffusion_policy_transformer as transformer, diffusion_policy_unet as unet, dp3
 from .checkpoint import plain_config, read_checkpoint
 from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved
 from .diffusion_policy_weights import affine, choose_weights

@@ -15,10 +15,8 @@ from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from .conditional_unet1d import ConditionalUnet1D, UNetConfig
 from .conditioning import GlobalDenoiser, InpaintingDenoiser, LocalDenoiser
-from .diffusion_policy_hybrid import ENCODER_KEYS
-from .diffusion_policy_hybrid import build_encoder as build_robomimic_encoder
-from .diffusion_policy_images import build_encoder as build_image_encoder
-from .diffusion_policy_images import encoder_settings
+from .diffusion_policy_hybrid import ENCODER_KEYS, build_encoder as build_robomimic_encoder
+from .diffusion_policy_images import build_encoder as build_image_encoder, encoder_settings
 from .diffusion_policy_parts import (
     Observed,
     Rebuilt,

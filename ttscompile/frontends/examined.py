@@ -85,9 +85,8 @@ def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[s
     entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
     both = {**entries["input_features"], **entries["output_features"]}
     features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
-    how = () if entries["type"] == "groot" else (str(entries["type"]),)
-    read = read_groot_processors if entries["type"] == "groot" else read_processors
-    found, own = read(directory, features, *how), (one for one in steps if one.get("registry_name") == NORMALIZE)
+    how, own = (directory, features), (one for one in steps if one.get("registry_name") == NORMALIZE)
+    found = read_groot_processors(*how) if entries["type"] == "groot" else read_processors(*how, str(entries["type"]))
     step: dict[str, Any] = {"config": {}} | next(own, {})
     doubts, action = [], {} if found.action is None else {ACTION: found.action}
     for key, (kind, _) in features.items():

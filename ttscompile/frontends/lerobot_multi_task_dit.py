@@ -19,22 +19,13 @@ from torch import nn
 from ..core.spec import Instruction, PolicySpec, SamplerTable
 from ..errors import CheckpointError
 from ..samplers.flow import METHODS, flow_matching_table
+from . import lerobot_policy as lerobot
 from .clip import TextConfig, VisionConfig, encoder_config, find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
 from .instruction import NO_TASK, encoder_folders, task_tokens
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import (
-    MASK,
-    TOKENS,
-    Measured,
-    diffusion_loops,
-    integration_steps,
-    language_inputs,
-    policy_spec,
-    read_weights,
-)
 from .lerobot_processors import PREPROCESSOR, Processors, read_processors
 from .loops import Loops, loops_of
 from .multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
@@ -42,11 +33,8 @@ from .saved_weights import require_weights
 from .settings import Settings
 
 _CLIP = "openai/clip-vit-base-patch16"
-_MOST_LETTERS = 200
-_MOST_LAYERS = 512
-"""Of all transformers together. Each is made twice, first without memory, which takes time."""
-
-_PLACED = "the tokenizer pads before the instruction, or does not cut it; expected padding_side right, truncation true."
+_MOST_LETTERS, _MOST_LAYERS = 200, 512
+"""Of a name; of all transformers together, each of which is made twice, first without memory, which takes time."""
 
 
 @dataclass(frozen=True)
@@ -151,10 +139,11 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         "positions": "rotary" if config.network.use_rope else "learned",
         **({} if options.task is None else {"task": options.task}),
     }
-    language = language_inputs(config.tokens, text.vocab_size) if compiled_in is None else {}
-    spec = policy_spec(config, processors, _loops(config, options), source, language)
-    told = Instruction(TOKENS, MASK, processors.new_line) if language and _in_words(processors) else None
-    return module.eval(), replace(spec, instruction=told)
+    language = lerobot.language_inputs(config.tokens, text.vocab_size) if compiled_in is None else {}
+    spec = lerobot.policy_spec(config, processors, _loops(config, options), source, language)
+    if language and _in_words(processors):
+        spec = replace(spec, instruction=Instruction(lerobot.TOKENS, lerobot.MASK, processors.new_line))
+    return module.eval(), spec
 
 
 def with_inputs(
@@ -174,21 +163,21 @@ def with_inputs(
                 f"images reach the vision encoder as {geometry.size}, and it takes {vision.image_size} pixels square."
                 " Check image_resize_shape and image_crop_shape, and that the encoder found is the policy's own."
             )
-    tokens = TOKENS.replace(".", "_"), MASK.replace(".", "_")
+    tokens = lerobot.TOKENS.replace(".", "_"), lerobot.MASK.replace(".", "_")
     condition = ConditionEncoder(config, processors, geometry, network.observation_encoder, tokens, task)
     return EncodedDenoiser(condition, network.noise_predictor)
 
 
 def _loops(config: MultiTaskDiTConfig, options: LoadOptions) -> Loops:
     if not config.flow:
-        return diffusion_loops(config, options)
+        return lerobot.diffusion_loops(config, options)
     return loops_of(lambda each: _flow(config, each), options, "its own integration")
 
 
 def _flow(config: MultiTaskDiTConfig, options: LoadOptions) -> SamplerTable:
     """The integration that is configured, or asked for in its place."""
     method = options.sampler or config.settings.choice("integration_method", *METHODS)
-    count = integration_steps(config.settings, options, "num_integration_steps", 100)
+    count = lerobot.integration_steps(config.settings, options, "num_integration_steps", 100)
     return flow_matching_table(torch.linspace(0, 1, count + 1).tolist(), method)
 
 
@@ -197,7 +186,8 @@ def _tokens(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Tokens and mask ``[1, n]`` of an instruction, without lerobot's padding: no token before it reads that."""
     if not _in_words(processors):
-        raise CheckpointError(f"{PREPROCESSOR}: {_PLACED} {NO_TASK}")
+        found = f"{PREPROCESSOR}: the tokenizer pads before the instruction, or does not cut it"
+        raise CheckpointError(f"{found}; expected padding_side right, truncation true. {NO_TASK}")
     name = str(processors.tokenizer.get("tokenizer_name") or config.text_encoder_name)
     tokens = torch.tensor([task_tokens(task, name, find_encoder(name, folders), config.tokens, text.vocab_size)])
     return tokens, torch.ones_like(tokens, dtype=torch.bool)
@@ -212,7 +202,7 @@ def _in_words(processors: Processors) -> bool:
 def _read_weights(config: MultiTaskDiTConfig, options: LoadOptions) -> dict[str, torch.Tensor]:
     """The weights of a policy as float32, under the names that transformers 5 gives."""
     found = {}
-    for name, value in read_weights(config, options, ".position_ids").items():
+    for name, value in lerobot.read_weights(config, options, ".position_ids").items():
         # transformers 4 saves an encoder below a level of its own, which transformers 5 leaves out.
         short = name.replace(".model.vision_model.", ".model.")
         found[short.replace(".text_encoder.text_model.", ".text_encoder.")] = value
@@ -230,7 +220,7 @@ class Network(nn.Module):
         self.observation_encoder = ObservationEncoder(cameras, vision, text, width, config.separate_encoders, frames)
 
 
-class ConditionEncoder(Measured):
+class ConditionEncoder(lerobot.Measured):
     """Raw observations to the condition vector: normalised, cropped and encoded.
 
     Args:

@@ -27,7 +27,7 @@ from .lerobot_config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotCon
 from .lerobot_policy import integration_steps, read_weights
 from .lerobot_processors import DOMAIN, IMAGENET, OWN_STEPS, Processors
 from .lerobot_vla import Gathered, part_of, positive_number, read_vla_config, read_vla_processors, seen_size, vla_spec
-from .saved_weights import require_weights
+from .saved_weights import renamed, require_weights
 from .settings import Settings
 from .xvla import XVLA, Denoiser, Prefix, XVLAConfig
 
@@ -101,8 +101,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     require_weights(network.state_dict(), weights, f"{directory / CONFIG}")
     network.load_state_dict(weights, assign=True)
     encoder = Gathered(shared, processors, Prefix(network), config.state or None, task)
-    sizes = {"actions": mode.actions}
-    sizes |= {} if options.task is not None else {"tokens": length, "vocabulary": florence.text.vocab_size}
+    sizes = {"actions": mode.actions, "tokens": length, "vocabulary": florence.text.vocab_size}
     spec = vla_spec(shared, processors, resize, "start", sizes, options, lambda each: _sampler(settings, each))
     fill = MEAN if resize and colours else ()  # lerobot resizes what is normalised
     observations = {key: replace(one, fill=fill) if one.image else one for key, one in spec.observations.items()}
@@ -227,9 +226,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, network: XVLA, domain:
     count, found = shared.settings.number("num_domains", 30, _MOST_DOMAINS), dict[str, Tensor]()
     expected = network.state_dict()
     for saved, value in read_weights(shared, options, ".final_logits_bias").items():
-        name = saved.removeprefix("model.")
-        for pattern, new in _RENAMED:
-            name = re.sub(pattern, new, name)
+        name = renamed(saved.removeprefix("model."), _RENAMED)
         of_domain = next((re.sub(*each, name) for each in _OF_DOMAIN if re.search(each[0], name)), None)
         if name == _PROJECTION:
             found["vlm.multi_modal_projector.image_projection.weight"] = value.T.contiguous()

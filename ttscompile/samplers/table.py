@@ -69,12 +69,7 @@ class _Chains:
         self.noise_to_next = self._added / (1 if self.multistep else float(_draw(0).flatten()[0])) + 0.0
 
     def run(
-        self,
-        samples: torch.Tensor,
-        outs: torch.Tensor,
-        seeds: Sequence[int],
-        noise: torch.Tensor,
-        follow: bool = False,
+        self, samples: torch.Tensor, outs: torch.Tensor, seeds: Sequence[int], noise: torch.Tensor, follow: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """One chain, on samples and outputs float64 ``[K, ...]``.
 

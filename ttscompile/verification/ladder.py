@@ -22,16 +22,7 @@ from ..errors import ArtifactChangedError, ArtifactError, RuntimeUnavailableErro
 from ..runtimes.open import MOST_THREADS, open_runtime
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import load_trajectories
-from .calls import (
-    DENSE_CALL,
-    PLANS,
-    RUNTIMES,
-    TOKENS,
-    check_dense,
-    check_plans,
-    check_runtimes,
-    check_tokens,
-)
+from .calls import DENSE_CALL, PLANS, RUNTIMES, TOKENS, check_dense, check_plans, check_runtimes, check_tokens
 from .network import BLOCK, EVALUATION, PREPROCESSING, Probe, check_blocks, check_evaluation, check_preprocessing
 from .precision import PLANS_PRECISION, PRECISION, check_plans_precision, check_precision
 from .reuse import ENGAGED, SPARSITY, Progress, check_engaged, check_episodes, choose

@@ -20,9 +20,8 @@ from ..artifact.view import View, view_of
 from ..core.plan import Plan
 from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
-from ..frontends.copies import sharing_copy
 from ..frontends.eager import eager_policy
-from ..frontends.encoded import parts
+from ..frontends.encoded import parts, sharing_copy
 from ..ir.dataflow import reachable_from
 from ..ir.evaluate import evaluator
 from ..ir.graph import Graph, backward_slice

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
-from torch import distributed as dist
+from torch import Tensor, distributed as dist, nn
 from torch.multiprocessing.spawn import spawn
 
 sys.path.insert(1, str(Path(__file__).parents[2] / "evaluation"))
@@ -100,10 +99,7 @@ class Demonstrations:
         return given, torch.from_numpy(np.stack(padding[:size])), torch.from_numpy(np.stack(places[:size]))
 
 
-LEARNERS: dict[str, type[Learner]] = {
-    "smolvla": SmolVLA,
-    "multi_task_dit": MultiTaskDiT,
-}
+LEARNERS: dict[str, type[Learner]] = {"smolvla": SmolVLA, "multi_task_dit": MultiTaskDiT}
 
 
 @dataclass

@@ -7,8 +7,7 @@ from math import exp
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from ttscompile.errors import DeadlineMissedError, ExecutorError
 from ttscompile.runtimes.executor import ExecutorSettings, GuardLimits

@@ -23,8 +23,7 @@ if any(importlib.util.find_spec(name) is None for name in ("websockets", "msgpac
     pytest.skip("NO TESTS OF OPENPI: websockets or msgpack is not installed; see CONTRIBUTING", allow_module_level=True)
 
 import msgpack
-from websockets.exceptions import ConnectionClosed as ConnectionClosed
-from websockets.exceptions import InvalidStatus as InvalidStatus
+from websockets.exceptions import ConnectionClosed as ConnectionClosed, InvalidStatus as InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 GOOD = np.array([1.0, 2.0], np.float32)
