@@ -35,7 +35,7 @@ def test_it_prints_the_same_as_a_table_and_as_json(arguments: list[str], tmp_pat
     assert [point["series"] for point in points] == ["this artifact"] + ["interval"] * 2
     assert record["identity"] == load_artifact(Path(arguments[0])).manifest.identity
     assert "held-out calls" in (tmp_path / "f.svg").read_text()
-    assert told.stderr.count("search: interval 0.8\n") == 1  # a log has a line for each part of the work, and no bar
+    assert told.stderr.count("search: interval 0.8: ") == 1  # a log has a line for each part of the work, and no bar
     shown = run(*asked).stdout
     assert "in which two calls of the original are" in " ".join(shown.split())
     assert all(f"{point['sparsity']:.1%}" in shown for point in points)

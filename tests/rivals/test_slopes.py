@@ -1,4 +1,4 @@
-"""The slopes of all gates are those that the reference runtime has by automatic differentiation."""
+"""The slopes of all gates are those that automatic differentiation finds for one formula of all cells."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 
 from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, assert_equal_but_for_rounding
+from tests.runtimes.recorded import everything_recorded
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.rivals import slopes as module
@@ -22,11 +23,11 @@ def random_plan(reuse: Source, computed: float) -> PlanArray:
 
 
 def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
-    """Straight through the gates of the reference."""
+    """Straight through the gates of one formula of all cells."""
     calls = task.calls
     one_hot = torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float()
     gates = one_hot.repeat(calls.count, 1, 1, 1).requires_grad_()
-    sample = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, gates).sample
+    sample = everything_recorded(task.executor.model, calls.contexts, calls.initial, calls.noise, gates, {})
     executed, expected = task.actions.executed(sample), task.actions.executed(calls.targets)
     (executed - expected).abs().mean().backward()
     assert gates.grad is not None
@@ -38,7 +39,7 @@ def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
 @pytest.mark.parametrize("reuse", [Source.FORWARD, Source.TIMESTEP])
 @pytest.mark.parametrize("computed", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("size", [1, 2**28])
-def test_slopes_are_the_gradients_of_the_reference(
+def test_slopes_are_the_gradients_of_a_whole_formula(
     make_task: MakeTask, monkeypatch: pytest.MonkeyPatch, reuse: Source, computed: float, size: int
 ) -> None:
     monkeypatch.setattr(module, "BYTES", size)  # one call at a time, or all

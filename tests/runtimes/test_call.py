@@ -212,7 +212,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     make_artifact: MakeArtifact, monkeypatch: pytest.MonkeyPatch, whole_steps: bool
 ) -> None:
     """What a session is bound to is settled at load; a call that binds costs many times a warm one."""
-    from ttscompile.runtimes.onnxruntime import contexts, workspace
+    from ttscompile.runtimes.onnxruntime import idle_steps, workspace
 
     schedule = uniform_plan(5, 5, 2)
     if not whole_steps:
@@ -228,7 +228,7 @@ def test_a_first_call_with_a_schedule_binds_nothing(
     def bind(*_: object) -> None:
         raise AssertionError("a session was bound during a call")
 
-    for module in (workspace, contexts):
+    for module in (workspace, idle_steps):
         monkeypatch.setattr(module, "Bound", bind)
     for _ in range(2):
         runtime.predict(obs, noise, artifact.plans["mine"])
