@@ -258,7 +258,7 @@ def test_reset_during_inference_a_hundred_times_at_random_moments() -> None:
     with World(latency={"dense": 0.28}) as world:
         during = set()
         for episode in range(1, 101):
-            for _ in range(chance.randrange(1, 12)):
+            for _ in range(chance.randrange(2, 12)):
                 world.observe()
                 try:
                     action = world.executor.action()
@@ -276,7 +276,7 @@ def test_reset_during_inference_a_hundred_times_at_random_moments() -> None:
         world.begin()
         assert world.tick()[0] == 100
         counted = world.executor.statistics()
-        assert len(during) > 40
+        assert len(during) > 50
         assert counted.chunks_discarded == len(during)
         assert counted.resets == 100
 
