@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import io
 import pickle
 import sys
@@ -48,17 +47,14 @@ def captured_once(directory: Path) -> Iterator[None]:
                 return convert(*trace(self.module, *self.how)).convert()
             held = registered(self.module)
             if (path := directory / key).exists():
-                graph, values = pickle.loads(path.read_bytes())  # by this run, in a folder of its own
+                graph, values = pickle.loads(path.read_bytes())  # by a run of these tests
                 return graph, {
                     name: numbers(held[one]) if isinstance(one, str) else one for name, one in values.items()
                 }
             with untraced():
                 traced = trace(self.module, *self.how)
             graph, weights = convert(*traced).convert()
-            start = "module." if _by_position(self.module) else ""
-            values = {
-                name: one if (own := name.removeprefix(start)) not in held else own for name, one in weights.items()
-            }
+            values = {name: name if name in held else one for name, one in weights.items()}
             with NamedTemporaryFile(dir=directory, delete=False) as unfinished:
                 pickle.dump((graph, values), unfinished)
             Path(unfinished.name).rename(path)
@@ -84,11 +80,6 @@ def registered(module: nn.Module) -> dict[str, Tensor]:
 def numbers(value: Tensor) -> Any:
     """As a constant of a graph, which shares memory with the module's."""
     return value.detach().cpu().contiguous().numpy()
-
-
-def _by_position(module: nn.Module) -> bool:
-    """Whether it takes any observation, and is given to the tracer within another module."""
-    return any(p.kind is p.VAR_KEYWORD for p in inspect.signature(module.forward).parameters.values())
 
 
 def structure(module: nn.Module, spec: PolicySpec, streams: int) -> str | None:

@@ -17,7 +17,7 @@ from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import condition_flops
 from ttscompile.errors import ArtifactError, PassError
 from ttscompile.ir.evaluate import evaluate
-from ttscompile.ir.graph import Graph, Node
+from ttscompile.ir.graph import Graph, Node, TensorType
 from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Binding, Program, mapped
 
@@ -316,6 +316,10 @@ def broken(program: Program, **pieces: Any) -> Program:
         (lambda p: broken(p, bindings={**p.pieces.bindings, "memory": Binding.LOOP}), "provides its context %memory"),
         (lambda p: broken(p, tables={**p.pieces.tables, "time": np.zeros((2, 1, 1, 16), np.float32)}), "%time"),
         (lambda p: broken(p, step=None), "nothing provides its context %modulation"),
+        (
+            lambda p: broken(p, pruner=replace(p.pieces.pruner, inputs={"memory": TensorType((), "bool")})),
+            "%memory is bool",
+        ),
     ],
 )
 def test_programs_that_do_not_fit(tmp_path: Path, edit: Any, message: str) -> None:

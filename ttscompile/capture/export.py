@@ -62,8 +62,8 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
     found, expected = graph.types()[graph.outputs[0]], graph.inputs[spec.sample_argument]
     if found != expected:
         raise CaptureError(f"the module returns {found}; expected the type of its sample, {expected}.")
-    differ = [name for name, value in weights.items() if not np.array_equal(value, others[name], equal_nan=True)]
-    if differ:
+    own = {name: value for name, value in weights.items() if value.ctypes.data != others[name].ctypes.data}
+    if differ := [name for name, value in own.items() if not np.array_equal(value, others[name], equal_nan=True)]:
         raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}")
     _require_streams_alike(module, spec, graph, weights)
     return graph, weights

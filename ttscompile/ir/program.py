@@ -138,7 +138,7 @@ class Pieces(Loop):
 
 
 def mapped(record: Value, function: Callable[[Graph], Graph]) -> Value:
-    """A record of this module with another graph in place of each that it holds, of the same inputs and outputs."""
+    """A record of this module with another graph in place of each that it holds; inputs of the stream keep names."""
     made: Any = record
     match made:
         case Graph():

@@ -39,16 +39,13 @@ def verify(program: Phase) -> None:
     expected = [spec.sample_argument, spec.timestep_argument, *spec.observations]
     if list(denoiser.inputs) != expected:
         raise PassError(f"denoiser: inputs {list(denoiser.inputs)}; expected {expected}.")
+    _verify_graphs({DENOISER: denoiser} if isinstance(program, Program) else program.graphs(), program)
     match program:
         case Program():
-            _verify_graphs({DENOISER: denoiser}, program)
             verify_pieces(program)
         case Cut(blocks=blocks, loop=loop):
-            _verify_graphs(program.graphs(), program)
             _verify_loop(loop, blocks, spec)
             _verify_contexts(_readers(loop), program.prologue.outputs)
-        case _:
-            _verify_graphs(program.graphs(), program)
 
 
 def verify_pieces(program: Program) -> None:
@@ -113,12 +110,13 @@ def _verify_bindings(pieces: Pieces) -> dict[str, TensorType]:
     step = () if pieces.step is None else pieces.step.outputs
     provided = {Binding.CONDITION: pieces.condition.outputs, Binding.TABLE: pieces.tables, Binding.STEP: step}
     given = {name for name, binding in pieces.bindings.items() if name in provided.get(binding, ())}
-    types = _verify_contexts(_readers(pieces) | ({} if pieces.step is None else {STEP: pieces.step.inputs}), given)
     for name in pieces.features:
         if name not in pieces.condition.outputs:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")
     if pieces.pruner is not None and tuple(pieces.pruner.inputs) != pieces.features:
         raise PassError(f"pruner: reads {list(pieces.pruner.inputs)}; its features are {list(pieces.features)}.")
+    others = {what: graph.inputs for what, graph in pieces.graphs().items() if what in (STEP, PRUNER)}
+    types = _verify_contexts(_readers(pieces) | others, given)
     return {name: type_ for name, type_ in types.items() if pieces.bindings[name] is Binding.TABLE}
 
 
