@@ -126,10 +126,13 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
 
 @pytest.mark.slow
 def test_what_depends_on_words_and_images_alone_leaves_the_loop(compiled: Path) -> None:
-    """So do the keys and values that the head's layers look at."""
+    """So do the keys and values that the head's layers look at: in turn those of 73 words, and of two images."""
     manifest = load_artifact(compiled).manifest
     blocks = [block.kind for block in manifest.blocks]
     assert blocks == ["cross_attention", "feed_forward", "self_attention", "feed_forward"] * 2
+    tokens, width = 1 + groots.HORIZON, 20
+    looking = [tokens * width * (width + seen) for seen in (73, 2 * 9)]  # queries and outputs; scores and their mean
+    assert [block.flops for block in manifest.blocks if block.kind == "cross_attention"] == [4 * n for n in looking]
     assert manifest.spec.source["embodiment"] == "new_embodiment"
 
 
@@ -212,6 +215,21 @@ def test_steps_that_are_not_rebuilt_are_named(
 ) -> None:
     step(directory, name, **changes)
     with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_policy(directory)
+
+
+def test_steps_in_another_order(directory: Path) -> None:
+    """Names of the robot would not be the policy's yet where it is packed; nor are any names after it."""
+    path = directory / "policy_preprocessor.json"
+    first, *others = json.loads(path.read_text())["steps"]
+    assert first["registry_name"] == "rename_observations_processor"
+    change_json(path, steps=[*others, first])
+    with pytest.raises(CheckpointError, match="expected rename_observations_processor before the other steps"):
+        load_checkpoint_policy(directory)
+    change_json(path, steps=[first, *others])
+    path = directory / "policy_postprocessor.json"
+    change_json(path, steps=[*json.loads(path.read_text())["steps"], first])
+    with pytest.raises(CheckpointError, match="the step 'rename_observations_processor' is not known here"):
         load_checkpoint_policy(directory)
 
 

@@ -8,7 +8,6 @@ Sources: Bjorck et al., GR00T N1 (arXiv 2503.14734); ``lerobot.policies.groot`` 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ from torch.nn import functional
 from .clip import Attention, FeedForward, Layers, TowerConfig
 from .evo1 import Perceptron
 from .internvl import Prompt
-from .language_layers import added
+from .language_layers import added, angles
 from .qwen3_vl import Qwen3VL, Qwen3VLConfig
 
 _WAVES = 256
@@ -67,7 +66,7 @@ class _ActionEncoder(nn.Module):
     def forward(self, actions: Tensor, timestep: Tensor) -> Tensor:
         x = self.W1(actions)
         half = x.shape[-1] // 2
-        angle = _angles(timestep, half, half)
+        angle = angles(timestep, half, half)
         time = torch.cat([angle.sin(), angle.cos()], -1)[:, None].expand_as(x)
         return self.W3(functional.silu(self.W2(torch.cat([x, time], -1))))  # type: ignore[no-any-return]
 
@@ -94,10 +93,8 @@ class _DiT(nn.Module):
         super().__init__()
         width, source = config.layers.hidden_size, config.language.text.width
         self.timestep_encoder: Any = nn.Module()
-        self.timestep_encoder.linear_1, self.timestep_encoder.linear_2 = (
-            nn.Linear(_WAVES, width),
-            nn.Linear(width, width),
-        )
+        self.timestep_encoder.linear_1 = nn.Linear(_WAVES, width)
+        self.timestep_encoder.linear_2 = nn.Linear(width, width)
         sources = (None if look == "itself" else source for look in config.looks)
         self.transformer_blocks = nn.ModuleList(_Layer(config.layers, each) for each in sources)
         self.proj_out_1, self.proj_out_2 = nn.Linear(width, 2 * width), nn.Linear(width, config.out)
@@ -162,7 +159,7 @@ class Denoiser(nn.Module):
         """``[B, T, D]``, timesteps int64 ``[B]`` and what ``Prefix`` gives -> velocity ``[B, T, D]``."""
         head, (state, hidden, words, *pictures) = self.head, encoded
         clock, count = timestep.to(torch.float32), sample.shape[1]
-        angle = _angles(clock, _WAVES // 2, _WAVES // 2 - 1)
+        angle = angles(clock, _WAVES // 2, _WAVES // 2 - 1)
         made, model = torch.cat([angle.cos(), angle.sin()], -1), head.model
         time = model.timestep_encoder.linear_2(functional.silu(model.timestep_encoder.linear_1(made)))
         x = head.action_encoder(sample, clock)
@@ -175,8 +172,3 @@ class Denoiser(nn.Module):
         shift, scale = model.proj_out_1(functional.silu(time))[:, None].chunk(2, -1)
         x = functional.layer_norm(x, x.shape[-1:], eps=1e-6) * (1 + scale) + shift
         return head.action_decoder(model.proj_out_2(x[:, -count:]))  # type: ignore[no-any-return]
-
-
-def _angles(timestep: Tensor, count: int, last: int) -> Tensor:
-    """``[B, count]``: a time times rates from 1 down to 1 / 10,000, which is the one after ``last`` others."""
-    return timestep[:, None] * torch.exp(torch.arange(count, dtype=torch.float32) * (-math.log(10_000) / last))

@@ -43,9 +43,11 @@ def task_tokens(
     """
     path = None if folder is None else find_tokenizer(folder)
     if path is None:
+        where = "" if folder is None else f": {folder} has none"
         raise CheckpointError(
-            f"the tokenizer {name!r:.200} is not on this machine, and nothing is ever downloaded. Put its"
-            f" tokenizer.json beside config.json of the language model. {NAME_FOLDER} {remedy}".rstrip()
+            f"the tokenizer {name!r:.200} is not on this machine{where}, and nothing is ever downloaded. Put its"
+            f" tokenizer.json (or CLIP's vocab.json and merges.txt) beside config.json of the language model."
+            f" {NAME_FOLDER} {remedy}".rstrip()
         )
     tokens = Tokenizer(path, CheckpointError)(text, most)
     if not tokens or max(tokens) >= vocabulary:

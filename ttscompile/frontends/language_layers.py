@@ -6,6 +6,7 @@ channels]`` with every head written out, so that what depends on the prefix alon
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -208,6 +209,11 @@ def rotate(x: Tensor, by: Rotation) -> Tensor:
     left, right = x.chunk(2, -1)
     cos, sin = by
     return torch.cat([left * cos - right * sin, right * cos + left * sin], -1)
+
+
+def angles(timestep: Tensor, count: int, last: int, longest: float = 10_000) -> Tensor:
+    """A time ``[B]`` times falling rates, ``[B, count]``: 1 at first, and ``1 / longest`` after ``last`` others."""
+    return timestep[:, None] * torch.exp(torch.arange(count, dtype=torch.float32) * (-math.log(longest) / last))
 
 
 def waves(timestep: Tensor, width: int, shortest: float, longest: float) -> Tensor:

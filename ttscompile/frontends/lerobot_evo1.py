@@ -13,11 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.spec import Affine, ChunkSpec, Instruction, PolicySpec, SamplerTable
+from ..core.spec import Affine, ChunkSpec, Instruction, PolicySpec
 from . import lerobot_vla as vla
 from .clip import ACTIVATIONS
 from .encoded import EncodedDenoiser
@@ -26,7 +25,7 @@ from .families import LoadOptions
 from .instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from .internvl import InternVitConfig, InternVLConfig, Prompt
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
-from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
+from .lerobot_policy import MASK, TOKENS, read_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
@@ -74,13 +73,13 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         raise settings.refusal("max_text_length", f"more than the {images} tokens of {views} images", 1024)
     sizes, task = {"actions": config.max_action_dim, "tokens": length, "vocabulary": vocabulary}, None
     if options.task is not None:
-        tokens = task_tokens(told.line(options.task), name, folder, None, vocabulary, "")
-        task = torch.tensor([tokens[told.skipped :][:length]])
+        tokens = task_tokens(told.line(options.task), name, folder, told.skipped + length, vocabulary, "")
+        task = torch.tensor([tokens[told.skipped :]])
     weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
     network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
     encoder = vla.Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
-    side = config.language.vision.image_size
-    spec = vla.vla_spec(shared, processors, (side, side), "stretch", sizes, options, partial(_sampler, settings), told)
+    side, table = config.language.vision.image_size, partial(vla.in_buckets, settings, 32, TIMES - 1)
+    spec = vla.vla_spec(shared, processors, (side, side), "stretch", sizes, options, table, told)
     spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform")
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
@@ -188,14 +187,6 @@ def _chunk(settings: Settings, chunk: ChunkSpec) -> ChunkSpec:
     own = chunk.normalizer
     own = None if own is None else Affine(own.scale[:kept], own.offset[:kept])
     return replace(chunk, action_dim=kept, normalizer=own)
-
-
-def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
-    """From noise at time 0 to actions at 1; a time is a row of its embedding, rounded as lerobot does."""
-    count = integration_steps(settings, options, "num_inference_timesteps", 32)
-    table = vla.flow_matching(count, options, start=0.0, end=1.0)
-    times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
-    return replace(table, timesteps=np.minimum((times * (TIMES - 1)).astype(np.int64), TIMES - 1))
 
 
 def _weights(shared: LeRobotConfig, options: LoadOptions, config: Evo1Config, model: Settings) -> Mapping[str, Tensor]:

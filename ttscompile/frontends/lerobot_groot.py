@@ -29,7 +29,7 @@ from .instruction import encoder_folders, language_model_folder, task_tokens, to
 from .internvl import Prompt
 from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
-from .lerobot_policy import MASK, TOKENS, integration_steps, read_weights
+from .lerobot_policy import MASK, TOKENS, read_weights
 from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
@@ -236,16 +236,13 @@ def _prompt(
 
 
 def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
-    """From noise at time 0 to actions at 1; a time is a bucket of many. Actions may be clipped at the end."""
-    count = integration_steps(settings, options, "num_inference_timesteps", 4)
-    table = vla.flow_matching(count, options, start=0.0, end=1.0)
-    times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
-    table = replace(table, timesteps=(times * settings.number("num_timestep_buckets", 1000, 2**20)).astype(np.int64))
+    """From noise to actions, which may be clipped at the end."""
+    table = vla.in_buckets(settings, 4, settings.number("num_timestep_buckets", 1000, 2**20), options)
     if not bounded:
         return table
     if table.name != "euler":
         raise SpecError(f"sampler {table.name}: the actions of this policy are clipped at the end; expected euler.")
-    last = np.arange(count) == count - 1
+    last = np.arange(table.steps) == table.steps - 1
     share = {"x0_to_next": last, "sample_to_next": ~last, "out_to_next": np.where(last, 0, table.out_to_next)}
     return replace(table, clip=1.0, **{name: each.astype(np.float32) for name, each in share.items()})
 

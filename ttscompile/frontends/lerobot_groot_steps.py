@@ -23,7 +23,6 @@ from .settings import Settings
 _PACK, _ENCODE = "groot_n1_7_pack_inputs_v1", "groot_n1_7_vlm_encode_v1"
 _UNPACK, _DECODE = "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
-_COMMON = ("rename_observations_processor", "to_batch_processor", "device_processor", *lerobot.RELATIVE)
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _MOST_LETTERS, _EPSILON = 64, 400, 1e-8
 _CAMERA = "observation.images."
@@ -71,8 +70,8 @@ class Seen(nn.Module):
 
     def __init__(self, geometry: Geometry) -> None:
         super().__init__()
-        self.geometry, (_, crop, target) = geometry, geometry
-        self.zoom = ResizeCrop(crop, crop, (target, target), mode="bicubic")
+        self.geometry, seen = geometry, (geometry.target, geometry.target)
+        self.zoom = ResizeCrop(geometry.crop, geometry.crop, seen, mode="bicubic")
 
     def forward(self, image: Tensor) -> Tensor:
         """See the class."""
@@ -86,8 +85,8 @@ class Seen(nn.Module):
 
 def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootProcessors:
     """The pipelines of a policy with these features."""
-    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, only=(*_COMMON, _PACK, _ENCODE, *_OLD))
-    after = lerobot.read_steps(directory, lerobot.POSTPROCESSOR, only=(*_COMMON, _UNPACK, _DECODE, *_OLD))
+    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, (_PACK, _ENCODE, *_OLD))
+    after = lerobot.read_steps(directory, lerobot.POSTPROCESSOR, (_UNPACK, _DECODE, *_OLD))
     if old := next((step["registry_name"] for step in (*before, *after) if step["registry_name"] in _OLD), None):
         raise CheckpointError(f"{directory}: the step {old} is {OLD}.")
     pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))

@@ -25,18 +25,19 @@ _RENAME, _TOKENIZE, NORMALIZE = "rename_observations_processor", "tokenizer_proc
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
 PROMPT = "pi05_prepare_state_tokenizer_processor_step"
-RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
+_RELATIVE, _ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 _PAD = ("evo1_pad_state_processor", "evo1_pad_action_processor")
 _CROP = "evo1_action_processor"
 """What it does is in the policy's configuration, which lerobot prefers to the step's own."""
-_KNOWN_STEPS: Mapping[str, frozenset[str]] = {
-    PREPROCESSOR: frozenset({_RENAME, _BATCH, _TOKENIZE, _DEVICE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT, RELATIVE[0]}),
-    POSTPROCESSOR: frozenset({_BATCH, _DEVICE, _UNNORMALIZE, RELATIVE[1], _CROP}),
-}
+_COMMON = {PREPROCESSOR: (_RENAME, _BATCH, _DEVICE, _RELATIVE), POSTPROCESSOR: (_BATCH, _DEVICE, _ABSOLUTE)}
+"""Steps that all policies have, or may have."""
+_BEFORE, _AFTER = (_TOKENIZE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT), (_UNNORMALIZE, _CROP)
+"""Beside them, those before and after a policy."""
 IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
 OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN)}
 """By type of policy, steps before it that no other has, in the order that lerobot saves."""
-_ONCE = frozenset({_RENAME, _TOKENIZE, NORMALIZE, _UNNORMALIZE})
+_OFTEN = frozenset({_BATCH, _DEVICE})
+"""Steps that may be anywhere, more than once."""
 
 
 Features = Mapping[str, tuple[str, tuple[int, ...]]]
@@ -160,7 +161,8 @@ class Processors:
 def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:
     """The pipelines of a policy of this type that LeRobot saved, with these features."""
     own = OWN_STEPS.get(kind, ())
-    before, after = (read_steps(directory, name, own) for name in (PREPROCESSOR, POSTPROCESSOR))
+    before = read_steps(directory, PREPROCESSOR, (*_BEFORE, *own))
+    after = read_steps(directory, POSTPROCESSOR, _AFTER)
     padded = any(step["registry_name"] in _PAD for step in before)
     return Processors(
         renamed=renamed_observations(directory, before, features),
@@ -173,17 +175,13 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
     )
 
 
-def read_steps(
-    directory: Path, name: str, own: Collection[str] = (), only: Collection[str] | None = None
-) -> list[dict[str, Any]]:
+def read_steps(directory: Path, name: str, own: Collection[str]) -> list[dict[str, Any]]:
     """The steps of a pipeline, each with a registered name that is known and a configuration, in lerobot's order.
 
     Args:
-        own: names before a policy that are known beside those of all.
-        only: names that are known in their place, of a policy whose steps are its own.
+        own: names that are known beside the common ones.
     """
-    path = directory / name
-    known = _KNOWN_STEPS[name].union(own if name == PREPROCESSOR else ()) if only is None else only
+    path, known = directory / name, (*_COMMON[name], *own)
     if not path.is_file():
         raise CheckpointError(
             f"{path}: no such file. Policies saved by lerobot before 0.4 keep their statistics inside the weights:"
@@ -204,17 +202,17 @@ def read_steps(
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
             found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
             raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
-        if registered in RELATIVE and step["config"].get("enabled") is not False:
+        if registered in (_RELATIVE, _ABSOLUTE) and step["config"].get("enabled") is not False:
             raise CheckpointError(
                 f"{path}: {registered} is enabled: actions are relative to the state, which is not compiled. Expected"
                 " a policy of absolute actions."
             )
     order = [step["registry_name"] for step in steps]
-    twice = sorted(kind for kind in _ONCE.union(own) if order.count(kind) > 1)
+    twice = sorted(kind for kind in known if kind not in _OFTEN and order.count(kind) > 1)
     if twice:
         found = f"found {order.count(twice[0])} of {twice[0]}"
         raise CheckpointError(f"{path}: expected at most one step of a kind; {found}. Combine them into one.")
-    if _RENAME in order and any(kind in order[: order.index(_RENAME)] for kind in (NORMALIZE, _TOKENIZE, *own)):
+    if _RENAME in order and not _OFTEN.issuperset(order[: order.index(_RENAME)]):
         raise CheckpointError(
             f"{path}: expected {_RENAME} before the other steps, as lerobot saves them; found {', '.join(order)}."
             " Save the pipeline again in that order."

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -29,12 +30,14 @@ _EMPTY = "observation.images.empty_camera_"
 """How lerobot calls a camera that the checkpoint knows and no robot has."""
 
 
-def read_vla_config(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> LeRobotConfig:
+def read_vla_config(
+    directory: Path, entries: Mapping[str, Any], options: LoadOptions, stateless: bool = False
+) -> LeRobotConfig:
     """Check what all of them have; cameras that the robot lacks are left out.
 
-    LeRobot shows the network a black image for such a camera, and masks it: nothing reads it.
+    LeRobot shows the network a black image for such a camera, and masks it: nothing reads it. ``stateless`` says
+    whether a policy may be without state.
     """
-    stateless = entries.get("use_proprio") is False  # of xvla
     config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True, stateless=stateless)
     if config.settings.flag("adapt_to_pi_aloha", False) or config.settings.flag("use_relative_actions", False):
         raise config.settings.error(
@@ -86,8 +89,8 @@ def vla_spec(
         image: height and width that images are resized to; None where they stay.
         fit: where the rest of a resized image is.
         sizes: ``actions``, the padded width of the sample; ``tokens`` of the instruction, and ``vocabulary``.
-        told: how a task becomes tokens; None as the processors say.
         table: the loop; None for ten steps, or as many as are configured, from time 1 to time 0.
+        told: how a task becomes tokens; None as the processors say.
     """
     language = language_inputs(sizes["tokens"], sizes["vocabulary"]) if options.task is None else {}
     source = {"policy": str(config.settings.values["type"])}
@@ -109,6 +112,18 @@ def vla_spec(
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     name = "num_steps" if "num_steps" in settings.values else "num_inference_steps"
     return flow_matching(integration_steps(settings, options, name, 10), options, start=1.0, end=0.0)
+
+
+def in_buckets(settings: Settings, steps: int, last: int, options: LoadOptions) -> SamplerTable:
+    """From noise at time 0 to actions at 1, each time as a whole number up to ``last``, rounded down as lerobot does.
+
+    Args:
+        steps: where neither the configuration nor the options say how many.
+    """
+    count = integration_steps(settings, options, "num_inference_timesteps", steps)
+    table = flow_matching(count, options, start=0.0, end=1.0)
+    times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
+    return replace(table, timesteps=(times * last).astype(np.int64))
 
 
 def flow_matching(count: int, options: LoadOptions, start: float, end: float) -> SamplerTable:

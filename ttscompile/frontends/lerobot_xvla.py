@@ -27,7 +27,7 @@ from .lerobot_config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotCon
 from .lerobot_policy import integration_steps, read_weights
 from .lerobot_processors import DOMAIN, IMAGENET, OWN_STEPS, Processors
 from .lerobot_vla import Gathered, part_of, positive_number, read_vla_config, read_vla_processors, seen_size, vla_spec
-from .saved_weights import renamed, require_weights
+from .saved_weights import filled, renamed, separated
 from .settings import Settings
 from .xvla import XVLA, Denoiser, Prefix, XVLAConfig
 
@@ -83,7 +83,8 @@ _MODES: Mapping[str, _Mode] = {
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
-    shared = read_vla_config(directory, {"chunk_size": 32, "n_action_steps": 32, **entries}, options)
+    stateless = entries.get("use_proprio") is False
+    shared = read_vla_config(directory, {"chunk_size": 32, "n_action_steps": 32, **entries}, options, stateless)
     settings = shared.settings
     mode, proprio = _mode(shared), settings.flag("use_proprio", True)
     features = {key: each for key, each in shared.features.items() if proprio or key != STATE}
@@ -95,11 +96,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     task, length, padding = _words(shared, processors, florence, options)
     config = read_config(shared, florence, mode, length, padding)
     domain = _domain(settings, processors)
-    with torch.device("meta"):  # compared before anything of the configured sizes takes memory
-        network = XVLA(config)
-    weights = _weights(shared, options, network, domain)
-    require_weights(network.state_dict(), weights, f"{directory / CONFIG}")
-    network.load_state_dict(weights, assign=True)
+    with torch.device("meta"):
+        empty = XVLA(config)
+    network = filled(lambda: empty, _weights(shared, options, empty, domain), CONFIG, directory)
     encoder = Gathered(shared, processors, Prefix(network), config.state or None, task)
     sizes = {"actions": mode.actions, "tokens": length, "vocabulary": florence.text.vocab_size}
     spec = vla_spec(shared, processors, resize, "start", sizes, options, lambda each: _sampler(settings, each))
@@ -231,14 +230,14 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, network: XVLA, domain:
         if name == _PROJECTION:
             found["vlm.multi_modal_projector.image_projection.weight"] = value.T.contiguous()
         elif ".qkv." in name:
-            thirds = value.chunk(3) if value.shape[0] % 3 == 0 else [value] * 3
-            found |= {name.replace(".qkv.", f".{one}_proj."): each for one, each in zip("qkv", thirds, strict=True)}
+            found |= separated(name, value)
         elif of_domain in expected and value.shape == (count, expected[of_domain].numel()):
             turned = value[domain].view(expected[of_domain].shape[::-1]).movedim(0, -1)
             found[of_domain] = turned.clone(memory_format=torch.contiguous_format)
         else:
             found[name] = value
-    found.setdefault("vlm.language_model.shared.weight", found.pop(_TIED, torch.empty(0)))
+    if _TIED in found:
+        found.setdefault("vlm.language_model.shared.weight", found.pop(_TIED))
     for name in expected.keys() - found.keys():
         if re.search(r"^vlm\.vision_tower\..*\.[qkv]_proj\.bias$", name):  # qkv_bias: false
             found[name] = torch.zeros(expected[name].shape)

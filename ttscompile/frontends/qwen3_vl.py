@@ -18,7 +18,7 @@ from ..errors import CheckpointError
 from .clip import ImageTowerConfig, Layers
 from .internvl import Prompt
 from .language_layers import LanguageConfig, Rotation, Words, added, laid, rotation
-from .saved_weights import renamed
+from .saved_weights import renamed, separated
 from .siglip import squares
 
 _RENAMED = (
@@ -26,7 +26,8 @@ _RENAMED = (
     (r"^visual\.pos_embed\.weight$", "visual.embeddings.positions"),
     (r"^visual\.blocks\.", "visual.encoder.layers."),
     (r"^(visual\.encoder\.layers\.\d+)\.norm([12])\.", r"\1.layer_norm\2."),
-    (r"^(visual\.encoder\.layers\.\d+)\.attn\.proj\.", r"\1.self_attn.out_proj."),
+    (r"^(visual\.encoder\.layers\.\d+)\.attn\.", r"\1.self_attn."),
+    (r"\.self_attn\.proj\.", ".self_attn.out_proj."),
     (r"^(visual\.encoder\.layers\.\d+)\.mlp\.linear_fc", r"\1.mlp.fc"),
 )
 
@@ -123,10 +124,8 @@ class Qwen3VL(nn.Module):
     def __init__(self, config: Qwen3VLConfig, prompt: Prompt) -> None:
         super().__init__()
         self.config, self.prompt = config, prompt
-        self.visual, self.language_model = (
-            _Vision(config.vision, config.text.width),
-            Words(config.vocabulary, config.text),
-        )
+        self.visual = _Vision(config.vision, config.text.width)
+        self.language_model = Words(config.vocabulary, config.text)
         side, at = config.vision.side // config.vision.merge, 0
         places, pictured = list[tuple[int, int, int]](), list[bool]()
         for words in prompt.between:
@@ -183,11 +182,7 @@ def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[
             value = value.sum(2)
         elif name == "visual.embeddings.positions":
             value = _between_positions(value, config.vision)
-        elif ".attn.qkv." in name:
-            thirds = zip("qkv", value.chunk(3), strict=False)
-            found |= {name.replace("attn.qkv", f"self_attn.{one}_proj"): each.clone() for one, each in thirds}
-            continue
-        found[name] = value
+        found |= separated(name, value) if ".qkv." in name else {name: value}
     return found
 
 

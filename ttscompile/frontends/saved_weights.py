@@ -69,6 +69,12 @@ def renamed(name: str, rules: Sequence[tuple[str, str]]) -> str:
     return name
 
 
+def separated(name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Weights of ``qkv`` as those of ``q_proj``, ``k_proj`` and ``v_proj``; what has no thirds stays whole, in each."""
+    thirds = value.chunk(3) if value.ndim and len(value) % 3 == 0 else [value] * 3
+    return {name.replace(".qkv.", f".{one}_proj."): each.clone() for one, each in zip("qkv", thirds, strict=True)}
+
+
 def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.Tensor]:
     """Weights of any floating-point type, under the names that a network without wrappers gives them."""
     for name, value in weights.items():

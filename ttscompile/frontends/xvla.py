@@ -7,7 +7,6 @@ Sources: Zheng et al., X-VLA (arXiv 2510.10274); ``lerobot.policies.xvla`` of hu
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +15,7 @@ from torch.nn import functional
 
 from .clip import Layers, TowerConfig
 from .florence import Florence, FlorenceConfig
+from .language_layers import angles
 
 _LONGEST_PERIOD = 100
 
@@ -127,6 +127,5 @@ class Denoiser(nn.Module):
 def _waves(timestep: Tensor, width: int) -> Tensor:
     """Cosine and sine of a time ``[B]``, ``[B, width]``; an odd width ends with a zero."""
     half = width // 2
-    rates = torch.exp(-math.log(_LONGEST_PERIOD) * torch.arange(half, dtype=torch.float32) / half)
-    angle = timestep[:, None] * rates
+    angle = angles(timestep, half, half, _LONGEST_PERIOD)
     return functional.pad(torch.cat([angle.cos(), angle.sin()], -1), (0, width % 2))
