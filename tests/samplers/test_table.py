@@ -143,6 +143,15 @@ class OneSided(DDIMScheduler):
         return super().step(model_output, timestep, sample.clamp(max=0.3), *args, **kwargs)
 
 
+class Silent(DDIMScheduler):
+    """Does not say what it takes the clean sample for."""
+
+    def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
+        made = super().step(model_output, timestep, sample, *args, **kwargs)
+        made.pred_original_sample = None
+        return made
+
+
 class TwoDraws(DDPMScheduler):
     """Draws its noise twice."""
 
@@ -187,6 +196,7 @@ def test_bounds_that_differ_are_refused() -> None:
         (EulerDiscreteScheduler, {}, "standard deviation"),
         (LCMScheduler, {"original_inference_steps": 20}, "LCMScheduler: its step at timestep"),
         (PNDMScheduler, {}, "19 timesteps for 10 steps"),
+        (Silent, {}, "failed: it gives no prediction of the clean sample"),
     ],
 )
 def test_other_samplers_are_refused_by_name(scheduler_class: type[Any], settings: dict[str, Any], message: str) -> None:

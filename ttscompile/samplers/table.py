@@ -86,6 +86,8 @@ class _Chains:
             try:
                 result = self._scheduler.step(outs[k], timestep, given[-1], **own, **self._step_arguments)
                 x0 = self._scheduler.model_outputs[-1] if self.multistep else result.pred_original_sample
+                if x0 is None:
+                    raise TypeError("it gives no prediction of the clean sample.")
                 meant.append(x0.double())
                 made.append(result.prev_sample.double())
             except Exception as error:
