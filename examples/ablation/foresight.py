@@ -8,32 +8,24 @@ call, for somebody who knows everything afterwards, and for a predictor that kno
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import combinations, islice
 from math import comb
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from choosing import Choice, Errors, choices
+from three_parts import answered, in_three
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.calibration.calls import (
-    FRACTION,
-    Actions,
-    Calls,
-    load_episodes,
-    prepare_calls,
-    sample_calls,
-    split_episodes,
-)
+from ttscompile.calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
 from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.sparse_loop import fit_correction
-from ttscompile.calibration.targets import REPEATS, dense_rounds
+from ttscompile.calibration.targets import REPEATS
 from ttscompile.calibration.task import Array
 from ttscompile.calibration.trials import base_of
 from ttscompile.core.coercion import integer
@@ -114,18 +106,8 @@ def oracle(
             f"the trajectories hold {len(episodes)} episodes; expected three at least: corrections are fitted on some,"
             " choices learned on others, and judged on others again. Record more; about sixteen are enough."
         )
-    split = split_episodes(len(episodes), FRACTION, seed)
-    inner = split_episodes(len(split.calibration), 1 / 3, seed)
-    fitting, learning = (tuple(split.calibration[i] for i in part) for part in (inner.calibration, inner.validation))
+    fitting, learning, judging = in_three(len(episodes), seed)
     executor, actions = Executor(view), Actions(spec)
-
-    def answered(drawn: Calls, what: str) -> Calls:
-        paths: list[torch.Tensor] = []
-        progress(what, 0, drawn.count)
-        for found in dense_rounds(executor, drawn):
-            paths.append(found)
-            progress(what, sum(map(len, paths)), drawn.count)
-        return replace(drawn, path=torch.cat(paths))
 
     def drawn(numbers: tuple[int, ...], stage: int) -> Calls:
         """Observations of some episodes, each with all of its draws, one after the other."""
@@ -134,10 +116,10 @@ def oracle(
 
     repeated = sample_calls(episodes, fitting, FITTED, seed, REPEATS)
     fitted = prepare_calls(executor.model, spec, episodes, repeated, (seed, 7, 0))
-    fitted = answered(fitted, "dense calls for corrections")
+    fitted = answered(executor, fitted, "dense calls for corrections", progress)
     parts = [
-        answered(drawn(numbers, stage), f"dense calls to {what}")
-        for stage, (what, numbers) in enumerate({"learn from": learning, "judge": split.validation}.items(), 1)
+        answered(executor, drawn(numbers, stage), f"dense calls to {what}", progress)
+        for stage, (what, numbers) in enumerate({"learn from": learning, "judge": judging}.items(), 1)
     ]
 
     def wrong(plan: PlanArray, correction: Correction | None, part: Calls) -> Array:
@@ -163,7 +145,7 @@ def oracle(
         choices=tuple(choices(learned, judged, computed, budget, seed)),
         schedules={count: int((computed == count).sum()) for count in counts},
         calls=(len(judged.of), draws),
-        episodes={"corrections": fitting, "learned": learning, "judged": split.validation},
+        episodes={"corrections": fitting, "learned": learning, "judged": judging},
     )
 
 

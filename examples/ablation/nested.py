@@ -15,25 +15,18 @@ from typing import Any
 import numpy as np
 import torch
 from deciding import Array, Family, Fixed, Row, Steps, best_family, decided
+from three_parts import answered, in_three
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.calibration.calls import (
-    FRACTION,
-    Actions,
-    Calls,
-    load_episodes,
-    prepare_calls,
-    sample_calls,
-    split_episodes,
-)
+from ttscompile.calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
 from ttscompile.calibration.search import search_plan
 from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.sparse_loop import SparseLoop
-from ttscompile.calibration.targets import REPEATS, dense_rounds
+from ttscompile.calibration.targets import REPEATS
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import base_of
 from ttscompile.calibration.tts import Tts
@@ -181,26 +174,19 @@ def nested(
             f"the trajectories hold {len(episodes)} episodes; expected four at least: corrections are fitted on some,"
             " thresholds learned on others, and judged on others again. Record more; about sixty are enough."
         )
-    split = split_episodes(len(episodes), FRACTION, seed)
-    inner = split_episodes(len(split.calibration), 1 / 3, seed)
-    fitting, learning = (tuple(split.calibration[i] for i in part) for part in (inner.calibration, inner.validation))
+    fitting, learning, judging = in_three(len(episodes), seed)
     executor, actions = Executor(view), Actions(spec)
 
-    def answered(numbers: Sequence[tuple[int, int]], what: str, stage: int) -> Calls:
+    def dense(numbers: Sequence[tuple[int, int]], what: str, stage: int) -> Calls:
         calls = prepare_calls(executor.model, spec, episodes, numbers, (seed, 10, stage))
-        paths: list[torch.Tensor] = []
-        progress(what, 0, calls.count)
-        for found in dense_rounds(executor, calls):
-            paths.append(found)
-            progress(what, sum(map(len, paths)), calls.count)
-        return replace(calls, path=torch.cat(paths))
+        return answered(executor, calls, what, progress)
 
     drawn = [
         sample_calls(episodes, numbers, limit, seed, REPEATS)
-        for numbers, limit in ((fitting, fitted), (learning, learned), (split.validation, judged))
+        for numbers, limit in ((fitting, fitted), (learning, learned), (judging, judged))
     ]
-    fit = answered(drawn[0], "dense calls for corrections", 0)
-    others = answered([*drawn[1], *drawn[2]], "dense calls to compare on", 1)
+    fit = dense(drawn[0], "dense calls for corrections", 0)
+    others = dense([*drawn[1], *drawn[2]], "dense calls to compare on", 1)
     learn, judge = (executor.select(others, one) for one in np.split(np.arange(others.count), [len(drawn[1])]))
     clock = Clock(60 * minutes)
     whole = Kept(executor, actions, fit, learn, min(3, most), seed)
@@ -245,7 +231,7 @@ def nested(
         rows=tuple(best.rows()),
         decided=tuple(made),
         calls=(fit.count, learn.count, judge.count),
-        episodes={"corrections": fitting, "learned": learning, "judged": split.validation},
+        episodes={"corrections": fitting, "learned": learning, "judged": judging},
         tried=len(whole.answers),
         jumps=jumps,
     )

@@ -188,7 +188,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     obs = {"obs": np.zeros((2, 2), np.float32)}
     rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
-    errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5)
+    errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5, HOSTILE, np.eye(2, 5, dtype=np.bool_))
     found = Verification(HOSTILE, None, None, (rung,), 1.0, errors)
     given = Given(Episode(HOSTILE, obs), verified(found), calls=1)
     page = render(build(artifact, policy, given))
@@ -197,6 +197,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     assert all(image["src"].startswith("data:") and "onerror" not in image for image in reader.of("img"))
     assert not any(name.startswith("on") for _, attributes in reader.tags for name in attributes)
     assert reader.text.count(HOSTILE) >= 10, "it is shown, as text"
+    assert f"Crosses: cells of plan {HOSTILE!r}" in reader.text
 
 
 def test_a_check_that_failed_is_told_and_is_the_exit_status(

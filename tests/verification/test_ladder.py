@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import Source
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.program import Program
+from ttscompile.runtimes.contexts import ContextValues
 from ttscompile.verification.record_golden import record_original, record_plans
 from ttscompile.verification.rung import FAILED, PASSED, SKIPPED, Rung
 
@@ -159,6 +161,32 @@ def test_the_sampler_at_one_step(artifact: Path) -> None:
     rung = failure(artifact)
     assert (rung.name, rung.step) == ("dense call", 3)
     assert "the sampler" in rung.told
+
+
+class Modulated(policy.Network):
+    """Blocks see one value of time and observation both: the step piece makes it."""
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        told = torch.tanh(self.encode(obs.flatten(1)) + self.time(timestep)).unsqueeze(1)
+        h = self.embed(sample)
+        for wide, narrow in zip(self.wide, self.narrow, strict=True):
+            h = h + narrow(torch.nn.functional.gelu(wide(h + told)))
+        return self.head(h)
+
+
+@pytest.mark.slow
+def test_a_runtime_whose_prologue_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pieces are sound, and the runtime mistakes one step for another before the loop."""
+    ttscompile.compile_denoiser(Modulated().eval(), policy.spec(), tmp_path / "compiled")
+    kept = ContextValues.keep_steps
+
+    def turned(self: ContextValues, made: Iterable[tuple[str, np.ndarray]]) -> None:
+        kept(self, [(name, np.roll(value, self.streams, 0)) for name, value in made])
+
+    monkeypatch.setattr(ContextValues, "keep_steps", turned)
+    rung = failure(tmp_path / "compiled")
+    assert rung.name == "dense call"
+    assert "so that the runtime is at fault" in rung.told
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Calibration, as one straight line: trials -> what each proposer proposes -> the judge -> artifact."""
+"""Calibration, as one straight line: trials -> what each proposer proposes -> the judge -> artifact; and its result."""
 
 from __future__ import annotations
 

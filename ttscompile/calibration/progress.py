@@ -25,7 +25,8 @@ class Bar:
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
         )
-        self._progress = progress.Progress(*columns, console=Console(stderr=True), disable=not shown)
+        self._shown, console = shown, Console(stderr=True)
+        self._progress = progress.Progress(*columns, console=console, disable=not (shown and console.is_terminal))
         self._task = self._progress.add_task("", total=None, note="", left="")
 
     def __enter__(self) -> Bar:
@@ -39,12 +40,12 @@ class Bar:
 
     def warn(self, what: str) -> None:
         """Say something beside the bar."""
-        if not self._progress.disable:
+        if self._shown:
             self._progress.console.print(f"warning: {what}", markup=False, soft_wrap=True)
 
     def stage(self, what: str, total: int, done: int = 0) -> None:
         """Begin something of ``total`` parts, ``done`` of which were done before."""
-        if not (self._progress.disable or self._progress.console.is_terminal):  # a log has no bar
+        if self._shown and self._progress.disable:  # a log has no bar
             self._progress.console.print(f"{what}: {total - done} to do", markup=False, soft_wrap=True)
         self._progress.update(self._task, description=what, total=total, completed=done, note="", left="")
 

@@ -1,9 +1,9 @@
-"""Points of action error and latency, and which of them no other beats."""
+"""Points of distance and latency, and which of them no other beats."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -79,10 +79,10 @@ AnyPoint = TypeVar("AnyPoint", bound=Point)
 
 
 def efficient(points: Sequence[AnyPoint]) -> tuple[AnyPoint, ...]:
-    """Points that no other beats in distance and latency both, fastest first."""
+    """Points that no other beats in distance and latency both, fastest first; no distance counts as below 0."""
     best: list[AnyPoint] = []
-    for point in sorted(points, key=lambda p: (p.latency_ms, p.distance)):
-        if not best or point.distance < best[-1].distance:
+    for point in sorted(points, key=lambda p: (p.latency_ms, max(p.distance, 0.0))):
+        if not best or max(point.distance, 0.0) < best[-1].distance:
             best.append(point)
     return tuple(best)
 
@@ -138,10 +138,8 @@ class Comparison:
     warnings: tuple[str, ...]
 
     def efficient(self) -> tuple[MeasuredPoint, ...]:
-        """Points that no other beats in distance and latency both, fastest first; no distance counts as below 0."""
-        best = efficient([replace(one, distance=max(one.distance, 0.0)) for one in self.points])
-        known = {(one.series, one.name): one for one in self.points}
-        return tuple(known[one.series, one.name] for one in best)
+        """Those of its points that no other beats; see the function."""
+        return efficient(self.points)
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""

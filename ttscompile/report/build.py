@@ -217,6 +217,8 @@ def verified(found: Verification) -> Section:
     if (errors := found.map) is not None:
         of = errors.errors, errors.steps.tolist(), [plain(kind) for kind in errors.kinds], errors.tolerance
         caption = "Relative error of each block's residual at the steps that were looked at: steps across, blocks down."
+        if errors.plan is not None:
+            caption += f" Crosses: cells of plan {errors.plan!r} that are not those stored."
         shown = (Picture(encoded(plot_errors(*of, "residuals", errors.cells)), caption),)
     return Section("Verification", (text,), (Table(head, rows),), shown)
 

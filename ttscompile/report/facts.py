@@ -234,7 +234,7 @@ def calibration(manifest: Manifest) -> Section:
             0, f"{errors}, against the dense policy with the same noise: the mean over calls, and the 90th percentile."
         )
         tables.insert(0, score_table(record))
-    return Section("Calibration", tuple(text), tuple(tables))
+    return Section("Calibration", tuple(text) or ("No errors were measured.",), tuple(tables))
 
 
 def _figure(score: Mapping[str, Any], key: str, form: str = ".4g") -> str:

@@ -268,7 +268,7 @@ def push(
     licence = licence_of(manifest, licence)
     progress("timing calls")
     policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
-    plans = tuple(dict.fromkeys((manifest.default_plan, DENSE)))
+    plans = tuple(dict.fromkeys((DENSE, manifest.default_plan)))
     text = card(artifact, repository, measure_plans(policy, artifact.manifest.spec, plans, runs), success, licence)
     if dry_run:
         return text

@@ -1,4 +1,4 @@
-"""Recordings that are arrays in one file: replay buffers of Diffusion Policy, and data sets of robomimic.
+"""Recordings that are arrays, each by its name: replay buffers of Diffusion Policy, and data sets of robomimic.
 
 The former are a zarr group with ``data/NAME [F, ...]`` and ``meta/episode_ends [E]``, the latter an HDF5 file with
 ``data/DEMO/obs/NAME [F, ...]``, a group for each demonstration.

@@ -20,6 +20,8 @@ from .episodes import Episode, load_trajectories, recorded_names
 from .frames import few, one_error
 from .lerobot_dataset import MAX_INFO
 
+PART = "recordings"
+
 REACH = 1.05
 """Normalised numbers are outside beyond this, either way: recordings may stray a little from the training data."""
 
@@ -96,7 +98,7 @@ def judged(one: Placed) -> Finding:
         level, remedy = Level.PROBLEM, "The columns look permuted: give them in the order of the training data."
     elif share <= one.some:
         told = f"{share:.1%} of the numbers are outside of the training data's; they fill {usual:.0%} of its range"
-    return Finding("recordings", f"range of {one.key!r}", told, level, "" if level is Level.OK else remedy)
+    return Finding(PART, f"range of {one.key!r}", told, level, "" if level is Level.OK else remedy)
 
 
 def check_ranges(episodes: Sequence[Episode], spec: PolicySpec) -> None:
@@ -112,8 +114,6 @@ def check_ranges(episodes: Sequence[Episode], spec: PolicySpec) -> None:
         if float(one.outside.mean()) > one.some:
             warnings.warn(f"observation: {found.told}", stacklevel=2)
 
-
-PART = "recordings"
 
 _LANGUAGE = "observation.language."
 """Begins the keys of an instruction's tokens, as lerobot names them."""

@@ -176,8 +176,7 @@ def video_frames(
 
     Raises:
         ModuleNotFoundError: PyAV is not installed.
-        TrajectoryError: a video is missing or damaged, of another codec, or lacks a frame; a
-            time is not finite.
+        TrajectoryError: a video is missing or damaged, of another codec, or lacks a frame; a time is not finite.
     """
     import av  # noqa: F401
 
@@ -193,10 +192,7 @@ def video_frames(
     missing = sorted(set(episodes.tolist()) - set(begins))
     if missing:
         raise TrajectoryError(f"{path}: there is no video {name!r} of the episodes {missing[:5]}. Copy it again.")
-    wanted = [
-        (begins[episode][0], begins[episode][1] + time)
-        for episode, time in zip(episodes.tolist(), times.tolist(), strict=True)
-    ]
+    wanted = [(begins[n][0], begins[n][1] + time) for n, time in zip(episodes.tolist(), times.tolist(), strict=True)]
     row = next((i for i, (_, time) in enumerate(wanted) if not math.isfinite(time)), None)
     if row is not None:
         told = f"{path}: the time of row {row} in the videos of {name!r} is {wanted[row][1]}; expected finite seconds"
@@ -213,9 +209,7 @@ def _begins(path: Path, name: str, info: Mapping[str, Any], column: Column) -> d
     """The file and the second in which each episode begins."""
     tables = sorted((path / "meta" / "episodes").rglob("*.parquet"))
     if tables:
-        numbers, *places = (
-            column(tables, each) for each in ("episode_index", *(f"videos/{name}/{of}" for of in _PLACE))
-        )
+        numbers, *places = (column(tables, each) for each in (EPISODE, *(f"videos/{name}/{of}" for of in _PLACE)))
         rows = zip(numbers.tolist(), *(place.tolist() for place in places), strict=True)
         folder = path / "videos" / name
         return {int(n): (folder / f"chunk-{int(c):03d}" / f"file-{int(f):03d}.mp4", float(t)) for n, c, f, t in rows}

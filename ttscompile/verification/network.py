@@ -1,8 +1,8 @@
 """The rungs of the network: what goes in and out of it, each block, and single evaluations; and what runs the pieces.
 
-``Probe`` runs them one by one, with onnxruntime and numpy: what a runtime does in one go, to look inside. It is slow
-and plain on purpose, with a loop of its own that shares nothing with the runtimes': where a call goes wrong and this
-goes right, the pieces are sound and the loop over them is not.
+``Probe`` runs them one by one and step by step, with onnxruntime and numpy: what a runtime does in one go, to look
+inside. It is slow and plain on purpose: where a call goes wrong and this goes right, the pieces are sound, and the
+runtime that puts them together is not.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
 from ..core.update import bounded, clips, matrices
-from ..ir.pieces import ADVANCE, LAYERS, PREDICTION, STEM, STREAM, TAIL, advance_context, block_name
+from ..ir.pieces import ADVANCE, CONDITION, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..runtimes.contexts import ContextValues
 from ..runtimes.frames import FramePieces
 from ..runtimes.onnxruntime.sessions import Sessions, run_named, run_piece, run_prologue
@@ -47,7 +47,12 @@ class Probe:
         named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
         named |= FramePieces(pieces, partial(run_piece, self._sessions, pieces)).values(named)
         self._contexts = ContextValues(self._manifest, self.streams, np, np.zeros, view.tables)
-        run_prologue(self._sessions, pieces, named, self._contexts)
+        run_prologue(self._sessions, {CONDITION: pieces[CONDITION]}, named, self._contexts)
+        if (step := pieces.get(STEP)) is not None:
+            for k in range(self._manifest.steps):  # a runtime has them in one batch
+                feed = {name: self._contexts.at(name, k) for name in step.inputs}
+                for name, value in run_named(self._sessions[STEP], step.outputs, feed).items():
+                    self._contexts.values[name][k] = value
         self._tail_blanks = {
             one.name: np.zeros([n if isinstance(n, int) else self.streams for n in one.shape], np.float32)
             for one in self._sessions[ADVANCE].get_inputs()

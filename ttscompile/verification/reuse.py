@@ -1,6 +1,6 @@
 """The rungs of reuse: what it changes in the actions, beside what other noise would change; and what plans save.
 
-Plans do what they are for, or a cache that never engages gives perfect actions, and saves nothing.
+A cache that never engages gives perfect actions, and saves nothing: so neither is enough alone.
 """
 
 from __future__ import annotations
