@@ -179,9 +179,8 @@ def test_a_call_that_is_due_is_not_kept_waiting_by_what_is_left() -> None:
             world.tick(action=False)
         policy: Any = world.policy
         newest = [obs[0, -1, 1] for _, _, obs in policy.calls]
-        late = [
-            start - world.start - seen for start, seen in zip(policy.begun, newest, strict=False)
-        ]  # one is under way
+        begun = zip(policy.begun, newest, strict=False)  # one is under way
+        late = [start - world.start - seen for start, seen in begun]
     assert max(late) <= 0.18 / ROWS + 1e-6, "one piece of work is the most that a call waits for"
     assert ROWS + 1 in policy.waited, "the second piece was left to the call"
 
