@@ -34,7 +34,7 @@ class Schedule:
         self.timeline: Timeline | None = None
         self.due = 0
         self.refusal: str | None = None
-        self._stood = 0.0  # seconds from the observation of the newest chunk to when it begins
+        self._first = 0  # no chunk begins before this tick: that of the first action, where the robot stood until then
         most = (settings.horizon + settings.reserve) * settings.ticks_per_step
         self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(most, 3))
 
@@ -78,14 +78,15 @@ class Schedule:
         if self._guard.refuse(actions[settings.horizon :]) is not None:
             actions = actions[: settings.horizon]
         rows = expand(actions, settings.ticks_per_step, settings.interpolation)
-        start = self.grid.tick(observed)
+        start = max(self.grid.tick(observed), self._first)
         new = Timeline.of(start, rows, observed)
         if self._guard.clips:
             new = new.clipped_to(self._guard.bounded(rows))
         seam = start if self.last is None else self.last[0] + 1
         blend = settings.blend_steps if settings.seam == "blend" else 0
         ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" and not alone else None
-        spliced = splice(self.timeline, new, seam, blend, ensemble)
+        # Before the first action nothing of an older chunk was played and the robot stood: the newest takes its place.
+        spliced = splice(None if self.last is None else self.timeline, new, seam, blend, ensemble)
         if spliced is None or new.end <= self.grid.tick(now):
             return "overdue"
         past = self._past
@@ -97,19 +98,19 @@ class Schedule:
             self.refusal = self._guard.refuse_motion(past, spliced.rows) if len(spliced.rows) else refusal
             if self.refusal is not None:
                 return "refused"
-        self.timeline, self._stood = spliced, 0.0
+        self.timeline = spliced
         return "scheduled"
 
     def begin(self, tick: int) -> None:
         """Have the chunk begin at the tick of the episode's first action: until then the robot is where it was seen.
 
-        None of its actions is overdue. Displacements that are left out would be lost for good, and the robot would jump
-        to a place that it should have reached by then. A chunk that would be over is not played.
+        None of its actions is overdue, nor of the next chunk's if it was observed before that tick. Displacements that
+        are left out would be lost for good, and the robot would jump to a place that it should have reached by then. A
+        chunk that would be over is not played.
         """
         timeline = self.timeline
         if self.last is None and timeline is not None and timeline.start < tick < timeline.end:
-            self._stood = self.grid.time(tick) - self.grid.time(timeline.start)
-            self.timeline = replace(timeline, start=tick)
+            self._first, self.timeline = tick, replace(timeline, start=tick)
 
     def skip_to(self, tick: int) -> None:
         """Have what follows keep the limits of a guard that clips, where nothing is given out for the ticks before."""
@@ -127,7 +128,8 @@ class Schedule:
     def executed(self) -> float:
         """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
         assert self.timeline is not None
-        return float(self.timeline.observed.max()) + self._stood + self._settings.horizon / self._settings.policy_hz
+        begun = max(float(self.timeline.observed.max()), self.grid.time(self._first))
+        return begun + self._settings.horizon / self._settings.policy_hz
 
     def need_by(self, time: float) -> None:
         """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""
@@ -144,12 +146,13 @@ class Schedule:
     def committed(self, observed: float, until: float) -> FloatArray:
         """Actions given out and scheduled between two times, one a step of the policy, ``[N, Da]``."""
         tick, last = self.grid.tick(observed), self.grid.tick(until)
-        played = dict(self._played)
-        rows: list[FloatArray] = []
+        played, timeline, rows = dict(self._played), self.timeline, list[FloatArray]()
+        if timeline is not None and not played:  # it begins with the first action, and so does the next chunk
+            timeline = replace(timeline, start=tick)
         while tick <= last and len(rows) < self._settings.horizon:
             row = played.get(tick)
-            if row is None and self.timeline is not None:
-                row = self.timeline.at(tick)
+            if row is None and timeline is not None:
+                row = timeline.at(tick)
             if row is None:
                 break
             rows.append(row)

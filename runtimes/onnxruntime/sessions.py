@@ -86,10 +86,8 @@ class Sessions:
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
         unused = filter(kinds.of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
         others = set(filter(kinds.is_of_loop, manifest.pieces))
-        once, contents = (
-            set(manifest.pieces) - single - {kinds.JOINT, kinds.LAYERS} - set(unused) - others,
-            _contents(view),
-        )
+        once = set(manifest.pieces) - single - {kinds.JOINT, kinds.LAYERS} - set(unused) - others
+        contents = _contents(view)
         sessions = {piece: self._session(view, piece, contents) for piece in sorted(once)}
         sessions[FIRST_STEP] = self._session(view, kinds.DENSE_STEP, contents, first_step=True)
         return sessions | self._of_blocks(view, contents) if blocks else sessions
