@@ -147,7 +147,7 @@ class Silent(DDIMScheduler):
     """Does not say what it takes the clean sample for."""
 
     def step(self, model_output: Any, timestep: Any, sample: Any, *args: Any, **kwargs: Any) -> Any:
-        made = super().step(model_output, timestep, sample, *args, **kwargs)
+        made: Any = super().step(model_output, timestep, sample, *args, **kwargs)
         made.pred_original_sample = None
         return made
 
