@@ -38,6 +38,24 @@ def world(recipe: ModuleType) -> Iterator[Any]:
     made.close()
 
 
+def test_the_end_of_a_world_does_not_freeze_the_pictures_of_another(recipe: ModuleType) -> None:
+    def risen(world: Any) -> Any:
+        for _ in range(8):
+            world.step(np.array([0.0, 0.0, 1.0, -1.0], np.float32))
+        return world.observe()["observation.images.front"]
+
+    other, world, alone = (recipe.FetchBlocks() for _ in range(3))
+    for each in (other, world, alone):
+        each.reset(5)
+        first = each.observe()["observation.images.front"]
+    expected = risen(alone)
+    assert not np.array_equal(first, expected)
+    world.observe()
+    other.close()
+    del other
+    assert np.array_equal(risen(world), expected)
+
+
 def test_every_task_can_be_done_in_the_same_scene(recipe: ModuleType, world: Any) -> None:
     for task in recipe.TASKS:
         world.reset(5, task, 5)

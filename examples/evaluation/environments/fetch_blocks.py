@@ -7,6 +7,7 @@ model of the arm is Gymnasium-Robotics'. Actions are ``[4]``: displacement of th
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import gymnasium_robotics
@@ -149,6 +150,16 @@ def _model() -> mujoco.MjModel:
     return model
 
 
+@cache
+def _renderer(size: int) -> mujoco.Renderer:
+    """The only one of its size, for all environments: they differ in what is drawn, not in meshes and textures.
+
+    Where a MuJoCo renderer is freed, it deletes the textures and buffers of whichever is current, so that another
+    environment sees a frozen picture from then on. So none is ever freed.
+    """
+    return mujoco.Renderer(_model(), size, size)
+
+
 class FetchBlocks:
     """See ``Environment``. The score is 1 at success and else 0.
 
@@ -158,11 +169,11 @@ class FetchBlocks:
     """
 
     title, hz, max_steps = "Fetch with blocks", 25.0, 60
+    displacements: tuple[int, ...] = (0, 1, 2)
 
     def __init__(self) -> None:
         self._model = _model()
         self._data = mujoco.MjData(self._model)
-        self._renderers: dict[int, mujoco.Renderer] = {}
         self._hand = self._model.body("robot0:gripper_link").id
         joints = self._model.jnt_qposadr
         self._fingers = [joints[self._model.joint(f"robot0:{side}_gripper_finger_joint").id] for side in "lr"]
@@ -253,10 +264,10 @@ class FetchBlocks:
 
     def view(self, camera: str, size: int = SIZE) -> npt.NDArray[np.uint8]:
         """What a camera sees now, RGB ``[size, size, 3]``; ``camera`` is ``front`` or ``wrist``."""
-        if size not in self._renderers:
-            self._renderers[size] = mujoco.Renderer(self._model, size, size)
-        renderer = self._renderers[size]
-        renderer.update_scene(self._data, camera)
+        renderer, seen_by = _renderer(size), mujoco.MjvCamera()
+        seen_by.type, seen_by.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, self._model.camera(camera).id
+        everything, options = mujoco.mjtCatBit.mjCAT_ALL.value, mujoco.MjvOption()
+        mujoco.mjv_updateScene(self._model, self._data, options, None, seen_by, everything, renderer.scene)
         return np.asarray(renderer.render())
 
     def step(self, action: Array) -> None:
@@ -286,10 +297,7 @@ class FetchBlocks:
         return self.view("front", 480)
 
     def close(self) -> None:
-        """Nothing more is asked."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers = {}
+        """Nothing is to be freed: the renderer is the process's."""
 
 
 ENVIRONMENT = FetchBlocks
