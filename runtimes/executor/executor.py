@@ -146,7 +146,10 @@ class AsyncExecutor:
         if self.trace.on:
             self.trace.span(CONTROL, name, start, self._clock.now() - start)
         if action is None:
-            raise error
+            try:
+                raise error
+            finally:
+                del error  # it and this frame would keep each other, and with them all that the caller holds
         return action
 
     def reset(self, seed: int | None = None) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ttscompile.errors import ExecutorClosedError, WorkerDeadError
+from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, WorkerDeadError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
 from .simulation import REAL_LIMIT, FakeClock, ScriptedPolicy, World, workers
@@ -85,6 +85,24 @@ def test_it_may_be_collected_during_a_call_and_by_its_own_thread() -> None:
     start_a_call(kept[0])
     assert policy.done.wait(REAL_LIMIT)
     until_no_thread_is_left()
+
+
+def test_a_missing_action_keeps_nothing_of_the_callers() -> None:
+    """Control loops often run without garbage collection, and what they hold may be a renderer."""
+
+    def loop(world: World) -> weakref.ref[FakeClock]:
+        held = FakeClock()
+        with pytest.raises(DeadlineMissedError):
+            world.executor.action()
+        return weakref.ref(held)
+
+    gc.collect()
+    gc.disable()
+    try:
+        with World() as world:
+            assert loop(world)() is None
+    finally:
+        gc.enable()
 
 
 def test_closing_twice_is_closing_once() -> None:
