@@ -194,6 +194,12 @@ def several(kind: Callable[[str], T]) -> Callable[[Any, Any, str], list[T]]:
     callback=several(float),
     help="Seconds without movement after which one call is dense and from nothing; 0: no watchdog.",
 )
+@click.option(
+    "--displacements/--no-displacements",
+    default=True,
+    show_default=True,
+    help="Whether the executor knows which actions of this world are displacements.",
+)
 @click.option("--hz", type=click.FloatRange(min=0.1), help="Ticks a second; without this option the world's own.")
 @click.option("--episodes", default=48, show_default=True, type=click.IntRange(1))
 @first_seed_option
@@ -210,6 +216,7 @@ def main(
     margins: list[int],
     horizons: list[int],
     watchdogs: list[float],
+    displacements: bool,
     hz: float | None,
     episodes: int,
     first_seed: int,
@@ -224,8 +231,9 @@ def main(
     make = environment_class(environment)
     hz = hz or make.hz
     seeds = range(first_seed, first_seed + episodes)
+    channels = make.displacements if displacements else ()
     setups = [
-        Setup(latency, seam, margin, horizon or None, hz, watchdog or None)
+        Setup(latency, seam, margin, horizon or None, hz, watchdog or None, channels)
         for seam, margin, horizon, watchdog, latency in product(seams, margins, horizons, watchdogs, latencies)
     ]
     for setup in setups:

@@ -139,7 +139,8 @@ class Setup:
         margin: ticks that a chunk shall be there before it is needed.
         horizon: actions from one call to the next; None for as many as the policy executes.
         hz: ticks a second, each one step of the environment.
-        stall_after: as in ``ExecutorSettings``.
+        stall_after: as in ``ExecutorSettings``, as is the next.
+        displacements: channels whose actions say how far to move.
     """
 
     latency_ms: float
@@ -148,6 +149,7 @@ class Setup:
     horizon: int | None
     hz: float
     stall_after: float | None = None
+    displacements: tuple[int, ...] = ()
 
     @property
     def label(self) -> str:
@@ -168,6 +170,7 @@ class Setup:
             horizon=self.horizon,
             tiers=(plan,),
             stall_after=self.stall_after,
+            displacements=self.displacements,
             refuse_infeasible=False,
             trace_events=0,
         )
@@ -229,6 +232,7 @@ def drive(make: Callable[[], Environment], variant: Variant, setup: Setup, seed:
     finally:
         clock.free()
         executor.close(timeout=120)
+        world.environment.close()
     age = statistics.action_age_ms
     world.windows = policy.windows
     bridged = statistics.reserve + statistics.holds

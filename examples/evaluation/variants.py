@@ -91,7 +91,8 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
     """Load what one argument names.
 
     Args:
-        text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds.
+        text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds, also in
+            another precision: ``DIR:NAME@int8+blocks``.
             With ``:pinned`` after it all calls of an episode have the same noise.
         runtime: of ``ttscompile.load``.
         threads: of ``ttscompile.load``.
@@ -104,7 +105,8 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
     if len(plans) > 1:
         raise click.BadParameter(f"{text}: expected one plan; found {':'.join(words)}.")
     policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, plan=plans[0] if plans else None)
-    whole = policy.plans[policy.info.default_plan].otherwise  # the noise of its calls is for the whole loop
+    name = policy.info.default_plan.partition("@")[0]  # in whatever precision
+    whole = policy.plans[name].otherwise  # the noise of its calls is for the whole loop
     shape = noise_shape(policy.info)
     if whole is not None and whole.cells is not None:
         shape = replace(shape, steps=len(whole.cells))

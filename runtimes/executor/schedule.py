@@ -85,8 +85,12 @@ class Schedule:
         seam = start if self.last is None else self.last[0] + 1
         blend = settings.blend_steps if settings.seam == "blend" else 0
         ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" and not alone else None
+        if settings.displacements and self.last is not None:
+            late = max(seam, self.grid.tick(now)) - start
+            new = replace(new, rows=self._caught_up(new, rows, late, max(blend, 1)))
         # Before the first action nothing of an older chunk was played and the robot stood: the newest takes its place.
-        spliced = splice(None if self.last is None else self.timeline, new, seam, blend, ensemble)
+        old = None if self.last is None else self.timeline
+        spliced = splice(old, new, seam, blend, ensemble, settings.displacements)
         if spliced is None or new.end <= self.grid.tick(now):
             return "overdue"
         past = self._past
@@ -100,6 +104,28 @@ class Schedule:
                 return "refused"
         self.timeline = spliced
         return "scheduled"
+
+    def _caught_up(self, new: Timeline, meant: FloatArray, late: int, steps: int) -> FloatArray:
+        """The rows of a chunk; what the robot should have been displaced by when it came is made up for after that.
+
+        A position is right whenever it is reached. But displacements that are overdue would be lost, those that were
+        given out in their place would stay, and what went wrong is what a policy corrects with its first ones.
+
+        Args:
+            new: the chunk.
+            meant: its rows as they were before the guard clipped them.
+            late: rows that are overdue.
+            steps: rows to make up for it in, or more if the guard's bounds leave no room.
+        """
+        rows, channels = new.rows.copy(), list(self._settings.displacements)
+        made = [action[channels] for tick, action in self._played if new.start <= tick < new.start + late]
+        left = meant[:late, channels].sum(axis=0) - np.sum(made, axis=0, dtype=np.float32)
+        for i, row in enumerate(rows[late:]):
+            wanted = meant[late + i, channels]
+            row[channels] = wanted + left / max(steps - i, 1)
+            row[channels] = self._guard.bounded(row)[channels]
+            left += wanted - row[channels]
+        return rows
 
     def begin(self, tick: int) -> None:
         """Have the chunk begin at the tick of the episode's first action: until then the robot is where it was seen.

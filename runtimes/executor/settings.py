@@ -84,7 +84,10 @@ class ExecutorSettings:
         ensemble_coefficient: m of the weights ``exp(-m * i)`` of ``ensemble``, i = 0 for the oldest prediction of a
             tick: 0 for a plain mean, negative where new predictions shall count more than old ones.
         max_hold: control ticks for which the last action is repeated when there is no other, not even in reserve; then
-            ``action`` raises. Right for positions; for velocities and differences set 0.
+            ``action`` raises. ``displacements`` are 0 meanwhile.
+        displacements: channels whose actions say how far to move, or how fast, not where to. What a chunk meant for the
+            ticks before it came, less what was given out in them, is added to its next actions, within the guard's
+            bounds: at once, or with ``blend`` over ``blend_steps``. Otherwise it is lost at every seam.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
         warm_up: first calls of each plan whose latency does not count.
         measured_calls: calls of each plan, after these, that measure its latency before the executor is ready.
@@ -116,6 +119,7 @@ class ExecutorSettings:
     blend_steps: int = 4
     ensemble_coefficient: float = 0.01
     max_hold: int = 3
+    displacements: tuple[int, ...] = ()
     margin_ticks: int = 1
     warm_up: int = 2
     measured_calls: int = 5
@@ -138,9 +142,10 @@ class ExecutorSettings:
             if one.type == "int" or (one.type == "int | None" and value is not None):
                 least = 0 if one.name in _MAY_BE_ZERO else 1
                 object.__setattr__(self, one.name, integer(value, one.name, ExecutorError, least, _MOST))
-        if self.cores is not None:
-            cores = tuple(integer(core, "a processor in cores", ExecutorError) for core in self.cores)
-            object.__setattr__(self, "cores", cores)
+        for name, what in (("cores", "a processor"), ("displacements", "a channel")):
+            given = getattr(self, name)
+            if given is not None:
+                object.__setattr__(self, name, tuple(integer(n, f"{what} in {name}", ExecutorError) for n in given))
         for name in ("policy_hz", "max_age", "stall_after"):
             value = getattr(self, name)
             if value is not None:
@@ -225,6 +230,9 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
             f"reserve = {reserve}: the policy predicts {longest} actions from the observation on, and horizon ="
             f" {horizon} are played anyway. Give at most {longest - horizon}, or None for all."
         )
+    if max(settings.displacements, default=0) >= chunk.action_dim:
+        have = f"actions have {chunk.action_dim} channels, 0 to {chunk.action_dim - 1}"
+        raise ExecutorError(f"displacements = {settings.displacements}: {have}. Name the channels among these.")
     stall = None
     if settings.stall_after is not None:
         scale = np.float32(1) if chunk.normalizer is None else np.abs(chunk.normalizer.scale)

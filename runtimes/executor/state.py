@@ -164,8 +164,10 @@ class ExecutorState:
         self._holds = held
         counts.holds += 1
         self.recorder.tick(now)
-        self._give(tick, last[1], time)
-        return last[1].copy()
+        action = last[1].copy()
+        action[list(self._settings.displacements)] = 0  # it moved the robot already
+        self._give(tick, action, time)
+        return action.copy()
 
     def _give(self, tick: int, action: FloatArray, time: float) -> None:
         self._schedule.give(tick, action, time)

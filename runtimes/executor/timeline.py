@@ -127,7 +127,12 @@ def expand(actions: FloatArray, ticks_per_step: int, interpolation: str) -> Floa
 
 
 def splice(
-    old: Timeline | None, new: Timeline, seam: int, blend: int = 0, ensemble: float | None = None
+    old: Timeline | None,
+    new: Timeline,
+    seam: int,
+    blend: int = 0,
+    ensemble: float | None = None,
+    displacements: tuple[int, ...] = (),
 ) -> Timeline | None:
     """The schedule after a chunk came.
 
@@ -138,6 +143,7 @@ def splice(
         blend: ticks over which the old actions turn evenly into the new ones, where both are there; 0 to replace them.
         ensemble: coefficient of ``average``, for what both have, and what only the old ones have stays; None for
             neither.
+        displacements: channels that do not turn: their sum counts, and it is made up for (``Schedule.add``).
 
     Returns:
         What is scheduled from ``seam`` on; None if the whole chunk is overdue.
@@ -155,7 +161,8 @@ def splice(
             made = made.then(old.between(made.end, old.end))
     elif blend and first >= old.start:
         rows, clipped, past = made.rows.copy(), made.clipped.copy(), both.rows[:blend]
-        weight = (np.arange(1, len(past) + 1, dtype=np.float32) / (blend + 1))[:, None]
+        weight = np.repeat(np.arange(1, len(past) + 1, dtype=np.float32)[:, None] / (blend + 1), rows.shape[1], 1)
+        weight[:, list(displacements)] = 1
         rows[: len(past)] = past + weight * (rows[: len(past)] - past)
         clipped[: len(past)] |= both.clipped[:blend]
         made = replace(made, rows=rows, clipped=clipped)

@@ -134,6 +134,7 @@ class Counting:
 
     title, hz, max_steps, task = "Counting", 1.0, 11, "count"
     measures: Mapping[str, float] = MappingProxyType({})
+    displacements: tuple[int, ...] = ()
 
     def reset(self, seed: int) -> None:
         self.seed, self.steps, self.sum, self.looked = seed, 0, 0.0, 0

@@ -31,18 +31,20 @@ class Environment(Protocol):
     """One robot and its task or tasks, one episode after another.
 
     A seed is an episode: the same seed and the same actions give the same frames, scores and pictures, in any order of
-    episodes. All but the first three attributes are of the episode under way.
+    episodes. All but the first four attributes are of the episode under way.
 
     Attributes:
         title: for tables and pictures, such as ``Push-T``.
         hz: actions a second.
         max_steps: actions after which an episode ends.
+        displacements: channels of the actions that say how far to move, not where to (``ExecutorSettings``).
         task: what has to be done, where there are several tasks: the seed decides; else empty.
     """
 
     title: str
     hz: float
     max_steps: int
+    displacements: tuple[int, ...]
     task: str
 
     @property

@@ -25,6 +25,7 @@ class Fetch:
     """See ``Environment``. The score is the share of the way to the goal that was covered at best; 1 at success."""
 
     title, hz, max_steps = "Fetch", 25.0, 50
+    displacements: tuple[int, ...] = (0, 1, 2)
 
     def __init__(self) -> None:
         self._worlds: dict[int, gymnasium.Env[Frame, Array]] = {}

@@ -104,6 +104,7 @@ class PushT:
     """
 
     title, hz, max_steps, task = "Push-T", 10.0, 300, ""
+    displacements: tuple[int, ...] = ()
 
     def __init__(self) -> None:
         self._gym: Any = gymnasium.make(
