@@ -13,7 +13,7 @@ from tests.calibration import policies
 from tests.once import Once
 from ttscompile import TtscompileError
 from ttscompile.artifact import load_artifact
-from ttscompile.errors import ArtifactError, RuntimeUnavailableError
+from ttscompile.errors import ArtifactError, IllegalPlanError, RuntimeUnavailableError
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime import sessions
 from ttscompile.verification.precision import CARRIED, EIGHT_BITS
@@ -61,6 +61,24 @@ def test_the_reference_runtime_computes_in_fp32(int8: Path) -> None:
         ttscompile.load(int8, "reference")
     with pytest.raises(RuntimeUnavailableError, match="'onnxruntime' computes in fp32, and beside it int8"):
         ttscompile.load(int8, plan="full@bf16")
+
+
+def test_parts_may_be_named_one_by_one(int8: Path) -> None:
+    artifact = load_artifact(int8)
+    record = artifact.manifest.precision
+    assert record is not None
+    parts = record.kept
+    assert artifact.plan(f"dense@int8+{'+'.join(parts)}").precision == artifact.plan("dense@int8").precision
+    obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
+    found = [open_runtime(artifact).predict(obs, noise, artifact.plan(f"dense@int8+{part}"))[0] for part in parts]
+    found.append(open_runtime(artifact).predict(obs, noise, artifact.plans["dense"])[0])
+    for i, one in enumerate(found):
+        assert all(not np.array_equal(one, other) for other in found[:i])
+    with pytest.raises(ArtifactError, match="wants 'nonsense' in 'int8'"):
+        ttscompile.load(int8, plan="dense@int8+nonsense")
+    for wrong in ("dense@fp32+blocks", "dense@+blocks"):
+        with pytest.raises(IllegalPlanError, match="has no plan"):
+            artifact.plan(wrong)
 
 
 def test_a_precision_that_the_artifact_does_not_hold_is_refused_by_its_name(fp32: Path) -> None:

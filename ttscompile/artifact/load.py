@@ -109,7 +109,8 @@ class Artifact:
         """A plan by its name, or in another precision: ``NAME@fp32``, ``NAME@int8``, ``NAME@bf16``.
 
         In fp32 all tokens are computed, too, which every runtime can do. int8 is of all parts that the artifact has
-        such models of; bf16 and fp16, which torch makes of the weights, are of the residual blocks.
+        such models of, bf16 and fp16, which torch makes of the weights, are of the residual blocks; or of the parts
+        that are named after it: ``NAME@int8+PART+PART``.
 
         Raises:
             IllegalPlanError: there is none of this name.
@@ -117,8 +118,9 @@ class Artifact:
         if not isinstance(name, str):
             found = f"found a {type(name).__name__}. A matrix is for predict_action(plan=...), call by call"
             raise IllegalPlanError(f"expected a ttscompile.Plan, or the name of one, {list(self.plans)}; {found}.")
-        own, _, precision = name.partition("@")
-        if own not in self.plans or precision not in ("", *PRECISIONS):
+        own, _, rest = name.partition("@")
+        precision, *parts = rest.split("+")
+        if own not in self.plans or precision not in ("", *PRECISIONS) or (parts and precision in ("", FP32)):
             remedy = "Use one of these, NAME@PRECISION for one in another precision, or dataclasses.replace"
             raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {list(self.plans)}. {remedy}.")
         if not precision:
@@ -126,7 +128,7 @@ class Artifact:
         if name not in self._derived:
             record, plan = self.manifest.precision, self.plans[own].exact
             held = record.kept if precision == INT8 and record is not None else (names.BLOCKS,)
-            plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(held, precision))
+            plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
             self._derived[name] = replace(plan)  # another object than the one in fp32 may be
         return self._derived[name]
 
