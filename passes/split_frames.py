@@ -73,7 +73,9 @@ class SplitFrames(Pass[Program, Program]):
         order = {node.name: i for i, node in enumerate(graph.nodes)}
         alike: dict[tuple[int, str], list[_Tower]] = {}  # what does the same with the same weights, together
         for tower in sorted(found, key=lambda one: order[one.entries[0]]):
-            alike.setdefault((tower.rows, _form(tower.graph)), []).append(tower)
+            own = (*tower.graph.inputs, *tower.graph.producers())  # names of values; weights keep theirs
+            form = str(tower.graph.renamed({name: f"%{i}" for i, name in enumerate(own)}))
+            alike.setdefault((tower.rows, form), []).append(tower)
         groups = list(alike.values())
         for group in groups:
             _require_apart(self, group[0].graph, program.weights)
@@ -213,11 +215,6 @@ def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
     out = tuple(Node(_crossing(n), "aten.clone.default", (Ref(n),), (), (types[n],)) for n in exits)
     inputs = {name: type_.resized(size) for name, type_ in graph.inputs.items()}
     return Graph(inputs, graph.constants, (*nodes, *out), tuple(map(_crossing, exits)))
-
-
-def _form(graph: Graph) -> str:
-    """Equal for graphs that differ in the names of their values alone; weights have theirs."""
-    return str(graph.renamed({name: f"%{i}" for i, name in enumerate((*graph.inputs, *graph.producers()))}))
 
 
 def _together(group: list[_Tower]) -> tuple[str, ...]:

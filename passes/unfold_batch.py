@@ -39,12 +39,12 @@ class UnfoldBatch(Pass[Cut, Cut]):
                 for name in (piece.stream, *(() if piece is loop.tail else piece.graph.outputs)):
                     rows[name] = Rows(name, like.type, f"{name}.rows", like.unfolded)
             blocks = tuple(replace(b, type=like.unfolded) for b in blocks)
-        stem, *inner, tail = (_crossing(piece, rows) for piece in loop.loop.values())
+        crossed = []
+        for piece in loop.loop.values():
+            graph = crossing_outputs(crossing_inputs(piece.graph, rows), rows)
+            stream = rows[piece.stream].crossing if piece.stream in rows else piece.stream
+            crossed.append(LoopPiece(graph, stream))
+        stem, *inner, tail = crossed
         prologue = crossing_outputs(program.prologue, rows)
         new = replace(program, blocks=blocks, prologue=prologue, loop=Loop(stem, tuple(inner), tail))
         return PassResult(new, (f"{len(rows)} values have several rows a stream and cross with an axis of streams",))
-
-
-def _crossing(piece: LoopPiece, rows: dict[str, Rows]) -> LoopPiece:
-    graph = crossing_outputs(crossing_inputs(piece.graph, rows), rows)
-    return LoopPiece(graph, rows[piece.stream].crossing if piece.stream in rows else piece.stream)

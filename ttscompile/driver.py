@@ -227,7 +227,12 @@ def _compile(
         manifest = write_artifact(program, models, directory, lowered, golden, beside, loop)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
-        _write(Path(single_file), whole)
+        try:
+            Path(single_file).parent.mkdir(parents=True, exist_ok=True)
+            replace_file(Path(single_file), whole)
+        except OSError as error:
+            told = f"the single file cannot be written: {error}"
+            raise ArtifactError(f"{single_file}: {told}. Give another path.") from error
         explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))
     return program
 
@@ -242,14 +247,6 @@ def _require_apart(single_file: str | os.PathLike[str], directory: str | os.Path
     if directory is not None and Path(os.path.realpath(directory)) in (file, *file.parents):
         problem = f"expected a path outside of the artifact {os.fspath(directory)}, which is replaced as a whole"
         raise ArtifactError(f"{single_file}: {problem}. {other}")
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, content)
-    except OSError as error:
-        raise ArtifactError(f"{path}: the single file cannot be written: {error}. Give another path.") from error
 
 
 def _lower_pieces(program: Program, models: Models, keep_fp32: Collection[str], explain: Explain) -> LoweredPieces:

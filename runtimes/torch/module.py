@@ -181,9 +181,11 @@ class PrunedCall(CallModule):
         """
         network = self._network(obs, initial)
         empty = self.empty_rollout(len(initial))
-        if rollout is not None:
-            self._check(rollout, empty)
         residuals, written = empty if rollout is None else rollout
+        for name, found, expected in zip(("residuals", "written"), (residuals, written), empty, strict=True):
+            if found.shape != expected.shape or found.dtype != expected.dtype:
+                kinds = [f"{value.dtype} {list(value.shape)}" for value in (expected, found)]
+                raise ObservationError(f"rollout: expected {name} {kinds[0]}; found {kinds[1]}. Use empty_rollout.")
         if not torch.compiler.is_compiling():
             return self._by_plan(network, initial, steps, residuals, written, rollout is not None)
         logits = network.logits()
@@ -192,7 +194,10 @@ class PrunedCall(CallModule):
         if self._far is not None:  # the loop is in the program once: one stream that is far outside decides for all
             far = self._is_far(network).any()
             uncorrected, other_offset, _ = self._moves(network, initial, steps, corrected=False)
-            advance, offset = advance.on(_chosen(far, uncorrected, advance)), torch.where(far, other_offset, offset)
+            plain, own = uncorrected.tensors(), advance.tensors()
+            # Without a correction no jump is numbered.
+            own |= {name: torch.where(far, plain[name], own[name]) for name in ("updates", "remember", "number")}
+            advance, offset = advance.on(own), torch.where(far, other_offset, offset)
             plan = torch.where(far, torch.tensor(self._plain_cells), plan)
         assert isinstance(advance, SteppedAdvance)
         cache = residuals if rollout is not None else None
@@ -245,18 +250,6 @@ class PrunedCall(CallModule):
         plan = torch.from_numpy(plans).to(initial.device)
         actions = self._actions(sample)
         return (actions, plan, (after, written | (plan == Source.COMPUTE.value))) if keeps else (actions, plan)
-
-    def _check(self, rollout: Rollout, like: Rollout) -> None:
-        for name, found, expected in zip(("residuals", "written"), rollout, like, strict=True):
-            if found.shape != expected.shape or found.dtype != expected.dtype:
-                kinds = [f"{value.dtype} {list(value.shape)}" for value in (expected, found)]
-                raise ObservationError(f"rollout: expected {name} {kinds[0]}; found {kinds[1]}. Use empty_rollout.")
-
-
-def _chosen(far: Tensor, uncorrected: Advance, corrected: Advance) -> dict[str, Tensor]:
-    """The tensors of one of two, which a tensor decides; without a correction no jump is numbered."""
-    plain, tensors = uncorrected.tensors(), corrected.tensors()
-    return tensors | {name: torch.where(far, plain[name], tensors[name]) for name in ("updates", "remember", "number")}
 
 
 def _repaired(plan: Tensor, written: Tensor) -> Tensor:

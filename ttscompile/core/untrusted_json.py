@@ -48,7 +48,8 @@ def parse_json(
         for _ in range(MAX_DEPTH + 1):
             if unseen is not None:
                 _require_shown(level, unseen)
-            level = [child for item in level for child in _children(item)]
+            held = [item for item in level if isinstance(item, dict | list)]
+            level = [child for item in held for child in (item.values() if isinstance(item, dict) else item)]
             if not level:
                 return data
     raise ValueError(f"it is more than {MAX_DEPTH} levels deep")
@@ -64,12 +65,6 @@ def _require_shown(level: list[Any], unseen: re.Pattern[str]) -> None:
         for text in item if isinstance(item, dict) else (item,):
             if isinstance(text, str) and unseen.search(text):
                 raise ValueError(f"it has a text with characters that cannot be shown, {text!a:.80}")
-
-
-def _children(item: object) -> Any:
-    if isinstance(item, dict):
-        return item.values()
-    return item if isinstance(item, list) else ()
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

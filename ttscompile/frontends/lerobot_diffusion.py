@@ -147,7 +147,11 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
             expected = as_saved(Network(config))
         require_weights(expected, weights, "config.json")
         network = Network(config)
-        _load_weights(network, weights)
+        for name, value in as_saved(network).items():
+            if not name.endswith(_GRID):
+                value.copy_(weights[name])
+            elif not torch.allclose(value, weights[name], atol=_ROUNDING):
+                raise CheckpointError(f"{name} is not the grid from -1 to 1 of a spatial softmax; it was changed.")
         encoder = ConditionEncoder(config, processors, network.rgb_encoder)
     except CheckpointError as error:
         raise CheckpointError(f"{directory}: {error}") from error
@@ -167,15 +171,6 @@ def as_saved(network: Network) -> dict[str, torch.Tensor]:
         if not saved.endswith((_COUNTER, ".pos_y", ".temperature")):
             found[f"diffusion.{saved}"] = value
     return found
-
-
-def _load_weights(network: Network, weights: Mapping[str, torch.Tensor]) -> None:
-    """Fill a network with weights that have its names and shapes; the grids of keypoints have to be its own."""
-    for name, value in as_saved(network).items():
-        if not name.endswith(_GRID):
-            value.copy_(weights[name])
-        elif not torch.allclose(value, weights[name], atol=_ROUNDING):
-            raise CheckpointError(f"{name} is not the grid from -1 to 1 of a spatial softmax; it was changed.")
 
 
 class RgbEncoder(nn.Module):

@@ -258,9 +258,10 @@ class DenoisingLoop:
         feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
         if self._inputs.jumps is not None:
             feeds[names.OFFSET] = self._jumped(w, self._inputs.jumps, feeds[names.OFFSET], state.history, k)
-        for name, piece in ((names.TAIL, self._pieces.tail), (names.STEM, self._pieces.stem)):
+        # The stem is of the next step; of the last one itself, whose stream nobody reads.
+        following = w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
+        for name, piece, at in ((names.TAIL, self._pieces.tail, k), (names.STEM, self._pieces.stem, following)):
             for context, type_ in piece.contexts.items():
-                at = k if name == names.TAIL else self._following(w, k)
                 feeds[names.advance_context(name, context)] = self._contexts.value(w, context, at, type_)
         sample, stream, prediction, *memory = w.inline(self._models[names.ADVANCE], feeds, self._weights)
         is_anchor = w.op("Gather", self._inputs.anchors, k)
@@ -298,10 +299,6 @@ class DenoisingLoop:
         longer = anchor.op("Concat", sample, prediction, kept, axis=2)
         same = other.op("Identity", history)
         return w.choose(is_anchor, anchor.body("anchor", longer), other.body("other", same))[0]
-
-    def _following(self, w: GraphWriter, k: str) -> str:
-        """The next step; of the last one itself, whose stream nobody reads."""
-        return w.op("Min", w.op("Add", k, w.constant(1)), w.constant(self._sampler.steps - 1))
 
     def _feeds(self, w: GraphWriter, piece: names.LoopPiece, stream: str, k: str) -> dict[str, str]:
         """A value for each input of the stem or a block: the sample or stream, then contexts."""

@@ -109,7 +109,10 @@ def lower_precision(
         new: dict[str, Array] = {}
         for name in pieces:
             # What some tokens are computed in is what all of them are: decided for all.
-            size = _tokens(models[name]) if is_tokens(name) else 1
+            size = 1
+            if is_tokens(name):  # as many as rows are kept
+                kept = next(value for value in models[name].graph.input if value.name not in (PIXELS, INDEX))
+                size = int(kept.type.tensor_type.shape.dim[0].dim_value)
             model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS, size)
             if own:
                 lowered[name] = model
@@ -125,12 +128,6 @@ def lower_precision(
             " precision 'fp32'."
         )
     return made, constants, tuple(notes)
-
-
-def _tokens(model: ModelProto) -> int:
-    """How many tokens a frame has, of a model for some of them: that many rows are kept."""
-    kept = next(value for value in model.graph.input if value.name not in (PIXELS, INDEX))
-    return int(kept.type.tensor_type.shape.dim[0].dim_value)
 
 
 def _notes(

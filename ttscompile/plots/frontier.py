@@ -53,7 +53,8 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))
     told = shown if len(shown) <= MOST_NAMES else [p for p in shown if p in efficient]
     for i, p in enumerate(told):
-        above = 4 + 8 * sum(_near(p, other) for other in told[:i])
+        apart = [(log(p.latency_ms / other.latency_ms), log(p.distance / other.distance)) for other in told[:i]]
+        above = 4 + 8 * sum(abs(x) < 0.15 and abs(y) < 0.2 for x, y in apart)
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
         axes.annotate(p.name, (p.latency_ms, p.distance), fontsize=8, **beside(place, p.name, above))
     best = [point for point in efficient if point.distance > 0]
@@ -72,10 +73,6 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     with_grid(axes)
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     return figure
-
-
-def _near(p: Point, other: Point) -> bool:
-    return abs(log(p.latency_ms / other.latency_ms)) < 0.15 and abs(log(p.distance / other.distance)) < 0.2
 
 
 def plot_chunk(actions: FloatArray, executed: range, title: str) -> Figure:

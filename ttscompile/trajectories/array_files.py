@@ -82,7 +82,7 @@ def hdf5_recording(path: Path) -> Recording:
     require_files(path)
     hint = "; expected an HDF5 file with data/DEMO/obs/NAME [F, ...]"
     with one_error(f"{path}: cannot be read as a data set of robomimic", hint), h5py.File(path, "r") as file:
-        demos = sorted(_group(path, file, "data"), key=_number)
+        demos = sorted(_group(path, file, "data"), key=lambda demo: (int((re.search(r"\d+$", demo) or "0")[0]), demo))
         groups = [_group(path, file, f"data/{demo}/obs") for demo in demos]
         lengths = [_length(path, group) for group in groups]
         names = sorted(set.intersection(*(set(group) for group in groups)))
@@ -145,8 +145,3 @@ def _require_plain_hdf5(path: Path, array: Any) -> None:
     if unknown := sorted({str(name) for name in array._filters} - FILTERS):
         told = f"compressed by {', '.join(unknown)}; expected {', '.join(sorted(FILTERS))}"
         raise TrajectoryError(f"{path}: {array.name!r} is {told}. Write it again (h5repack), or {AS_NPZ}")
-
-
-def _number(demo: str) -> tuple[int, str]:
-    found = re.search(r"\d+$", demo)
-    return (int(found.group()) if found else 0, demo)

@@ -207,11 +207,6 @@ class Paper(NothingAfter):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
 
-    def _room(self, interval: int) -> int:
-        """Computed cells of a call at this interval: geometrically to the budget."""
-        left = max(0.0, 1 - (interval + 1) / max(1.0, SHRINKING * self.intervals))
-        return round(float(self._task.budget * (self._most / self._task.budget) ** left))
-
     def _logits(self, values: Mapping[str, Array] | Mapping[str, Tensor], calls: Calls) -> Tensor:
         """What the head says, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.as_tensor(value) for name, value in values.items()}
@@ -224,7 +219,9 @@ class Paper(NothingAfter):
         leaves = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in self._values.items()}
         logits = self._logits(leaves, calls)
         price = torch.zeros(len(Source))
-        price[Source.COMPUTE] = _price(logits.detach().numpy(), self._room(interval))
+        left = max(0.0, 1 - (interval + 1) / max(1.0, SHRINKING * self.intervals))  # geometrically to the budget
+        room = round(float(task.budget * (self._most / task.budget) ** left))
+        price[Source.COMPUTE] = _price(logits.detach().numpy(), room)
         logits = logits - price
         plans = legal(pruner_plan(logits.detach().numpy()), calls.window)
         hard = torch.nn.functional.one_hot(torch.from_numpy(plans.astype(np.int64)), len(Source)).float()
