@@ -237,7 +237,8 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     if settings.stall_after is not None:
         scale = np.float32(1) if chunk.normalizer is None else np.abs(chunk.normalizer.scale)
         reach = np.broadcast_to(np.float32(settings.stall_range) / scale, (chunk.action_dim,))
-        stall = StallRule(ceil(settings.stall_after * control_hz), reach, settings.stall_plan)
+        after = ceil(settings.stall_after * control_hz)
+        stall = StallRule(after, reach, settings.stall_plan, settings.displacements)
     named = tiers if stall is None else (*tiers, stall.plan)
     if unknown := [name for name in named if name.partition("@")[0] not in info.plans]:
         known = list(info.plans)

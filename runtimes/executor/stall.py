@@ -17,18 +17,20 @@ class StallRule:
         ticks: for which the actions have to stay where they are.
         reach: float32 ``[Da]``, how far from the first of them they may be, in their own units.
         plan: that the next call runs then.
+        summed: channels that are displacements: what they add up to says where the robot is.
     """
 
     ticks: int
     reach: FloatArray
     plan: str
+    summed: tuple[int, ...] = ()
 
 
 class Watchdog:
     """Looks at the actions of one episode; a rule of None never finds anything."""
 
     def __init__(self, rule: StallRule | None) -> None:
-        self._rule = rule
+        self._rule, self._sum = rule, np.zeros(0 if rule is None else len(rule.reach), np.float32)
         self.restart()
 
     def restart(self) -> None:
@@ -45,7 +47,10 @@ class Watchdog:
         """Take note that an action ``[Da]`` was given out; whether ``plan`` is another one now."""
         if self._rule is None:
             return False
-        before = self.plan
+        before, summed = self.plan, list(self._rule.summed)
+        self._sum = self._sum + action
+        action = action.copy()
+        action[summed] = self._sum[summed]
         if self._first is not None and (np.abs(action - self._first) <= self._rule.reach).all():
             self._still += 1
         else:

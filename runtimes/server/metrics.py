@@ -9,6 +9,8 @@ from ttscompile.runtimes.executor.statistics import COUNTS, ExecutorStatistics, 
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
+_ESCAPED = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -35,7 +37,7 @@ def exposition(metrics: Sequence[Metric]) -> str:
         lines += [f"# HELP {name} {each.help}", f"# TYPE {name} {each.kind}"]
         of_samples = name if each.sum is None else f"{name}_bucket"
         for labels, value in each.samples:
-            inside = ",".join(f'{key}="{_escaped(text)}"' for key, text in labels.items())
+            inside = ",".join(f'{key}="{text.translate(_ESCAPED)}"' for key, text in labels.items())
             lines.append(f"{of_samples}{{{inside}}} {value!r}" if inside else f"{of_samples} {value!r}")
         if each.sum is not None:
             lines += [f"{name}_sum {each.sum!r}", f"{name}_count {each.samples[-1][1]!r}"]
@@ -56,7 +58,3 @@ def of_statistics(statistics: ExecutorStatistics) -> list[Metric]:
             what = f"Percentiles of the last measurements; see {name} in ExecutorStatistics."
             found.append(Metric(name, "gauge", what, samples))
     return found
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,3 +118,19 @@ def test_a_demonstration_has_a_row_for_each_step(recipe: ModuleType, world: Any)
     pictures = {"front": (96, 96, 3), "wrist": (96, 96, 3)}
     assert shapes == {**pictures, "state": (4,), "blocks": (9,), "action": (4,)}
     assert np.abs(recorded["action"]).max() <= 1
+
+
+def test_success_is_counted_by_phrasing(recipe: ModuleType) -> None:
+    folder = Path(__file__).parents[2] / "examples" / "policies" / "vla"
+    by_phrasing = script(folder, "phrasings").by_phrasing
+    world, seeds, asked = recipe.FetchBlocks(), range(40), dict[int, str]()
+    for seed in seeds:
+        world.reset(seed)
+        asked[seed] = world.instruction
+    episodes = [{"seed": n, "task": recipe.TASKS[n % 12], "success": n % 3 == 0} for n in seeds]
+    found = by_phrasing({"environment": "fetch-blocks", "variants": [{"episodes": episodes}] * 2})
+    assert sum(len(one) for one, _ in found.values()) == len(seeds)
+    assert sum(map(sum, (one for one, _ in found.values()))) == 14
+    for words, (one, other) in found.items():
+        form = re.compile(words.replace("{}", r"\w+"))
+        assert len(one) == len(other) == sum(form.fullmatch(text) is not None for text in asked.values())

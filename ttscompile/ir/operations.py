@@ -149,19 +149,14 @@ def _tensordot(node: Node, types: Types) -> int:
     return 2 * math.prod(node.type.at(1)) * math.prod(shape[a] for a in axes if isinstance(a, int))
 
 
-def _bilinear(node: Node, types: Types) -> int:
-    """Both inputs meet in each number of the result."""
-    return 2 * math.prod(node.type.at(1)) * math.prod(_shape(types, node.args[2])[1:])
-
-
 def _attention(node: Node, types: Types) -> int:
     query, key, value = (_shape(types, a) for a in node.args[:3])
     return 2 * math.prod(query[:-1]) * key[-2] * (query[-1] + value[-1])
 
 
-def _gathering(node: Node, types: Types) -> int:
-    """A convolution: each number of the result gathers one receptive field."""
-    return 2 * math.prod(node.type.at(1)) * math.prod(_shape(types, node.args[1])[1:])
+def _gathering(place: int) -> Callable[[Node, Types], int]:
+    """Each number of the result gathers a receptive field, or all pairs of both inputs: as much as its weights have."""
+    return lambda node, types: 2 * math.prod(node.type.at(1)) * math.prod(_shape(types, node.args[place])[1:])
 
 
 def _spreading(node: Node, types: Types) -> int:
@@ -214,7 +209,7 @@ _ELEMENTWISE = Operation(elementwise=True)
 _PRODUCT = Operation(linear=Linear.IN_EACH, flops=_product(0))
 _OF_SUM = Operation(linear=Linear.IN_EACH, flops=_product(1))
 _NORM = Operation(mixes=_normalized)
-_CONVOLUTION = Operation(flops=_gathering)
+_CONVOLUTION = Operation(flops=_gathering(1))
 _RECURRENT = Operation(dropout=(6, "train"), flops=_recurrent)
 
 _GROUPS: tuple[tuple[str, Operation], ...] = (
@@ -252,7 +247,7 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     ("addmm baddbmm addmv", _OF_SUM),
     ("einsum", replace(_PRODUCT, flops=_einsum)),
     ("tensordot", replace(_PRODUCT, flops=_tensordot)),
-    ("bilinear", Operation(flops=_bilinear)),
+    ("bilinear", Operation(flops=_gathering(2))),
     ("outer ger kron", Operation(linear=Linear.IN_EACH)),
     ("conv1d conv2d conv3d", _CONVOLUTION),
     ("conv_transpose1d conv_transpose2d conv_transpose3d", replace(_CONVOLUTION, flops=_spreading)),

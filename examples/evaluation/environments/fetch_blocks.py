@@ -129,6 +129,16 @@ def instruction(task: str, number: int, phrasings: Mapping[str, tuple[str, ...]]
     return templates[number % len(templates)].format(colour, *direction)
 
 
+def template(task: str, seed: int, phrasings: Mapping[str, tuple[str, ...]] = SEEN) -> str:
+    """The phrasing of the episode of a seed, with ``{}`` for colour and direction."""
+    templates = phrasings[task.split()[0]]
+    return templates[_number(seed) % len(templates)]
+
+
+def _number(seed: int) -> int:
+    return int(np.random.default_rng((seed, 1)).integers(100))
+
+
 def tokens(text: str) -> Frame:
     """What the policy is told: a token a word, as its tokenizer makes them, and which of them count; ``[LENGTH]``."""
     made = [BEFORE + WORDS.index(word) for word in text.split()]
@@ -224,7 +234,7 @@ class FetchBlocks:
         mujoco.mj_forward(self._model, data)
         self._move(random.uniform((-0.1, -0.12, -0.06), (0.08, 0.12, 0.06)), 1.0, 60)
         self.task = TASKS[seed % len(TASKS)] if task is None else task
-        self.instruction = instruction(self.task, int(np.random.default_rng((seed, 1)).integers(100)), self.phrasings)
+        self.instruction = instruction(self.task, _number(seed), self.phrasings)
         self._asked = list(COLOURS).index(self.task.split()[-1])
         self._was = self.block(self._asked)
         self._steps, self.done, self.success, self.score = 0, False, False, 0.0

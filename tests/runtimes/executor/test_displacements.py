@@ -114,3 +114,18 @@ def test_a_held_action_moves_nothing_and_still_says_where_to_be() -> None:
 def test_channels_that_are_not_there(wrong: tuple[float, ...], told: str) -> None:
     with pytest.raises(ExecutorError, match=told):
         Robot(ExecutorSettings(displacements=wrong))  # type: ignore[arg-type]
+
+
+def test_a_robot_that_keeps_moving_evenly_has_not_stopped() -> None:
+    """Displacements that are all the same say that it moves; positions that are, that it stands."""
+    made = {"tiers": ("dense",), "stall_after": 1.0, "stall_range": 0.05}
+    for channels, stalls in (((), 1), ((0,), 0)):
+        robot = Robot(ExecutorSettings(refuse_infeasible=False, displacements=channels, **made))  # type: ignore[arg-type]
+        with robot:
+            robot.answer = None  # type: ignore[assignment, method-assign]
+            robot.policy.actions = lambda obs: np.tile(np.float32([0.1, GOAL, 0.0]), (TO - 1 + TA + RESERVE, 1))
+            robot.drive(30)
+            assert (robot.executor.statistics().stalls > 0) == bool(stalls)
+            robot.policy.actions = lambda obs: np.tile(np.float32([0.0, GOAL, 0.0]), (TO - 1 + TA + RESERVE, 1))
+            robot.drive(40)
+            assert robot.executor.statistics().stalls > 0
