@@ -8,10 +8,10 @@ import pytest
 from one_camera import OneCamera
 
 from tests.families import cameras
+from tests.families.cameras import act, counted, frame, moved, picture
 from tests.once import Once
-from tests.runtimes.test_tokens import REUSE, act, counted, frame, moved, picture
 from ttscompile.artifact.load import load_artifact
-from ttscompile.core.plan import DENSE
+from ttscompile.core.plan import DENSE, TokenReuse
 from ttscompile.runtimes.load import open_policy
 
 pytestmark = pytest.mark.slow
@@ -22,7 +22,7 @@ def test_frames_of_the_other_camera_are_computed_whole(
     once: Once, camera: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     artifact = load_artifact(cameras.compiled_tokens(once) / "artifact")
-    policy = open_policy(artifact, seed=0, plan=replace(artifact.plans[DENSE], tokens=REUSE))
+    policy = open_policy(artifact, seed=0, plan=replace(artifact.plans[DENSE], tokens=TokenReuse(0.0, 1000)))
     one = OneCamera(cameras.CAMERAS[camera])
     one.patch(monkeypatch.setattr)
     first = frame((picture(0), picture(1)))

@@ -4,18 +4,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 import ttscompile
 from tests.once import Once
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.core.plan import Plan
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.siglip import Siglip, SiglipConfig
+from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.flow import flow_matching_table
 
-TO, SIDE, WORDS = 2, 24, 8
+Array = npt.NDArray[Any]
+TO, SIDE, PATCH, WORDS = 2, 24, 4, 8
 CAMERAS = ("left", "right")
 STEPS, HORIZON, ACTIONS = 3, 6, 3
 
@@ -40,8 +45,8 @@ class Patches(nn.Module):
     def __init__(self, kind: str) -> None:
         super().__init__()
         sizes: Any = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "num_attention_heads": 2}
-        clip = VisionConfig(**sizes, image_size=SIDE, patch_size=4)
-        siglip = SiglipConfig(**sizes, image_size=SIDE, patch_size=4)
+        clip = VisionConfig(**sizes, image_size=SIDE, patch_size=PATCH)
+        siglip = SiglipConfig(**sizes, image_size=SIDE, patch_size=PATCH)
         self.tower = ClipVision(clip) if kind == "clip" else Siglip(siglip, (SIDE, SIDE))
         self.out = nn.Linear(64, 8)
         self.pooled = kind == "clip"
@@ -151,3 +156,34 @@ def compiled_tokens(once: Once) -> Path:
     return once.folder(
         "tokens", lambda folder: ttscompile.compile_denoiser(*policy("clip"), folder / "artifact", precision="int8")
     )
+
+
+def picture(number: int) -> Array:
+    return 0.1 + 0.5 * np.random.default_rng(number).random((3, SIDE, SIDE), dtype=np.float32)
+
+
+def moved(image: Array, patch: int, by: float = 0.3) -> Array:
+    """The picture with another patch in this place."""
+    image, (y, x) = image.copy(), divmod(patch, SIDE // PATCH)
+    image[:, y * PATCH : (y + 1) * PATCH, x * PATCH : (x + 1) * PATCH] += np.float32(by)
+    return image
+
+
+def frame(*streams: tuple[Array, Array]) -> dict[str, Array]:
+    """What the two cameras of each stream show."""
+    seen = {key: np.stack([pair[i] for pair in streams]) for i, key in enumerate(CAMERAS)}
+    return {**seen, "state": np.zeros((len(streams), 4), np.float32)}
+
+
+def act(
+    policy: CompiledPolicy, before: dict[str, Array], newest: dict[str, Array], plan: str | Plan | None = None
+) -> Array:
+    noise = ttscompile.Noise(np.ones((len(newest["state"]), HORIZON, ACTIONS), np.float32))
+    window = {key: np.stack([before[key], value], 1) for key, value in newest.items()}
+    return np.asarray(policy.predict_action(window, noise=noise, plan=plan)["action_pred"])
+
+
+def counted(policy: CompiledPolicy) -> tuple[int, int]:
+    """Tokens that the last call computed, of how many."""
+    assert policy.last_report is not None
+    return policy.last_report.frames.tokens, policy.last_report.frames.of

@@ -14,6 +14,7 @@ import pytest
 
 import ttscompile
 from tests.families import cameras
+from tests.families.cameras import act, counted, frame, moved, picture
 from tests.literal_tokens import LiteralTokens
 from tests.once import Once
 from ttscompile.artifact.load import Artifact, load_artifact
@@ -34,7 +35,7 @@ from ttscompile.runtimes.tokens import TokenTower, sizes_of, token_towers
 pytestmark = pytest.mark.slow
 
 Array = npt.NDArray[Any]
-SIDE, PATCH, TOKENS = cameras.SIDE, 4, 37
+TOKENS = 37
 REUSE = TokenReuse(threshold=0.0, refresh=1000)
 
 
@@ -55,37 +56,6 @@ def reusing(artifact: Artifact, reuse: TokenReuse = REUSE, **fields: Any) -> Pla
 @pytest.fixture
 def policy(artifact: Artifact) -> CompiledPolicy:
     return open_policy(artifact, seed=0, plan=reusing(artifact))
-
-
-def picture(number: int) -> Array:
-    return 0.1 + 0.5 * np.random.default_rng(number).random((3, SIDE, SIDE), dtype=np.float32)
-
-
-def moved(image: Array, patch: int, by: float = 0.3) -> Array:
-    """The picture with another patch in this place."""
-    image, (y, x) = image.copy(), divmod(patch, SIDE // PATCH)
-    image[:, y * PATCH : (y + 1) * PATCH, x * PATCH : (x + 1) * PATCH] += np.float32(by)
-    return image
-
-
-def frame(*streams: tuple[Array, Array]) -> dict[str, Array]:
-    """What the two cameras of each stream show."""
-    seen = {key: np.stack([pair[i] for pair in streams]) for i, key in enumerate(cameras.CAMERAS)}
-    return {**seen, "state": np.zeros((len(streams), 4), np.float32)}
-
-
-def act(
-    policy: CompiledPolicy, before: dict[str, Array], newest: dict[str, Array], plan: str | Plan | None = None
-) -> Array:
-    noise = ttscompile.Noise(np.ones((len(newest["state"]), cameras.HORIZON, cameras.ACTIONS), np.float32))
-    window = {key: np.stack([before[key], value], 1) for key, value in newest.items()}
-    return np.asarray(policy.predict_action(window, noise=noise, plan=plan)["action_pred"])
-
-
-def counted(policy: CompiledPolicy) -> tuple[int, int]:
-    """Tokens that the last call computed, of how many."""
-    assert policy.last_report is not None
-    return policy.last_report.frames.tokens, policy.last_report.frames.of
 
 
 def tower_of(artifact: Artifact, threshold: float = 0.0, refresh: int = 1000) -> TokenTower:

@@ -13,7 +13,7 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.manifest import marked
 from ttscompile.artifact.view import view_of
 from ttscompile.core.plan import DENSE
-from ttscompile.core.spec import Affine, Noise, PolicySpec
+from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import RuntimeUnavailableError, SpecError
 from ttscompile.report.timing import Contestant, plan_contestant
 from ttscompile.runtimes.liveness import reads_earlier_calls
@@ -180,10 +180,5 @@ def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
         f"observation {k!r}": (o.normalizer, expected.observations[k].normalizer) for k, o in found.observations.items()
     }
     pairs["the action"] = (found.chunk.normalizer, expected.chunk.normalizer)
-    return [name for name, (left, right) in pairs.items() if not _same(left, right)]
-
-
-def _same(left: Affine | None, right: Affine | None) -> bool:
-    if left is None or right is None:
-        return left is right
-    return np.array_equal(left.scale, right.scale) and np.array_equal(left.offset, right.offset)
+    numbers = {name: [one and (*one.scale, *one.offset) for one in pair] for name, pair in pairs.items()}
+    return [name for name, (left, right) in numbers.items() if left != right]
