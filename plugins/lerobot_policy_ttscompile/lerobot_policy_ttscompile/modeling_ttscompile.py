@@ -200,8 +200,9 @@ class TtscompilePolicy(PreTrainedPolicy):
         streams = len(batch[next(iter(info.observation))])
         (horizon, width), predicted = info.original_sample, info.sample[0]
         shape = (streams, horizon, width)
-        drawn = torch.rand(shape) * 2 - 1 if info.noise == "uniform" else torch.randn(shape)
-        first = drawn if initial is None else initial.cpu()
+        if initial is None:  # a sample that is given is not drawn, and shifts no later draw
+            initial = torch.rand(shape) * 2 - 1 if info.noise == "uniform" else torch.randn(shape)
+        first = initial.cpu()
         if not info.stochastic:
             return ttscompile.Noise(first[:, :predicted].numpy())
         steps = torch.stack([torch.randn(shape) for _ in range(info.noise_steps - 1)] + [torch.zeros(shape)])
