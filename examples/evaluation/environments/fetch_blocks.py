@@ -6,6 +6,7 @@ model of the arm is Gymnasium-Robotics'. Actions are ``[4]``: displacement of th
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -165,9 +166,11 @@ def _renderer(size: int) -> mujoco.Renderer:
     """The only one of its size, for all environments: they differ in what is drawn, not in meshes and textures.
 
     Where a MuJoCo renderer is freed, it deletes the textures and buffers of whichever is current, so that another
-    environment sees a frozen picture from then on. So none is ever freed.
+    environment sees a frozen picture from then on. So none is freed before the end of the process.
     """
-    return mujoco.Renderer(_model(), size, size)
+    renderer = mujoco.Renderer(_model(), size, size)
+    atexit.register(renderer.close)
+    return renderer
 
 
 class FetchBlocks:
