@@ -120,8 +120,7 @@ class Schedule:
         rows, channels = new.rows.copy(), list(self._settings.displacements)
         made = [action[channels] for tick, action in self._played if new.start <= tick < new.start + late]
         left = meant[:late, channels].sum(axis=0) - np.sum(made, axis=0, dtype=np.float32)
-        for i, row in enumerate(rows[late:]):
-            wanted = meant[late + i, channels]
+        for i, (row, wanted) in enumerate(zip(rows[late:], meant[late:, channels], strict=True)):
             row[channels] = wanted + left / max(steps - i, 1)
             row[channels] = self._guard.bounded(row)[channels]
             left += wanted - row[channels]

@@ -143,8 +143,9 @@ class ExecutorSettings:
                 least = 0 if one.name in _MAY_BE_ZERO else 1
                 object.__setattr__(self, one.name, integer(value, one.name, ExecutorError, least, _MOST))
         for name, what in (("cores", "a processor"), ("displacements", "a channel")):
-            given = getattr(self, name)
-            if given is not None:
+            if (given := getattr(self, name)) is not None:
+                if not isinstance(given, tuple | list | range):
+                    raise ExecutorError(f"{name} must be a tuple of whole numbers; found {given!r:.80}.")
                 object.__setattr__(self, name, tuple(integer(n, f"{what} in {name}", ExecutorError) for n in given))
         for name in ("policy_hz", "max_age", "stall_after"):
             value = getattr(self, name)

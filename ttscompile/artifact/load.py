@@ -109,8 +109,8 @@ class Artifact:
         """A plan by its name, or in another precision: ``NAME@fp32``, ``NAME@int8``, ``NAME@bf16``.
 
         In fp32 all tokens are computed, too, which every runtime can do. int8 is of all parts that the artifact has
-        such models of, bf16 and fp16, which torch makes of the weights, are of the residual blocks; or of the parts
-        that are named after it: ``NAME@int8+PART+PART``.
+        such models of. bf16 and fp16, which torch makes of the weights, are of the residual blocks. Parts may be named
+        in place of these: ``NAME@int8+PART+PART``.
 
         Raises:
             IllegalPlanError: there is none of this name.

@@ -109,7 +109,7 @@ def test_a_held_action_moves_nothing_and_still_says_where_to_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"), [((3,), "channels, 0 to 2"), ((-1,), "displacements"), ((0.5,), "an integer")]
+    ("wrong", "told"), [((3,), "channels, 0 to 2"), ((-1,), "displacements"), ((0.5,), "an integer"), (0, "a tuple")]
 )
 def test_channels_that_are_not_there(wrong: tuple[float, ...], told: str) -> None:
     with pytest.raises(ExecutorError, match=told):
