@@ -121,7 +121,7 @@ class Artifact:
         own, _, rest = name.partition("@")
         precision, *parts = rest.split("+")
         if own not in self.plans or precision not in ("", *PRECISIONS) or (parts and precision in ("", FP32)):
-            remedy = "Use one of these, NAME@PRECISION for one in another precision, or dataclasses.replace"
+            remedy = "Use one of these, NAME@PRECISION or NAME@int8+PART for another precision, or dataclasses.replace"
             raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {list(self.plans)}. {remedy}.")
         if not precision:
             return self.plans[own]
