@@ -12,8 +12,8 @@ from ttscompile.artifact.view import View, require_held
 from ttscompile.core.coercion import integer
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import BF16, FP16, INT8
-from ttscompile.errors import RuntimeUnavailableError
-from ttscompile.ir.pieces import BLOCKS
+from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError
+from ttscompile.ir.pieces import parts_of
 
 from .backend import Backend, fitting
 from .runtime import Runtime
@@ -37,7 +37,7 @@ class Kind:
             torch's own setting), and with a device.
         install: what pip has to install where its packages are missing.
         held: the precisions beside fp32 that it computes in, from models that the artifact holds.
-        made: the precisions of residual blocks that it makes of the weights in fp32.
+        made: the precisions of any part that it makes of the weights in fp32.
         tokens: whether it can compute some of the tokens of an image encoder.
         devices: whether it computes anywhere else than on the CPU.
     """
@@ -84,13 +84,16 @@ def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
     Raises:
         RuntimeUnavailableError: it has no such precision, or cannot reuse tokens.
         ArtifactError: it could, and the artifact holds no such models.
+        IllegalPlanError: the artifact has no such part.
     """
     kind, remedy = kind_of(runtime), "Take plan='dense', or a plan in fp32: plan='NAME@fp32', which is plan.exact"
+    parts = parts_of(artifact.manifest.pieces)
     for part, precision in plan.precision.items():
-        if precision in kind.made and part == BLOCKS:
-            continue
-        if precision not in kind.held:
-            able = [*kind.held, *(f"{name} in {BLOCKS}" for name in kind.made)]
+        if precision in kind.made and part not in parts:
+            told = f"a plan wants {part!r} in {precision!r}; the artifact's parts are {', '.join(parts)}"
+            raise IllegalPlanError(f"{told}. Name some of these.")
+        if precision not in (*kind.made, *kind.held):
+            able = (*kind.held, *kind.made)
             can = f"fp32, and beside it {', '.join(able)}" if able else "fp32 alone"
             raise RuntimeUnavailableError(
                 f"runtime {runtime!r} computes in {can}; the plan wants {part!r} in {precision!r}. {remedy}."

@@ -191,7 +191,7 @@ class Runtime:
         self.require_streams(streams)
         if plan.otherwise is not None and self._chunk is None:
             plan = plan.otherwise
-        name = self._artifact.name_of(plan)
+        name, told = self._artifact.name_of(plan), self._artifact.told(plan)
         opened = self._opened_for(plan)
         view, backend = opened.view, opened.backend
         spec, manifest = view.manifest.spec, view.manifest
@@ -207,7 +207,8 @@ class Runtime:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
         settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
-        self._given |= name is None
+        reads = told is None or plan.cells is None or (plan.cells == Source.ROLLOUT)[~backend.keeps].any()
+        self._given |= name is None and bool(reads)  # NAME@bf16 reads what NAME does, which is kept where it reads that
         keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
         self._used = opened
         self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
@@ -225,7 +226,7 @@ class Runtime:
         executed.flags.writeable = False
         report = CallReport(
             plan=executed,
-            plan_name=self._artifact.told(plan) or GIVEN,
+            plan_name=told or GIVEN,
             loop=plan.loop,
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,

@@ -19,14 +19,13 @@ import torch
 from ttscompile.artifact.view import View
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import BoolArray, PlanArray, dense_plan, without_illegal_reads
-from ttscompile.core.spec import FP32, FloatArray
-from ttscompile.ir.pieces import BLOCKS
+from ttscompile.core.spec import FloatArray
 from ttscompile.runtimes.backend import Call, fitting
 from ttscompile.runtimes.inpainting import MaskedUpdates
 from ttscompile.runtimes.instructions import Instructions, by_plan, instructions_of
 from ttscompile.runtimes.liveness import readable_rollout
 
-from .devices import exact_arithmetic, narrow_type
+from .devices import exact_arithmetic
 from .network import Parts, Placed
 from .sampler import Advance
 from .workspace import Workspace
@@ -36,7 +35,7 @@ class TorchBackend:
     """A ``Backend`` on torch.
 
     Args:
-        view: of an artifact; its blocks have their products in fp32, bf16 or fp16.
+        view: of an artifact; each of its parts has its products in fp32, bf16 or fp16.
         placed: constants of the artifact, where to compute; those of other views are shared.
         threads: of arithmetic on the CPU, during calls alone: torch's setting is as it was between them.
         capture: how lines are captured; None for CUDA graphs on CUDA, and not at all elsewhere.
@@ -65,7 +64,7 @@ class TorchBackend:
         self.keeps = readable_rollout(view)
         self._advances: dict[tuple[Correction | None, bool], tuple[Advance, MaskedUpdates | None]] = {}
         with self._settings():
-            self._parts = Parts(view, placed, narrow_type(view.precision.get(BLOCKS, FP32), self.device))
+            self._parts = Parts(view, placed)
             self.workspace = Workspace(self._parts, 1)
         self._some: dict[int, Workspace] = {}  # for streams of a batch that follow a plan of their own
         self._whole = False
@@ -104,6 +103,8 @@ class TorchBackend:
     def logits(self) -> FloatArray:
         """See ``Backend.logits``."""
         with self._settings():
+            if self.device.type == "cuda":  # cuBLAS warns if it comes first in a thread, as in the one that prunes
+                torch.cuda.synchronize(self.device)
             return np.asarray(self.workspace.network.logits().float().cpu().numpy(), dtype=np.float32)
 
     def first_step(self) -> None:
@@ -141,8 +142,7 @@ class TorchBackend:
             work.call(plan, keep, self._advance)
 
         key = work.streams, whole, plan, keep.tobytes(), self._advance
-        matrix = not self._pruned and plan not in self._named
-        self._lines.run(None if matrix else key, line)
+        self._lines.run(key, line, at_once=self._pruned or plan in self._named)
 
     def _advance_of(self, call: Call) -> Advance:
         """The sampler's steps with the correction of a call; made once for each, and once for its prefixes."""
@@ -195,29 +195,30 @@ class Lines:
 
     def __init__(self, capture: Capture | None) -> None:
         self._capture = capture
-        self._captured: OrderedDict[Hashable, Line] = OrderedDict()
+        self._captured: OrderedDict[Hashable, Line | None] = OrderedDict()  # None: it came once
 
     @property
     def captures(self) -> bool:
         """Whether lines are captured."""
         return self._capture is not None
 
-    def run(self, key: Hashable, line: Line) -> None:
+    def run(self, key: Hashable, line: Line, at_once: bool = True) -> None:
         """Run a line.
 
         Args:
-            key: of all that the line depends on beside the values of its tensors; None not to capture it.
+            key: of all that the line depends on beside the values of its tensors.
+            at_once: capture it when it comes for the first time, and not for the second, as one that may never return.
         """
-        if self._capture is None or key is None:
+        if self._capture is None:
             line()
             return
         found = self._captured.get(key)
         if found is None:
-            found = self._captured[key] = self._capture(line)
+            found = self._captured[key] = self._capture(line) if at_once or key in self._captured else None
             if len(self._captured) > MOST:
                 self._captured.popitem(last=False)
         self._captured.move_to_end(key)
-        found()
+        (found or line)()
 
     def forget(self) -> None:
         """Let go of everything that was captured: its tensors are no more."""
@@ -239,8 +240,12 @@ def cuda_graphs(device: torch.device) -> Capture:
                 line()
         torch.cuda.current_stream(device).wait_stream(side)
         graph = torch.cuda.CUDAGraph()
+        # Torch keeps cuBLAS's scratch memory until somebody clears it, as torch.compile does. A graph that was captured
+        # with it then writes where other data is. Cleared here, it is taken anew, from the graph's own pool.
+        torch._C._cuda_clearCublasWorkspaces()
         with torch.cuda.graph(graph, pool=pool, stream=side):
             line()
+        torch._C._cuda_clearCublasWorkspaces()
         replay: Line = graph.replay
         return replay
 

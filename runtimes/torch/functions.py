@@ -39,7 +39,7 @@ HALF_LINEAR: Callable[..., Any] | None = None
 if {"x86", "fbgemm"}.intersection(torch.backends.quantized.supported_engines):
     HALF_LINEAR = torch.ops.quantized.linear_dynamic_fp16.default._op
 
-LINEAR, GELU = "aten.linear.default", "aten.gelu.default"
+LINEAR, GELU, MUL = "aten.linear.default", "aten.gelu.default", "aten.mul.Tensor"
 
 
 def packs(value: Any, weight: Any) -> bool:
@@ -88,6 +88,9 @@ _OWN: Mapping[str, Callable[..., Any]] = {
 }
 """Torch's Python functions that take the arguments of an overload as they are."""
 
+_ROOT_MEAN_SQUARE = ("aten.rsqrt.default", "aten.add.Tensor", "aten.mean.dim", "aten.pow.Tensor_Scalar")
+"""What divides a value by the root of the mean of its squares, the last operation first."""
+
 _PRODUCTS = frozenset(f"aten.{name}.default" for name in ("linear", "addmm", "mm", "matmul", "bmm", "convolution"))
 """Operations that autocast computes in the narrower type, so that their constants can be kept in it."""
 
@@ -107,7 +110,7 @@ def write_function(
     device = next((value.device for value in (*examples, *weights.values())), torch.device("cpu"))
     users = graph.users()
     readers = {name: len(nodes) + (name in graph.outputs) for name, nodes in users.items()}
-    writer = _Writer(streams, device, readers)
+    writer = _Writer(streams, device, readers, narrow)
     for name, value in zip(graph.inputs, examples, strict=True):
         writer.take_input(name, value)
     for name in graph.constants:
@@ -137,8 +140,12 @@ class _Writer:
     until something else reads it.
     """
 
-    def __init__(self, streams: int, device: torch.device, readers: Mapping[str, int]) -> None:
-        self._streams, self._device = streams, device
+    def __init__(
+        self, streams: int, device: torch.device, readers: Mapping[str, int], narrow: torch.dtype | None
+    ) -> None:
+        self._streams, self._device, self._narrow = streams, device, narrow
+        self._nodes: dict[str, Node] = {}
+        self._narrowed: dict[str, str] = {}  # by name in the source, that of the same in the type of products
         self._readers = readers  # how many nodes read a value, outputs counted as one more
         self._packed_nodes: dict[str, Node] = {}  # by name, what is computed in the place of linear layers
         self._numbers = count()
@@ -147,7 +154,7 @@ class _Writer:
         self._fixed: set[str] = set()  # names in the graph of what depends on no input
         self._parameters: list[str] = []
         self._lines: list[_Line] = []
-        self._scope: dict[str, Any] = {"as_strided": torch.as_strided}
+        self._scope: dict[str, Any] = {"as_strided": torch.as_strided, "to": Tensor.to, "narrow": narrow}
         self._owners: dict[int, tuple[str, Tensor]] = {}  # by storage: the computed value that made it
         self._seen: dict[tuple[Any, ...], str] = {}  # names of views that have a line
 
@@ -164,8 +171,8 @@ class _Writer:
 
     def write(self, node: Node) -> None:
         """Compute a node, and write it down unless it is fixed or a view."""
-        resolved = resolve_op(node)  # refuses what must not run
-        node, function = self._packed(node) or (node, _OWN.get(node.op, resolved))
+        self._nodes[node.name], resolved = node, resolve_op(node)  # which refuses what must not run
+        node, function = self._packed(node) or self._norm(node) or (node, _OWN.get(node.op, resolved))
         args = [self._value(node, argument) for argument in node.args]
         kwargs = {name: self._value(node, argument) for name, argument in node.kwargs}
         value = function(*args, **kwargs)
@@ -184,6 +191,28 @@ class _Writer:
         self._lines.append(_Line(name, f"{called}({', '.join(texts)})", tuple(reads)))
         if isinstance(value, Tensor) and value.numel() and not self._is_foreign(node, value):
             self._owners.setdefault(_storage(value), (name, value))
+
+    def _norm(self, node: Node) -> tuple[Node, Callable[..., Any]] | None:
+        """RMSNorm, where a node is the last of the six that it was captured as; None for any other node."""
+
+        def made_by(argument: Argument, op: str) -> Node | None:
+            found = self._nodes.get(argument.name) if isinstance(argument, Ref) else None
+            return found if found is not None and found.op == op else None
+
+        chain = [node if node.op == MUL else None]
+        for place, op in enumerate((MUL, *_ROOT_MEAN_SQUARE)):
+            before = chain[-1]
+            chain.append(None if before is None else made_by(before.args[place == 1], op))
+        _, scaled, _, added, mean, square = chain
+        if scaled is None or added is None or mean is None or square is None:
+            return None
+        (value, _), (_, weight), (_, eps) = scaled.args, node.args, added.args
+        if square.args != (value, 2) or mean.args[1:] != ((-1,), True) or not isinstance(weight, Ref):
+            return None
+        shape = self._values[scaled.name].shape[-1:]
+        if weight.name not in self._fixed or self._values[weight.name].shape != shape or not isinstance(eps, float):
+            return None
+        return replace(node, args=(value, tuple(shape), weight, eps)), torch.rms_norm
 
     def _packed(self, node: Node) -> tuple[Node, Callable[..., Any]] | None:
         """What does the same as a node on a packed weight: its arguments, and the function; None if nothing does."""
@@ -255,8 +284,15 @@ class _Writer:
     def _text(self, node: Node, argument: Argument, reads: list[str]) -> str:
         """An argument in the source; names that it reads go to ``reads``."""
         if isinstance(argument, Ref):
-            reads.append(self._named(argument.name))
-            return reads[-1]
+            name, value = self._named(argument.name), self._values[argument.name]
+            wide = isinstance(value, Tensor) and value.dtype == torch.float32 and argument.name not in self._fixed
+            if self._narrow is not None and node.op in _PRODUCTS and wide:
+                if name not in self._narrowed:  # autocast would do it once for each product that reads it
+                    self._narrowed[name] = self._new("n")
+                    self._lines.append(_Line(self._narrowed[name], f"to({name}, narrow)", (name,)))
+                name = self._narrowed[name]
+            reads.append(name)
+            return name
         if isinstance(argument, tuple) and any(isinstance(each, Ref | tuple) for each in argument):
             return f"[{', '.join(self._text(node, each, reads) for each in argument)}]"
         name = self._new("a")

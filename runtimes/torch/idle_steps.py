@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,11 @@ class Prepared(NamedTuple):
 
 
 class IdleSteps(devices.OnTensors):
-    """What steps that add one sum of residuals predict, from numbers of the size of the sample."""
+    """What steps that add one sum of residuals predict, from numbers of the size of the sample.
+
+    Attributes:
+        fused: the module of that name where it can run, which needs a GPU and Triton; None elsewhere.
+    """
 
     TENSORS = ("constant", "head", "shift", "along", "across", "basis")
 
@@ -43,6 +47,7 @@ class IdleSteps(devices.OnTensors):
         self.along, self.across = product[: self._dimensions + 1], product[self._dimensions + 1 :]
         self._held = not form.product.any()  # the prediction is the total's, whatever the sample is
         self.basis = None if form.norm is None else there(form.norm.basis)
+        self.fused: Any = None
 
     def prepare(self, total: Tensor) -> Prepared:
         """What is known as soon as the total is."""

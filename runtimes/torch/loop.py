@@ -84,9 +84,12 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     while k < steps:
         if network.idle is not None and plan.idle[k]:
             count = plan.alike[k]
-            known = network.idle.prepare(operands.total(count))
-            for step in range(k, k + count):
-                state = go_on(state, network.idle.predict(known, state.sample), step)
+            known, fused = network.idle.prepare(operands.total(count)), network.idle.fused
+            if fused is not None and fused.fits(advance, k, count):
+                state = fused.run(network.idle, known, advance, state, k, offset[k : k + count])
+            else:
+                for step in range(k, k + count):
+                    state = go_on(state, network.idle.predict(known, state.sample), step)
             k += count
             continue
         first = stream = network.stem(state.sample.permute(1, 2, 0), k)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext, suppress
+from importlib import import_module
 from typing import TypeAlias
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor
 from ttscompile.artifact.view import View
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
-from ttscompile.ir.pieces import FRAMES, LoopPiece
+from ttscompile.ir.pieces import BLOCKS, CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece
 from ttscompile.ir.program import frame_values
 from ttscompile.runtimes.contexts import ContextValues
 
@@ -41,17 +42,24 @@ class Placed:
 
 
 class Parts:
-    """What all numbers of streams share."""
+    """What all numbers of streams share.
 
-    def __init__(self, view: View, placed: Placed, narrow: torch.dtype | None) -> None:
-        self.manifest, self.pieces = view.manifest, view.pieces
-        self.device, self.narrow = placed.device, narrow
+    Attributes:
+        narrow: by part, the type that its products are computed in; None, or no entry, for float32.
+    """
+
+    def __init__(self, view: View, placed: Placed) -> None:
+        self.manifest, self.pieces, self.device = view.manifest, view.pieces, placed.device
+        self.narrow = {part: devices.narrow_type(one, placed.device) for part, one in view.precision.items()}
         values = {**view.weights, **view.pruner}
         self.weights = placed.all(values)
         first = placed.all(view.first_weights)
         self.first = self.weights | first if first else self.weights
         form, _ = idle_form(self.pieces, values)
         self.idle = None if form is None else IdleSteps(form, placed.device)
+        if self.idle is not None and placed.device.type == "cuda":
+            with suppress(ModuleNotFoundError):  # Triton comes with most builds of torch for CUDA, not with all
+                self.idle.fused = import_module(f"{__package__}.fused")
 
     def zeros(self, shape: tuple[int, ...], dtype: str) -> Tensor:
         """Zeros on the device."""
@@ -80,29 +88,28 @@ class StreamsNetwork:
         self._once: dict[str, Function] = {}
         seen = frame_values(pieces, self._write_and_run, obs)
         order = [*obs, *seen]
-        self._condition = self._written(pieces.condition, [*obs.values(), *seen.values()], streams, order=order)
+        given = [*obs.values(), *seen.values()]
+        self._condition = self._written(CONDITION, pieces.condition, given, streams, order)
         self._step: Function | None = None
         self.prologue()
         if pieces.step is not None:
             reads = self.contexts.for_step_piece(pieces.step.inputs)
-            self._step = self._written(pieces.step, reads, self._steps * streams)
+            self._step = self._written(STEP, pieces.step, reads, self._steps * streams)
             self.prologue()
         (horizon, dimensions), kind = manifest.spec.sample, manifest.blocks[0].type
         sample = torch.zeros((dimensions, streams, horizon), device=parts.device).permute(1, 2, 0)
         stream = parts.zeros(kind.at(streams), kind.dtype)
-        self._stem, self._stem_reads = self._loop_piece(pieces.stem, sample)
-        self._tail, self._tail_reads = self._loop_piece(pieces.tail, stream)
-        with self._narrow():
-            blocks = [self._loop_piece(piece, stream, parts.narrow) for piece in pieces.blocks]
-            first = blocks
-            if parts.first is not parts.weights:
-                first = [self._loop_piece(piece, stream, parts.narrow, parts.first) for piece in pieces.blocks]
+        self._stem, self._stem_reads = self._loop_piece(STEM, pieces.stem, sample)
+        self._tail, self._tail_reads = self._loop_piece(TAIL, pieces.tail, stream)
+        first = blocks = [self._loop_piece(BLOCKS, piece, stream) for piece in pieces.blocks]
+        if parts.first is not parts.weights:
+            first = [self._loop_piece(BLOCKS, piece, stream, parts.first) for piece in pieces.blocks]
         self._blocks, self._block_reads = zip(*blocks, strict=True)
         self._first, _ = zip(*first, strict=True)
         self._pruner = None
         if pieces.pruner is not None:
             self._pruner_reads = [self.contexts.values[name] for name in pieces.pruner.inputs]
-            self._pruner = self._written(pieces.pruner, self._pruner_reads, streams)
+            self._pruner = self._written(PRUNER, pieces.pruner, self._pruner_reads, streams)
         self._contiguous = self._stem(sample, *self._stem_reads[0])[0].is_contiguous()
 
     def prologue(self) -> None:
@@ -118,11 +125,12 @@ class StreamsNetwork:
     def _write_and_run(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         graph = self._parts.pieces.once()[name]
         rows = self.streams if name == FRAMES else len(next(iter(given.values())))
-        self._once[name] = self._written(graph, list(given.values()), rows, order=list(given))
+        self._once[name] = self._written(name, graph, list(given.values()), rows, list(given))
         return self._run_once(name, given)
 
     def _run_once(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
-        return self._once[name](*given.values())
+        made = self._once[name](*given.values())  # which another part reads, that may be in fp32
+        return made if self._parts.narrow.get(name) is None else [each.to(_FLOAT.get(each.dtype)) for each in made]
 
     def condition(self) -> Tensor:
         """What a correction reads: the features, one row of numbers a stream, ``[B, N]``."""
@@ -141,47 +149,45 @@ class StreamsNetwork:
 
     def block(self, b: int, k: int, stream: Tensor) -> Tensor:
         """See ``loop.Network``."""
-        block = self._blocks[b] if k else self._first[b]
-        if self._parts.narrow is None:
-            residual: Tensor = block(stream, *self._block_reads[b][k])[0]
-            return residual
-        with self._narrow():
-            residual = block(stream, *self._block_reads[b][k])[0]
-            return residual
+        residual: Tensor = (self._blocks if k else self._first)[b](stream, *self._block_reads[b][k])[0]
+        return residual
 
     def tail(self, stream: Tensor, k: int) -> Tensor:
         """See ``loop.Network``."""
         return self._tail(stream, *self._tail_reads[k])[0]
 
-    def _narrow(self) -> AbstractContextManager[object]:
-        parts = self._parts
-        if parts.narrow is None:
-            return nullcontext()
-        return torch.autocast(parts.device.type, parts.narrow, cache_enabled=False)
-
-    def _written(
+    def _written(  # a graph, and all that its function depends on
         self,
+        part: str,
         graph: Graph,
         examples: Sequence[Tensor],
         streams: int,
-        narrow: torch.dtype | None = None,
         order: Sequence[str] | None = None,
         weights: Mapping[str, Tensor] | None = None,
     ) -> Function:
         if order is not None:  # of the parameters; those that the graph does not read are there too
             types = {name: graph.inputs.get(name, TensorType((), "float32")) for name in order}
             graph = Graph(types, graph.constants, graph.nodes, graph.outputs)
-        return write_function(graph, weights or self._parts.weights, examples, streams, narrow)
+        kind, narrow = self._parts.device.type, self._parts.narrow.get(part)
+        with nullcontext() if narrow is None else torch.autocast(kind, narrow, cache_enabled=False):
+            function = write_function(graph, weights or self._parts.weights, examples, streams, narrow)
+        if narrow is None:
+            return function
+
+        def narrowed(*given: Tensor) -> tuple[Tensor, ...]:
+            with torch.autocast(kind, narrow, cache_enabled=False):
+                return function(*given)
+
+        return narrowed
 
     def _loop_piece(
-        self,
-        piece: LoopPiece,
-        value: Tensor,
-        narrow: torch.dtype | None = None,
-        weights: Mapping[str, Tensor] | None = None,
+        self, part: str, piece: LoopPiece, value: Tensor, weights: Mapping[str, Tensor] | None = None
     ) -> tuple[Function, list[tuple[Tensor, ...]]]:
         """The function of a piece, with the stream first, and its contexts at each step."""
         contexts = list(piece.contexts)
         reads = [tuple(self.contexts.at(name, k) for name in contexts) for k in range(self._steps)]
         order = [piece.stream, *contexts]
-        return self._written(piece.graph, [value, *reads[0]], self.streams, narrow, order, weights), reads
+        return self._written(part, piece.graph, [value, *reads[0]], self.streams, order, weights), reads
+
+
+_FLOAT = {torch.bfloat16: torch.float32, torch.float16: torch.float32}

@@ -34,23 +34,22 @@ from .sampler import Advance, State, begin
 class SteppedAdvance(Advance):
     """The same, also at a step that only the program knows."""
 
-    TENSORS = (*Advance.TENSORS, "columns", "remember", "number")
+    TENSORS = (*Advance.TENSORS, "remember", "number")
 
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
         super().__init__(spec, correction, device)
         number = np.full(self.steps, -1, np.int64)
         for each, landing in self.jumps.values():
             number[landing] = each
-        self.columns = torch.tensor(self._to_clean, dtype=torch.float32, device=device)
-        self.remember = torch.tensor(self._anchors, device=device)
+        self.remember = torch.tensor(self.anchors, device=device)
         self.number = torch.tensor(number, device=device)
 
     def at(self, state: State, prediction: Tensor, k: Tensor, offset: Tensor) -> State:
         """What is carried to the step after k, which is int64 ``[1]``."""
         clean = None
-        if self._clip is not None:
-            of_sample, of_prediction = self.columns.index_select(0, k)[0].unbind()
-            clean = (state.sample * of_sample + prediction * of_prediction).clamp(-self._clip, self._clip)
+        if self.clip is not None:
+            of_sample, of_prediction = self.to_clean.index_select(0, k)[0].unbind()
+            clean = (state.sample * of_sample + prediction * of_prediction).clamp(-self.clip, self.clip)
         matrix = self.updates.index_select(0, k)[0].expand(len(state.sample), -1, -1)
         moved = self._moved(state, prediction, clean, matrix, offset)
         anchor = self.remember.index_select(0, k)

@@ -35,23 +35,28 @@ class Advance(devices.OnTensors):
     Attributes:
         updates: the matrices, ``[K, G, R, (1 + S) T]``.
         horizon: T.
+        dimensions: D.
         memories: S.
         reading: ``[N, F]``, what the correction reads of the condition; None if it reads nothing.
         observed: ``[F, K D T]``, what that adds; None if it reads nothing.
         jumps: by anchor, the number of its jump, and the step after which that is added.
+        anchors: which steps are.
+        clip: of denoised samples; None where the sampler does not clip them.
+        to_clean: ``[K, 2]``, what a denoised sample is of the sample and of the prediction.
     """
 
-    TENSORS: tuple[str, ...] = ("updates", "reading", "observed", "inner", "middle", "outer")
+    TENSORS: tuple[str, ...] = ("updates", "to_clean", "reading", "observed", "inner", "middle", "outer")
 
     def __init__(self, spec: PolicySpec, correction: Correction | None, device: torch.device) -> None:
-        table, (self.horizon, dimensions) = spec.sampler, spec.sample
+        table, (self.horizon, self.dimensions) = spec.sampler, spec.sample
         self.memories, self.steps = table.memories, table.steps
         used = correction or no_correction(table.steps, spec.sample)
-        self._anchors: list[bool] = used.anchors.tolist()
+        self.anchors: list[bool] = used.anchors.tolist()
         self.updates = devices.placed(matrices(table, used), device)
-        self._of_step = [one.expand(dimensions, -1, -1) for one in self.updates]
-        self._clip = table.clip if clips(table) else None
+        self._of_step = [one.expand(self.dimensions, -1, -1) for one in self.updates]
+        self.clip = table.clip if clips(table) else None
         self._to_clean = list(zip(table.sample_to_x0.tolist(), table.out_to_x0.tolist(), strict=True))
+        self.to_clean = torch.tensor(self._to_clean, dtype=torch.float32, device=device)
         self.reading = self.observed = self.inner = self.middle = self.outer = None
         if correction is not None and correction.reads:
             self.reading = devices.placed(correction.reading, device)
@@ -103,11 +108,11 @@ class Advance(devices.OnTensors):
     def __call__(self, state: State, prediction: Tensor, k: int, offset: Tensor) -> State:
         """What is carried to step k + 1, of ``prediction [D, B, T]`` and ``offset [D, B, (1 + S) T]``."""
         clean = None
-        if self._clip is not None:
+        if self.clip is not None:
             of_sample, of_prediction = self._to_clean[k]
-            clean = (state.sample * of_sample).add_(prediction, alpha=of_prediction).clamp_(-self._clip, self._clip)
+            clean = (state.sample * of_sample).add_(prediction, alpha=of_prediction).clamp_(-self.clip, self.clip)
         moved = self._moved(state, prediction, clean, self._of_step[k], offset)
-        return moved._replace(history=self._longer(state, prediction)) if self._anchors[k] else moved
+        return moved._replace(history=self._longer(state, prediction)) if self.anchors[k] else moved
 
     def _moved(self, state: State, prediction: Tensor, clean: Tensor | None, matrix: Tensor, offset: Tensor) -> State:
         sample, history, memory = state

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dis
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,6 +14,8 @@ import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
 import ttscompile
+from tests.families import cameras
+from tests.once import Once
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding, bound
 from ttscompile import Source
@@ -19,11 +23,12 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import DENSE, Plan
-from ttscompile.errors import CaptureError, RuntimeUnavailableError
+from ttscompile.errors import CaptureError, IllegalPlanError, RuntimeUnavailableError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Enum, Graph, Ref
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.instructions import instructions_of
+from ttscompile.runtimes.random_calls import normalized, random_call
 from ttscompile.runtimes.torch.backend import Line, Lines, TorchBackend
 from ttscompile.runtimes.torch.functions import HALF_LINEAR, write_function
 from ttscompile.runtimes.torch.loop import denoise
@@ -144,7 +149,9 @@ def test_the_first_call_of_an_episode_is_captured_too(calibrated: Artifact) -> N
     assert len(lines) == 1
 
 
-def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_runs_as_it_is(calibrated: Artifact) -> None:
+def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_is_captured_when_it_comes_again(
+    calibrated: Artifact,
+) -> None:
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(1)
     seen = set()
@@ -156,10 +163,22 @@ def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_runs_as
         seen.add(report.plan.tobytes())
     assert len(lines) == 1 + len(seen)  # the prologue is a line of its own, since the pruner reads it
     matrix = random_plan(rng, 5, calibrated.manifest.groups, np.zeros((5, 5), np.bool_))
-    obs, noise = random_inputs(calibrated, rng, 1)
-    ours, theirs = (runtime.predict(obs, noise, Plan(cells=matrix))[0] for runtime in runtimes)
-    assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
-    assert len(lines) == 1 + len(seen)
+    for number in range(3):
+        obs, noise = random_inputs(calibrated, rng, 1)
+        ours, theirs = (runtime.predict(obs, noise, Plan(cells=matrix))[0] for runtime in runtimes)
+        assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
+        assert len(lines) == 1 + len(seen) + (number > 0)
+
+
+def test_a_plan_in_another_precision_is_captured_and_keeps_what_its_own_does(calibrated: Artifact) -> None:
+    lines: list[Line] = []
+    runtime, rng = both(calibrated, lines)[0], np.random.default_rng(0)
+    for number in range(3):
+        runtime.predict(*random_inputs(calibrated, rng, 1), calibrated.plan("evenly@bf16"))
+        assert len(lines) == 1 + (number > 0), "the prologue, and the second call"
+    assert not runtime._given
+    runtime.predict(*random_inputs(calibrated, rng, 1), calibrated.plan("mixed@bf16"))
+    assert runtime._given, "it reads residuals of earlier calls, so that all are kept from now on"
 
 
 @pytest.mark.slow
@@ -199,17 +218,41 @@ def test_lines_that_were_captured_long_ago_are_let_go() -> None:
 
 
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
-def test_products_in_fewer_bits_are_near_those_in_fp32(make_artifact: MakeArtifact, precision: str) -> None:
+@pytest.mark.parametrize(
+    "parts", [("blocks",), ("condition",), ("step",), ("blocks", "condition", "step")], ids="+".join
+)
+def test_products_in_fewer_bits_are_near_those_in_fp32(
+    make_artifact: MakeArtifact, precision: str, parts: tuple[str, ...]
+) -> None:
+    """Any part, and all of them, which is what the precision alone names."""
     artifact = make_artifact(toy_program(normed=True))
     rng = np.random.default_rng(0)
     obs, noise = random_inputs(artifact, rng, 2)
     plan = uniform_plan(5, 5, 3)
     exact = open_runtime(artifact, "torch").predict(obs, noise, Plan(cells=plan))[0]
-    runtime, narrowed = open_runtime(artifact, "torch"), Plan(cells=plan, precision={"blocks": precision})
+    runtime, narrowed = open_runtime(artifact, "torch"), Plan(cells=plan, precision=dict.fromkeys(parts, precision))
     narrow = runtime.predict(obs, noise, narrowed)[0]
     unit = {"bf16": 2.0**-8, "fp16": 2.0**-11}[precision]
     difference = np.abs(narrow - exact).max() / np.abs(exact).max()
     assert bound(1) < difference < bound(call_terms(artifact), unit=unit)
+    assert artifact.plan(f"dense@{precision}+{'+'.join(parts)}").precision == narrowed.precision
+    if len(parts) == 3:
+        assert artifact.plan(f"dense@{precision}").precision == narrowed.precision
+
+
+@pytest.mark.slow
+def test_frames_are_computed_in_fewer_bits(once: Once) -> None:
+    """The features of a tower in bf16 are read by a prologue in fp32, and the other way round."""
+    artifact = load_artifact(once.folder("seeing", cameras.compile_seeing) / "artifact")
+    spec, runtime = artifact.manifest.spec, open_runtime(artifact, "torch")
+    (obs, noise), (_, other) = (random_call(spec, number, 8) for number in (0, 1))
+    obs = normalized(spec, obs)
+    exact = runtime.predict(obs, noise, artifact.plan("dense"))[0]
+    apart = np.abs(runtime.predict(obs, other, artifact.plan("dense"))[0] - exact).max()
+    assert {"frame_00", "frame_01", "condition", "blocks"} <= set(artifact.plan("dense@bf16").precision)
+    for name in ("dense@bf16", "dense@bf16+frame_00+frame_01", "dense@bf16+condition"):
+        found = runtime.predict(obs, noise, artifact.plan(name))[0]
+        assert 0 < np.abs(found - exact).max() < 2.0**-4 * apart, name
 
 
 def test_weights_of_products_are_kept_in_fewer_bits(toy_artifact: Artifact) -> None:
@@ -228,10 +271,7 @@ def test_weights_of_products_are_kept_in_fewer_bits(toy_artifact: Artifact) -> N
         ({"device": "abacus"}, "device 'abacus' cannot be had"),
         ({"device": "cuda:97"}, "device 'cuda:97' cannot be had"),
         ({"device": 3}, "expected the name of a device"),
-        (
-            {"plan": "dense@int8"},
-            "runtime 'torch' computes in fp32, and beside it bf16 in blocks, fp16 in blocks; the plan wants",
-        ),
+        ({"plan": "dense@int8"}, "runtime 'torch' computes in fp32, and beside it bf16, fp16; the plan wants 'blocks'"),
         ({"runtime": "onnxruntime", "device": "cuda"}, "on the CPU alone; found device 'cuda'. Use runtime='torch'"),
         (
             {"runtime": "reference", "plan": "dense@bf16"},
@@ -248,6 +288,12 @@ def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, options: dict[str
         ttscompile.load(toy_artifact.path, **({"runtime": "torch"} | options))
 
 
+def test_a_part_that_there_is_not_is_refused(toy_artifact: Artifact) -> None:
+    told = "a plan wants 'frame_07' in 'bf16'; the artifact's parts are blocks, condition, step. Name some of these."
+    with pytest.raises(IllegalPlanError, match=re.escape(told)):
+        ttscompile.load(toy_artifact.path, "torch", plan="dense@bf16+frame_07")
+
+
 def test_the_precision_is_told(toy_artifact: Artifact) -> None:
     told = [ttscompile.load(toy_artifact.path, "torch", plan=name).info for name in ("dense", "dense@bf16")]
     assert [(one.precision, one.default_plan) for one in told] == [("fp32", "dense"), ("bf16", "dense@bf16")]
@@ -260,7 +306,7 @@ def test_settings_of_torch_are_as_they_were_after_a_call(toy_artifact: Artifact)
     during: list[int] = []
     backend = policy._runtime.backend
     original = backend._lines.run
-    backend._lines.run = lambda key, line: (during.append(torch.get_num_threads()), original(key, line))
+    backend._lines.run = lambda *given, **kwargs: (during.append(torch.get_num_threads()), original(*given, **kwargs))
     policy.predict_action({"obs": np.zeros((1, 2), np.float32)}, plan="dense")
     assert (set(during), torch.get_num_threads()) == ({1}, 2)
     assert torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
@@ -368,7 +414,7 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     plan = random_plan(rng, manifest.steps, groups, np.ones((5, 5), np.bool_), computed=0.4)
     lowered = instructions_of(plan, groups)
     assert lowered.rollout.any()
-    parts = Parts(view_of(artifact), Placed(device), None)
+    parts = Parts(view_of(artifact), Placed(device))
     network = StreamsNetwork(parts, {"obs": torch.zeros((2, 2), device=device)}, 2)
     advance = Advance(manifest.spec, random_correction(artifact, rng), device)
     network.prologue()
@@ -382,3 +428,44 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     results = [sample, network.logits(), network.condition(), *residuals.values()]
     assert len(results) == 3 + np.count_nonzero(plan == Source.COMPUTE)
     assert {each.device.type for each in results} == {"meta"}
+
+
+def rms_graph(axis: int = -1, power: int = 2) -> Graph:
+    kind, one = f32(B, 3, 4), f32(B, 3, 1)
+    nodes = (
+        node("square", "pow.Tensor_Scalar", kind, Ref("x"), power),
+        node("mean", "mean.dim", one, Ref("square"), (axis,), True),
+        node("added", "add.Tensor", one, Ref("mean"), 1e-5),
+        node("root", "rsqrt.default", one, Ref("added")),
+        node("scaled", "mul.Tensor", kind, Ref("x"), Ref("root")),
+        node("normed", "mul.Tensor", kind, Ref("scaled"), Ref("w")),
+        node("q", "linear.default", kind, Ref("normed"), Ref("wide")),
+        node("k", "linear.default", kind, Ref("normed"), Ref("wide")),
+    )
+    return Graph({"x": kind}, {"w": f32(4), "wide": f32(4, 4)}, nodes, ("q", "k", "normed"))
+
+
+@pytest.mark.parametrize(("axis", "power", "fused"), [(-1, 2, True), (-1, 4, False), (-2, 2, False)])
+def test_an_rms_norm_is_one_operation(axis: int, power: int, fused: bool) -> None:
+    """And nothing else is, which only looks like it; of axis -2 the mean is of another shape, which broadcasts too."""
+    graph, draw = rms_graph(axis, power), torch.Generator().manual_seed(0)
+    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
+    x = torch.randn(2, 3, 4, generator=draw)
+    function = write_function(graph, weights, [x], 2, None)
+    calls = function.__code__.co_names
+    assert (torch.rms_norm in [function.__globals__[name] for name in calls]) == fused
+    for found, expected in zip(function(x), evaluate(graph, weights, {"x": x}), strict=True):
+        assert_equal_but_for_rounding(found, expected, 64)
+
+
+def test_what_several_products_read_is_narrowed_once() -> None:
+    graph, draw = rms_graph(), torch.Generator().manual_seed(0)
+    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
+    x = torch.randn(2, 3, 4, generator=draw)
+    with torch.autocast("cpu", torch.bfloat16):
+        function = write_function(graph, weights, [x], 2, torch.bfloat16)
+        found, expected = function(x), evaluate(graph, weights, {"x": x})
+    assert [each.dtype for each in found] == [torch.bfloat16, torch.bfloat16, torch.float32]
+    assert [each.argval for each in dis.get_instructions(function)].count("narrow") == 1
+    for one, other in zip(found, expected, strict=True):
+        assert_equal_but_for_rounding(one.float(), other.float(), 64, unit=2.0**-8)

@@ -107,8 +107,10 @@ def test_a_graph_is_captured_on_a_stream_of_its_device(monkeypatch: pytest.Monke
     device, runs, cuda = torch.device("cuda:1"), list[int](), MagicMock()
     for name in ("graph_pool_handle", "Stream", "current_stream", "stream", "CUDAGraph", "graph"):
         monkeypatch.setattr(torch.cuda, name, getattr(cuda, name))
+    cleared = list[int]()
+    monkeypatch.setattr(torch._C, "_cuda_clearCublasWorkspaces", lambda: cleared.append(len(runs)), raising=False)
     replay = cuda_graphs(device)(lambda: runs.append(0))
     assert [call.args for call in (*cuda.Stream.call_args_list, *cuda.current_stream.call_args_list)] == [(device,)] * 3
     assert cuda.graph.call_args.kwargs["stream"] is cuda.Stream.return_value
-    assert len(runs) == 3
+    assert len(runs) == 3 and cleared == [2, 3]
     assert replay is cuda.CUDAGraph.return_value.replay

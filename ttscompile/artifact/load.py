@@ -109,8 +109,8 @@ class Artifact:
         """A plan by its name, or in another precision: ``NAME@fp32``, ``NAME@int8``, ``NAME@bf16``.
 
         In fp32 all tokens are computed, too, which every runtime can do. int8 is of all parts that the artifact has
-        such models of. bf16 and fp16, which torch makes of the weights, are of the residual blocks. Parts may be named
-        in place of these: ``NAME@int8+PART+PART``.
+        such models of. bf16 and fp16, which torch makes of the weights, are of all parts. Parts may be named in place
+        of these: ``NAME@int8+PART+PART``.
 
         Raises:
             IllegalPlanError: there is none of this name.
@@ -127,7 +127,7 @@ class Artifact:
             return self.plans[own]
         if name not in self._derived:
             record, plan = self.manifest.precision, self.plans[own].exact
-            held = record.kept if precision == INT8 and record is not None else (names.BLOCKS,)
+            held = names.parts_of(self.manifest.pieces if precision != INT8 else () if record is None else record.kept)
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
             self._derived[name] = replace(plan)  # another object than the one in fp32 may be
         return self._derived[name]

@@ -74,7 +74,7 @@ SECTIONS = (
     help="Execute the plans with onnxruntime, or with torch, which needs the extra 'compile'; or with each of them:"
     " onnxruntime,torch.",
 )
-@click.option("--device", type=TEXT, help="Have torch compute on this device, as it calls it: cpu, cuda.")
+@click.option("--device", type=TEXT, help="Have torch, and the original, compute on this device: cpu, cuda.")
 @options.several_threads_option(
     "Threads that each plan computes with. Of several, as in 1,2,4, each plan is timed with each of these, and the rest"
     " is done with the first."
@@ -146,7 +146,7 @@ def bench(
         # What does not fit is told before anything is measured.
         resolved = {} if control_hz is None else in_loop(entered, control_hz, executor)
         if checkpoint is not None:
-            entered = [*originals(checkpoint, encoders, threads[0], artifact), *entered]
+            entered = [*originals(checkpoint, encoders, threads[0], artifact, device), *entered]
     default = artifact.manifest.default_plan
     _warn(directory, artifact, console)
     with console.status("timing") as status:

@@ -94,7 +94,9 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
     return made
 
 
-def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact) -> list[Contestant]:
+def originals(
+    checkpoint: Path, encoders: Path | None, threads: int, artifact: Artifact, device: str | None = None
+) -> list[Contestant]:
     """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
 
     Args:
@@ -102,9 +104,10 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
         encoders: the folder that ``convert`` was given with it, if it was.
         threads: of PyTorch.
         artifact: that was made from it.
+        device: where PyTorch computes, None for the CPU. Its settings are torch's own: convolutions may use TF32.
 
     Raises:
-        RuntimeUnavailableError: there is no torch.
+        RuntimeUnavailableError: there is no torch, or no such device.
         SpecError: the checkpoint is of another policy.
     """
     try:
@@ -112,6 +115,7 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
 
         from ttscompile.frontends.eager import eager_policy
         from ttscompile.frontends.encoded import parts
+        from ttscompile.runtimes.torch.devices import device_of
     except ModuleNotFoundError as error:
         raise RuntimeUnavailableError(
             f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
@@ -119,6 +123,7 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
         ) from error
     module, saved = original_policy(checkpoint, artifact.manifest.spec, encoders)
     torch.set_num_threads(threads)
+    module.to(device_of(device or "cpu"))
     manifest, found = artifact.manifest, artifact.default.otherwise or artifact.default
     own = replace(manifest.spec.whole_horizon, sampler=manifest.sampler_of(found.loop), loops={})
     made: list[Contestant] = []
@@ -129,7 +134,7 @@ def originals(checkpoint: Path, encoders: Path | None, threads: int, artifact: A
         # An encoder runs once a call, whatever the sampler: what it takes is not known apart.
         same = sampler.steps == manifest.steps or parts(module).encoder is None
         flops = manifest.flops.dense / manifest.steps * sampler.steps if same else None
-        label = f"original, {sampler.name} {sampler.steps}"
+        label = f"original, {sampler.name} {sampler.steps}" + f", on {device}" * (device is not None)
         made.append(network_contestant(label, eager_policy(module, spec), spec, flops))
     return made
 

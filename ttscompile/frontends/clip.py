@@ -332,9 +332,9 @@ class ClipText(nn.Module):
     def forward(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         """See the class."""
         length = tokens.shape[1]
-        square = torch.ones(length, length, dtype=torch.bool)
+        square = torch.ones(length, length, dtype=torch.bool, device=tokens.device)
         # Padding before a text sees itself: attention to nothing is not the same number everywhere. Nobody sees it.
-        alone = torch.eye(length, dtype=torch.bool) & ~mask[:, None, None, :1]
+        alone = torch.eye(length, dtype=torch.bool, device=mask.device) & ~mask[:, None, None, :1]
         added = torch.where(square.tril() & mask[:, None, None, :] | alone, 0.0, torch.finfo(torch.float32).min)
         features = self.final_layer_norm(self.encoder(self.embeddings(tokens), added))
         ids = tokens.to(torch.int32)  # ArgMax of ONNX knows no int64

@@ -22,12 +22,13 @@ def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
 
     Returns:
         A function of the normalised observations ``{key: [B, ...]}`` and the noise of one call, that gives the
-        denoised sample ``[B, T, D]``. Runs on the CPU. Raises ObservationError if a stochastic sampler is given no
-        ``noise.steps``.
+        denoised sample ``[B, T, D]``, on the CPU. Runs where the module is. Raises ObservationError if a stochastic
+        sampler is given no ``noise.steps``.
     """
+    device = next((weight.device for weight in module.parameters()), None)
     table = spec.sampler
     rows = [tuple(float(getattr(table, column)[k]) for column in table.COLUMNS) for k in range(table.steps)]
-    timesteps = torch.from_numpy(table.timesteps)
+    timesteps = torch.from_numpy(table.timesteps).to(device)
 
     def run(observations: Mapping[str, torch.Tensor], noise: Noise) -> torch.Tensor:
         if table.stochastic and noise.steps is None:
@@ -35,9 +36,9 @@ def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
                 f"noise.steps is None, but sampler {table.name} draws noise; expected [K, B, T, D], K = {table.steps}."
             )
         with torch.inference_mode():
-            evaluate = evaluation(module, spec, observations)
-            x = torch.from_numpy(noise.initial)
-            draws = None if noise.steps is None else torch.from_numpy(noise.steps)
+            evaluate = evaluation(module, spec, {key: value.to(device) for key, value in observations.items()})
+            x = torch.from_numpy(noise.initial).to(device)
+            draws = None if noise.steps is None else torch.from_numpy(noise.steps).to(device)
             memory = [torch.zeros_like(x)] * table.memories
             for k, (to_x0, out_to_x0, x0_to_next, to_next, out_to_next, noise_to_next) in enumerate(rows):
                 out = evaluate(x, timesteps[k].expand(x.shape[0]))
@@ -51,11 +52,11 @@ def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
                     following = following + noise_to_next * draws[k]
                 terms = (x0, x, out, *memory)
                 memory = [
-                    sum((weight * term for weight, term in zip(each, terms, strict=True)), torch.zeros(()))
+                    sum((weight * term for weight, term in zip(each, terms, strict=True)), torch.zeros_like(x))
                     for each in table.to_memory[k].tolist()
                 ]
                 x = following
-            return x
+            return x.cpu()
 
     return run
 

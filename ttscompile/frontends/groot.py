@@ -144,7 +144,10 @@ class Prefix(nn.Module):
         if not self.apart:
             return own, added(valid)[:, None, None], features
         pictured = self.backbone.pictured + [False] * tokens.shape[1]
-        words, pictures = (torch.tensor([i for i, each in enumerate(pictured) if each is of]) for of in (False, True))
+        words, pictures = (
+            torch.tensor([i for i, each in enumerate(pictured) if each is of], device=mask.device)
+            for of in (False, True)
+        )
         return own, added(valid[:, words])[:, None, None], features[:, words], features[:, pictures]
 
 

@@ -181,10 +181,13 @@ class InternVL(nn.Module):
             at += self.config.image_tokens
         valid = functional.pad(mask, (len(positions), 0), value=True)
         positions += range(at, at + tokens.shape[1])
-        words = [language.embed_tokens(torch.tensor([each])) if each else None for each in self.prompt.between]
+        words = [
+            language.embed_tokens(torch.tensor([each], device=mask.device)) if each else None
+            for each in self.prompt.between
+        ]
         x = laid(seen.unbind(1), words, language.embed_tokens(tokens))
-        turns = rotation(torch.tensor([positions]), self.config.text.channels, self.config.base)
-        causal = torch.ones(len(positions), len(positions), dtype=torch.bool).tril()
+        turns = rotation(torch.tensor([positions], device=mask.device), self.config.text.channels, self.config.base)
+        causal = torch.ones(len(positions), len(positions), dtype=torch.bool, device=mask.device).tril()
         hidden = added(valid[:, None, None, :] & causal)
         for layer in language.layers:
             x = layer(x, turns, hidden)[0]

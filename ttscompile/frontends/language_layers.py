@@ -179,7 +179,7 @@ def prefix_mask(valid: Tensor, late: int = 0) -> Tensor:
         late: the last so many tokens are not seen by those before them.
     """
     count = valid.shape[1]
-    group = torch.arange(count) >= count - late
+    group = torch.arange(count, device=valid.device) >= count - late
     seen = valid[:, None, None, :] & (group[None, :] <= group[:, None])
     return added(seen)
 
@@ -198,7 +198,7 @@ class Rotation(NamedTuple):
 
 def rotation(positions: Tensor, channels: int, base: float = 10_000) -> Rotation:
     """The rotary embedding of positions ``[B, T]``; of several axes, ``[B, T, channels / 2]``."""
-    rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32))
+    rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32, device=positions.device))
     own = positions if positions.ndim == 3 else positions[..., None]
     angles = (own.to(torch.float32) * rates)[:, None]
     return Rotation(angles.cos(), angles.sin())
@@ -213,12 +213,13 @@ def rotate(x: Tensor, by: Rotation) -> Tensor:
 
 def angles(timestep: Tensor, count: int, last: int, longest: float = 10_000) -> Tensor:
     """A time ``[B]`` times falling rates, ``[B, count]``: 1 at first, and ``1 / longest`` after ``last`` others."""
-    return timestep[:, None] * torch.exp(torch.arange(count, dtype=torch.float32) * (-math.log(longest) / last))
+    falling = torch.arange(count, dtype=torch.float32, device=timestep.device) * (-math.log(longest) / last)
+    return timestep[:, None] * torch.exp(falling)
 
 
 def waves(timestep: Tensor, width: int, shortest: float, longest: float) -> Tensor:
     """Sine and cosine of a time ``[B]``, ``[B, width]``; periods between the two, evenly spaced in their logarithm."""
-    fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64)
+    fraction = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64, device=timestep.device)
     rates = 1.0 / (shortest * (longest / shortest) ** fraction) * 2 * torch.pi
     angle = rates * timestep[:, None]
     return torch.cat([angle.sin(), angle.cos()], -1).to(torch.float32)

@@ -163,7 +163,7 @@ class Expert(nn.Module):
         valid, *cache = encoded
         x = self.action_in_proj(sample)
         time = layers.waves(timestep, self.config.expert.width, *self.config.periods)
-        own = torch.zeros(1, 1)
+        own = torch.zeros(1, 1, device=x.device)
         if self.config.adaptive:
             time = functional.silu(self.mlp_out(functional.silu(self.mlp_in(time))))
         else:
@@ -171,10 +171,11 @@ class Expert(nn.Module):
             x = torch.cat([x, time[:, None].expand_as(x)], 2)
             x = torch.cat([state, self.mlp_out(functional.silu(self.mlp_in(x)))], 1)
             # The state does not see the actions.
-            groups = torch.arange(x.shape[1]) > 0
+            groups = torch.arange(x.shape[1], device=x.device) > 0
             own = layers.added(groups[None, :] <= groups[:, None])
         count = x.shape[1]
-        turns = layers.rotation(valid.sum(-1, keepdim=True) + torch.arange(count)[None], self.config.expert.channels)
+        places = valid.sum(-1, keepdim=True) + torch.arange(count, device=x.device)[None]
+        turns = layers.rotation(places, self.config.expert.channels)
         before = layers.added(valid[:, None, None, :]).expand(-1, -1, count, -1)
         mask = torch.cat([before, own.expand(len(sample), 1, count, count)], 3)
         for i, layer in enumerate(self.layers):

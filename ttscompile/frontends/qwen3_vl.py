@@ -105,7 +105,7 @@ class _Vision(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         x, channels = self.embeddings(pixels), self.config.hidden_size // self.config.num_attention_heads
-        both = torch.cartesian_prod(*(torch.arange(self.config.side),) * 2)[None].unbind(-1)
+        both = torch.cartesian_prod(*(torch.arange(self.config.side, device=x.device),) * 2)[None].unbind(-1)
         row, column = (rotation(each, channels // 2) for each in both)
         turns, stacked = Rotation(*(torch.cat(pair, -1) for pair in zip(row, column, strict=True))), []
         for number, layer in enumerate(self.encoder.layers):
@@ -150,15 +150,16 @@ class Qwen3VL(nn.Module):
         levels = list(zip(*(each.split(text.width, -1) for each in shown), strict=True))
         valid = functional.pad(mask, (len(self.places), 0), value=True)
         count = len(self.places) + tokens.shape[1]
-        hidden = added(valid[:, None, None, :] & torch.ones(count, count, dtype=torch.bool).tril())
-        places = torch.tensor(self.places + [(self.after + i,) * 3 for i in range(tokens.shape[1])])
+        hidden = added(valid[:, None, None, :] & torch.ones(count, count, dtype=torch.bool, device=mask.device).tril())
+        after = [(self.after + i,) * 3 for i in range(tokens.shape[1])]
+        places = torch.tensor(self.places + after, device=mask.device)
         axis = torch.zeros(text.channels // 2, dtype=torch.int64)  # time, row or column, of each pair of channels
         for own, section in enumerate(self.config.sections, 1):
             axis[own : 3 * section : 3] = own
         turns = rotation(places[:, axis][None], text.channels, self.config.base)
-        words = [language.embed_tokens(torch.tensor([each])) for each in self.prompt.between]
+        words = [language.embed_tokens(torch.tensor([each], device=mask.device)) for each in self.prompt.between]
         x = laid(levels[0], words, language.embed_tokens(tokens))
-        blank, none = [torch.zeros_like(each) for each in words], torch.zeros(1, tokens.shape[1], text.width)
+        blank, none = [torch.zeros_like(each) for each in words], x.new_zeros(1, tokens.shape[1], text.width)
         for number, layer in enumerate(language.layers):
             if 0 < number < len(levels):
                 x = x + laid(levels[number], blank, none.expand(len(x), -1, -1))

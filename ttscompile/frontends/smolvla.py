@@ -176,12 +176,12 @@ class Expert(nn.Module):
         time = layers.waves(timestep, config.expert.width, *config.periods)
         x = torch.cat([x, time[:, None].expand_as(x)], 2)
         x = self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(x)))
-        own = torch.arange(count)[None]
+        own = torch.arange(count, device=x.device)[None]
         own_turns = layers.rotation(own, config.expert.channels)
         turns = layers.rotation(valid.sum(-1, keepdim=True) + own, config.expert.channels)
         crossing = layers.added(valid[:, None, None, :])
         # Actions see the prefix, and each other backwards in time.
-        later = layers.added(torch.ones(count, count, dtype=torch.bool).tril())[None, None]
+        later = layers.added(torch.ones(count, count, dtype=torch.bool, device=x.device).tril())[None, None]
         whole = torch.cat([crossing.expand(-1, -1, count, -1), later.expand(len(sample), -1, -1, -1)], 3)
         for i, layer in enumerate(self.layers):
             prefix = layers.Seen(seen[2 * i], seen[2 * i + 1])

@@ -121,7 +121,9 @@ class Denoiser(nn.Module):
         x = own.action_encoder(torch.cat([sample, beside], 2)) + own.pos_emb[:, :count]
         x = own.blocks(torch.cat([x, context], 1))
         actions: Tensor = own.action_decoder(own.norm(x[:, :count]))
-        return torch.where(torch.tensor(self.grippers), actions.sigmoid(), actions) if any(self.grippers) else actions
+        if not any(self.grippers):
+            return actions
+        return torch.where(torch.tensor(self.grippers, device=actions.device), actions.sigmoid(), actions)
 
 
 def _waves(timestep: Tensor, width: int) -> Tensor:

@@ -145,6 +145,11 @@ def part_of(piece: str) -> str | None:
     return None if piece.partition(_OF_LOOP)[0] in _SMALL else piece
 
 
+def parts_of(pieces: Iterable[str]) -> tuple[str, ...]:
+    """The parts that these pieces belong to, ``blocks`` first."""
+    return tuple(dict.fromkeys((BLOCKS, *filter(None, map(part_of, pieces)))))
+
+
 # Values that several pieces of the loop have.
 STREAM, STREAM_NEXT, RESIDUAL = "stream", "stream_next", "residual"
 

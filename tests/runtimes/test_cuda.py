@@ -1,0 +1,191 @@
+"""The runtime on torch where there is a GPU: it agrees with the reference, and what it captures is replayed.
+
+Nothing of this runs without one. ``test_torch`` replays recordings of the same lines on the CPU.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from tests.families import cameras
+from tests.plans import store_schedules
+from tests.rounding import assert_equal_but_for_rounding, bound
+from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.core.lattice import Source, uniform_plan
+from ttscompile.core.plan import DENSE, Plan
+from ttscompile.runtimes import Runtime, open_runtime
+from ttscompile.runtimes.random_calls import normalized, random_call
+from ttscompile.samplers.flow import flow_matching_table
+
+from .agreement import call_terms, largest_difference, random_inputs
+from .conftest import MakeArtifact
+from .plans import random_correction, random_plan
+from .pruners import calibrated as with_pruner
+from .toys import toy_program, written_artifact
+
+DEVICE = "cuda"
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch has no CUDA device here")
+
+VARIANTS = [{}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}, {"normed": True, "sequence_first": True}]
+
+
+def both(artifact: Artifact) -> tuple[Runtime, Runtime]:
+    return open_runtime(artifact, "torch", device=DEVICE), open_runtime(artifact, "reference")
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, int]) -> None:
+    """Batches of one to four streams, each with a plan of its own or all with the same."""
+    artifact = make_artifact(toy_program(**variant, pruner=False))
+    runtimes, allowed = both(artifact), bound(call_terms(artifact))
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < allowed
+
+
+@pytest.fixture(scope="module")
+def artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
+    """The toy with two schedules, one of which reads the rollout cache, and has a correction with jumps."""
+    made = written_artifact(toy_program(normed=True), tmp_path_factory.mktemp("cuda") / "artifact")
+    manifest, rng = made.manifest, np.random.default_rng(3)
+    evenly = uniform_plan(manifest.steps, len(manifest.groups), 2)
+    mixed = random_plan(rng, manifest.steps, manifest.groups, np.ones_like(evenly, np.bool_))
+    assert (mixed == Source.ROLLOUT).any()
+    plans, corrections = {"evenly": evenly, "mixed": mixed}, {"mixed": random_correction(made, rng)}
+    store_schedules(made.path, dict(made.pruner), plans, "evenly", {}, corrections=corrections)
+    return load_artifact(made.path)
+
+
+@pytest.mark.parametrize("name", ["evenly", "mixed", DENSE])
+def test_a_call_is_replayed_on_other_inputs_and_batches(artifact: Artifact, name: str) -> None:
+    runtimes, rng = both(artifact), np.random.default_rng(0)
+    for streams in (1, 3, 1):
+        for runtime in runtimes:
+            runtime.reset()
+        for called in (DENSE, name, name, name):
+            obs, noise = random_inputs(artifact, rng, streams)
+            ours, theirs = (runtime.predict(obs, noise, artifact.plans[called])[0] for runtime in runtimes)
+            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+
+
+def test_what_was_committed_is_kept(make_artifact: MakeArtifact) -> None:
+    program = toy_program(8, 4, pruner=False, normed=True, horizon=6)
+    artifact = make_artifact(replace(program, spec=replace(program.spec, sampler=flow_matching_table(8))))
+    runtimes, rng = both(artifact), np.random.default_rng(0)
+    sparse = Plan(cells=uniform_plan(8, 4, 3))
+    for plan, length in ((artifact.plans[DENSE], 1), (sparse, 3), (artifact.plans[DENSE], 3)):
+        obs, noise = random_inputs(artifact, rng, 1)
+        prefix = rng.standard_normal((1, length, artifact.manifest.spec.chunk.action_dim), dtype=np.float32)
+        ours, theirs = (runtime.predict(obs, noise, plan, prefix)[0] for runtime in runtimes)
+        assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+
+
+def test_the_pruner_decides(tmp_path: Path) -> None:
+    program = toy_program(normed=True)
+    made = written_artifact(program, tmp_path / "pruned")
+    artifact, rng = load_artifact(with_pruner(made.path, program)), np.random.default_rng(0)
+    runtimes, seen = both(artifact), set()
+    for _ in range(6):
+        obs, noise = random_inputs(artifact, rng, 2)
+        found = [runtime.predict(obs, noise, artifact.plans["pruner"]) for runtime in runtimes]
+        np.testing.assert_array_equal(*(report.plan for _, report in found))
+        assert_equal_but_for_rounding(found[0][0], found[1][0], 2 * call_terms(artifact))
+        seen.add(found[0][1].plan.tobytes())
+    assert len(seen) > 1
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_products_in_fewer_bits_are_near_those_in_fp32(artifact: Artifact, precision: str) -> None:
+    runtime, rng = open_runtime(artifact, "torch", device=DEVICE), np.random.default_rng(0)
+    unit = {"bf16": 2.0**-8, "fp16": 2.0**-11}[precision]
+    for _ in range(2):
+        obs, noise = random_inputs(artifact, rng, 2)
+        exact, narrow = (runtime.predict(obs, noise, artifact.plan(n))[0] for n in (DENSE, f"{DENSE}@{precision}"))
+        difference = np.abs(narrow - exact).max() / np.abs(exact).max()
+        assert bound(1) < difference < bound(call_terms(artifact), unit=unit)
+
+
+def test_what_torch_was_told_about_precision_changes_no_action(artifact: Artifact) -> None:
+    obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
+    runtime = open_runtime(artifact, "torch", device=DEVICE)
+    expected = runtime.predict(obs, noise, artifact.plans[DENSE])[0]
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        found = open_runtime(artifact, "torch", device=DEVICE).predict(obs, noise, artifact.plans[DENSE])[0]
+        again = runtime.predict(obs, noise, Plan(cells=artifact.plans[DENSE].cells))[0]
+    finally:
+        torch.set_float32_matmul_precision(before)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(again, expected)
+
+
+def test_frames_are_encoded(tmp_path: Path) -> None:
+    cameras.compile_seeing(tmp_path)
+    artifact = load_artifact(tmp_path / "artifact")
+    spec, runtimes = artifact.manifest.spec, both(artifact)
+    for number in range(2):
+        obs, noise = random_call(spec, number, 8)
+        ours, theirs = (one.predict(normalized(spec, obs), noise, artifact.plans[DENSE])[0] for one in runtimes)
+        assert_equal_but_for_rounding(ours, theirs, call_terms(artifact))
+
+
+def test_the_module_moves_there(artifact: Artifact) -> None:
+    module = ttscompile.to_module(artifact.path, "evenly").to(DEVICE)
+    obs, noise = random_call(artifact.manifest.spec, 0, 8)
+    given = {key: torch.from_numpy(value).to(DEVICE) for key, value in obs.items()}
+    steps = None if noise.steps is None else torch.from_numpy(noise.steps).to(DEVICE)
+    found = module(given, torch.from_numpy(noise.initial).to(DEVICE), steps).cpu()
+    expected = ttscompile.load(artifact.path, "reference").predict_action(obs, noise=noise, plan="evenly")
+    assert_equal_but_for_rounding(found, expected["action_pred"], 4 * call_terms(artifact))
+
+
+def test_a_call_is_captured_while_another_thread_computes(artifact: Artifact) -> None:
+    """As the executor does, beside a program of its user's that has the GPU, too, and draws no numbers there."""
+    stop, failed = threading.Event(), list[Exception]()
+
+    def other() -> None:
+        numbers = torch.ones(64, 64, device=DEVICE)  # torch lets no thread draw some while another captures
+        try:
+            while not stop.is_set():
+                numbers.matmul(numbers).cpu()
+        except Exception as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    try:
+        runtimes, rng = both(artifact), np.random.default_rng(0)
+        for name in (DENSE, "evenly", "mixed", DENSE):
+            obs, noise = random_inputs(artifact, rng, 2)
+            ours, theirs = (runtime.predict(obs, noise, artifact.plans[name])[0] for runtime in runtimes)
+            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+    finally:
+        stop.set()
+        thread.join()
+    assert not failed
+
+
+def test_a_policy_goes_and_another_comes(artifact: Artifact, make_artifact: MakeArtifact) -> None:
+    """What was captured is let go with its policy, and takes no memory of the next one with it."""
+    other = make_artifact(toy_program(8, 4, normed=True))
+    for one in (artifact, other, artifact, other):
+        runtimes, rng = both(one), np.random.default_rng(0)
+        for name in (DENSE, DENSE, f"{DENSE}@bf16"):
+            obs, noise = random_inputs(one, rng, 2)
+            ours = runtimes[0].predict(obs, noise, one.plan(name))[0]
+            if "@" not in name:
+                assert_equal_but_for_rounding(
+                    ours, runtimes[1].predict(obs, noise, one.plan(name))[0], 2 * call_terms(one)
+                )
+        del runtimes
+        gc.collect()
