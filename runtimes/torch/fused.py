@@ -29,33 +29,29 @@ TILE = 2**12
 
 def fits(advance: Advance, k: int, count: int) -> bool:
     """Whether ``count`` steps from k on can run here, which anchors cannot, and are faster so."""
-    _, groups, read, written = advance.updates.shape
-    dimensions = max(groups, advance.dimensions)
-    return count > 1 and not any(advance.anchors[k : k + count]) and dimensions * read * written <= LARGEST
+    numbers = advance.dimensions * advance.updates[0, 0].numel()
+    return count > 1 and not any(advance.anchors[k : k + count]) and numbers <= LARGEST
 
 
 def run(idle: IdleSteps, known: Prepared, advance: Advance, state: State, k: int, offset: Sequence[Tensor]) -> State:
     """Steps k, k + 1, ..., one for each of ``offset``, none of which is an anchor; see ``Advance``."""
     dimensions, streams, horizon = state.sample.shape
     memories, count = advance.memories, len(offset)
-    start, stop = 2 * horizon, (2 + HISTORY) * horizon
     matrices = advance.updates[k : k + count]
-    offsets = torch.stack(list(offset)) + torch.matmul(state.history, matrices[:, :, start:stop])
+    of_history = torch.matmul(state.history, matrices[:, :, 2 * horizon : (2 + HISTORY) * horizon])
+    offsets = torch.stack(list(offset)) + of_history
     places = 2 + (advance.clip is not None) + memories
     features = state.sample.new_empty(2, dimensions, streams, places * horizon)
-    group = len(matrices[0]) > 1
     rows, columns = triton.next_power_of_2(dimensions), triton.next_power_of_2(horizon)
-    known = Prepared(*map(Tensor.contiguous, known))
     _steps[(streams,)](
-        features, state.sample, state.memory.contiguous(), offsets, *known, idle.along, idle.across,
-        matrices, advance.to_clean, k, count, streams, advance.clip or 0.0,
-        matrices.stride(0), matrices.stride(1) if group else 0,
+        features, state.sample, state.memory.contiguous(), offsets, *map(Tensor.contiguous, known),
+        idle.along, idle.across, matrices, advance.to_clean, k, count, streams, advance.clip or 0.0,
+        matrices.stride(0), matrices.stride(1) * (len(matrices[0]) > 1),
         dimensions, horizon, memories, advance.clip is not None, HISTORY, rows, columns,
         triton.next_power_of_2(dimensions + 1), max(TILE // (rows * columns), 1),
     )  # fmt: skip
     made = features[count % 2]
-    memory = made[..., (places - memories) * horizon :].contiguous()
-    return State(made[..., :horizon].contiguous(), state.history, memory)
+    return State(made[..., :horizon].contiguous(), state.history, made[..., (places - memories) * horizon :])
 
 
 @triton.jit

@@ -28,11 +28,7 @@ class Prepared(NamedTuple):
 
 
 class IdleSteps(devices.OnTensors):
-    """What steps that add one sum of residuals predict, from numbers of the size of the sample.
-
-    Attributes:
-        fused: the module of that name where it can run, which needs a GPU and Triton; None elsewhere.
-    """
+    """What steps that add one sum of residuals predict, from numbers of the size of the sample."""
 
     TENSORS = ("constant", "head", "shift", "along", "across", "basis")
 
@@ -47,7 +43,7 @@ class IdleSteps(devices.OnTensors):
         self.along, self.across = product[: self._dimensions + 1], product[self._dimensions + 1 :]
         self._held = not form.product.any()  # the prediction is the total's, whatever the sample is
         self.basis = None if form.norm is None else there(form.norm.basis)
-        self.fused: Any = None
+        self.fused: Any = None  # the module of that name, where there are a GPU and Triton
 
     def prepare(self, total: Tensor) -> Prepared:
         """What is known as soon as the total is."""

@@ -129,8 +129,8 @@ class StreamsNetwork:
         return self._run_once(name, given)
 
     def _run_once(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
-        made = self._once[name](*given.values())  # which another part reads, that may be in fp32
-        return made if self._parts.narrow.get(name) is None else [each.to(_FLOAT.get(each.dtype)) for each in made]
+        made, narrow = self._once[name](*given.values()), self._parts.narrow.get(name)  # others may read it in fp32
+        return made if narrow is None else [each.float() if each.dtype == narrow else each for each in made]
 
     def condition(self) -> Tensor:
         """What a correction reads: the features, one row of numbers a stream, ``[B, N]``."""
@@ -188,6 +188,3 @@ class StreamsNetwork:
         reads = [tuple(self.contexts.at(name, k) for name in contexts) for k in range(self._steps)]
         order = [piece.stream, *contexts]
         return self._written(part, piece.graph, [value, *reads[0]], self.streams, order, weights), reads
-
-
-_FLOAT = {torch.bfloat16: torch.float32, torch.float16: torch.float32}

@@ -106,7 +106,7 @@ def test_anchors_and_steps_that_are_too_large_are_left_to_torch(make_artifact: M
     advance.anchors[4] = True
     assert fused.fits(advance, 1, 3) and fused.fits(advance, 5, 7)
     assert not fused.fits(advance, 3, 2) and not fused.fits(advance, 1, 1)
-    advance.updates = torch.empty(STEPS, 2, 512, 512)
+    advance.updates = torch.empty(STEPS, 2, 512, 512)  # of two dimensions
     assert not fused.fits(advance, 1, 3)
 
 

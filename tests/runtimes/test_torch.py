@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dis
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,14 +21,11 @@ from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import DENSE, Plan
-from ttscompile.errors import CaptureError, IllegalPlanError, RuntimeUnavailableError
-from ttscompile.ir.evaluate import evaluate
-from ttscompile.ir.graph import Enum, Graph, Ref
+from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.instructions import instructions_of
 from ttscompile.runtimes.random_calls import normalized, random_call
 from ttscompile.runtimes.torch.backend import Line, Lines, TorchBackend
-from ttscompile.runtimes.torch.functions import HALF_LINEAR, write_function
 from ttscompile.runtimes.torch.loop import denoise
 from ttscompile.runtimes.torch.network import Parts, Placed, StreamsNetwork
 from ttscompile.runtimes.torch.sampler import Advance
@@ -38,7 +33,7 @@ from ttscompile.runtimes.torch.sampler import Advance
 from .agreement import call_terms, largest_difference, random_inputs
 from .conftest import MakeArtifact
 from .plans import random_correction, random_plan
-from .toys import B, f32, node, toy_program
+from .toys import toy_program
 
 VARIANTS = [{}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}, {"normed": True, "sequence_first": True}]
 
@@ -69,18 +64,6 @@ def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict
     for seed in range(5):
         rng = np.random.default_rng(seed)
         assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < allowed
-
-
-def test_a_policy_that_was_saved_in_half_precision_agrees_with_the_reference(make_artifact: MakeArtifact) -> None:
-    """Its weights are read in half precision, and nothing is computed in it."""
-    program = toy_program(pruner=False)
-    saved = {
-        name: value.astype(np.float16).astype(value.dtype) if name.endswith(".w") else value
-        for name, value in program.weights.items()
-    }
-    artifact, rng = make_artifact(replace(program, weights=saved)), np.random.default_rng(0)
-    runtimes = open_runtime(artifact, "torch"), open_runtime(artifact, "reference")
-    assert largest_difference(artifact, *runtimes, rng, streams=2, calls=4) < bound(call_terms(artifact))
 
 
 @pytest.mark.slow
@@ -255,16 +238,6 @@ def test_frames_are_computed_in_fewer_bits(once: Once) -> None:
         assert 0 < np.abs(found - exact).max() < 2.0**-4 * apart, name
 
 
-def test_weights_of_products_are_kept_in_fewer_bits(toy_artifact: Artifact) -> None:
-    graph = toy_artifact.pieces.blocks[0].graph
-    weights = {name: torch.from_numpy(np.array(value)) for name, value in toy_artifact.weights.items()}
-    examples = [torch.randn(kind.at(1)) for kind in graph.inputs.values()]
-    with torch.autocast("cpu", torch.bfloat16):
-        function = write_function(graph, weights, examples, 1, torch.bfloat16)
-    kept = [each for each in function.__globals__.values() if isinstance(each, torch.Tensor)]
-    assert {each.dtype for each in kept} == {torch.bfloat16}
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -312,96 +285,6 @@ def test_settings_of_torch_are_as_they_were_after_a_call(toy_artifact: Artifact)
     assert torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
 
 
-def attention(streams_first: bool) -> Graph:
-    """Products, moves of all sorts that change how memory is seen, and constants that can be computed ahead."""
-    x, wide, heads = f32(B, 3, 4), f32(B, 3, 8), f32(B, 2, 3, 4)
-    nodes = (
-        node("t", "transpose.int", f32(4, 8), Ref("w"), 0, 1),
-        node("tt", "transpose.int", f32(8, 4), Ref("t"), 0, 1),
-        node("y", "linear.default", wide, Ref("x"), Ref("tt"), Ref("b")),
-        node("g", "gelu.default", wide, Ref("y")),
-        node("v", "reshape.default", f32(B, 3, 2, 4), Ref("g"), (B, 3, 2, 4)),
-        node("h", "transpose.int", heads, Ref("v"), 1, 2),
-        node("s", "select.int", f32(B, 3, 4), Ref("h"), 1, 1),
-        node("u", "unsqueeze.default", f32(B, 1, 3, 4), Ref("s"), 1),
-        node("a", "add.Tensor", heads, Ref("h"), Ref("u")),
-        node("p", "permute.default", f32(3, B, 4, 2), Ref("a"), (2, 0, 3, 1)),
-        node("c", "reshape.default", f32(3, B, 8), Ref("p"), (3, B, 8)),
-        node("z", "sum.dim_IntList", x if streams_first else f32(3, B), Ref("c"), (2,)),
-    )
-    return Graph({"x": x}, {"w": f32(8, 4), "b": f32(8)}, nodes, ("z", "h", "x"))
-
-
-def test_a_function_computes_what_its_graph_says_with_fewer_operations() -> None:
-    graph, rng = attention(False), torch.Generator().manual_seed(0)
-    weights = {name: torch.randn(kind.at(1), generator=rng) for name, kind in graph.constants.items()}
-    for streams in (1, 3):
-        function = write_function(graph, weights, [torch.zeros(streams, 3, 4)], streams, None)
-        for _ in range(2):
-            x = torch.randn(streams, 3, 4, generator=rng)
-            found, expected = function(x), evaluate(graph, weights, {"x": x})
-            assert found[2] is x
-            for one, other in zip(found, expected, strict=True):
-                assert_equal_but_for_rounding(one, other, 40)
-        names = function.__code__.co_varnames
-        assert len(names) - 1 < len(graph.nodes) - 3, names  # transpositions of the weight, moves, and the gelu
-
-
-@pytest.mark.skipif(torch.backends.quantized.engine not in ("x86", "fbgemm"), reason="this torch has no FBGEMM")
-@pytest.mark.parametrize("bias", [True, False])
-def test_only_weights_that_half_precision_holds_are_read_in_it(bias: bool) -> None:
-    half, rng = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)).half().float(), np.random.default_rng(0)
-    terms = 5 + 2
-    linear = node("y", "linear.default", f32(B, 3, 7), Ref("x"), Ref("w"), *[Ref("b")] * bias)
-    nodes = linear, node("g", "gelu.default", f32(B, 3, 7), Ref("y"))
-    graph = Graph({"x": f32(B, 3, 5)}, {"w": f32(7, 5), "b": f32(7)}, nodes, ("g",))
-    x, b = (torch.from_numpy(rng.standard_normal(shape).astype(np.float32)) for shape in ((2, 3, 5), (7,)))
-    finer, large = half.clone(), half.clone()
-    finer[6, 4] *= 1 + 2**-20
-    large[0, 0] = 2.0**17
-    for weight, expected in ((half, True), (finer, False), (large, False)):
-        weights = {"w": weight, "b": b}
-        function = write_function(graph, weights, [torch.zeros_like(x)], 2, None)
-        assert any(value is HALF_LINEAR for value in function.__globals__.values()) == expected
-        assert_equal_but_for_rounding(function(x)[0], evaluate(graph, weights, {"x": x})[0], terms)
-
-
-def test_a_function_reads_weights_where_nothing_can_be_packed() -> None:
-    """Types and ranks that oneDNN's kernels are not made for are computed as they stand."""
-    kind = replace(f32(B, 4), dtype="float64")
-    weight = replace(f32(2, 4), dtype="float64")
-    nodes = (node("y", "linear.default", replace(f32(B, 2), dtype="float64"), Ref("x"), Ref("w")),)
-    graph, x = Graph({"x": kind}, {"w": weight}, nodes, ("y",)), torch.randn(3, 4, dtype=torch.float64)
-    weights = {"w": torch.randn(2, 4, dtype=torch.float64)}
-    (found,) = write_function(graph, weights, [x], 3, None)(x)
-    assert torch.equal(found, x @ weights["w"].T)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"op": "aten.from_file.default"}, "not a pure function|reads files|does not exist"),
-        ({"args": (Ref("x"), Enum("dtype", "Tensor"))}, "no such dtype"),
-    ],
-)
-def test_a_graph_that_cannot_be_written_is_refused(change: dict[str, object], message: str) -> None:
-    one = replace(node("y", "tanh.default", f32(B, 4), Ref("x")), **change)
-    with pytest.raises(CaptureError, match=message):
-        write_function(Graph({"x": f32(B, 4)}, {}, (one,), ("y",)), {}, [torch.zeros(1, 4)], 1, None)
-
-
-def test_nothing_of_an_artifact_gets_into_the_source_of_a_function() -> None:
-    """Names of arguments are the only text of a graph that a function holds, and operations take none but their own."""
-    wrong = "alpha=print('executed'), beta"
-    bad = replace(node("y", "add.Tensor", f32(B, 4), Ref("x"), Ref("x")), kwargs=((wrong, 1),))
-    with pytest.raises((TypeError, RuntimeError), match="print"):
-        write_function(Graph({"x": f32(B, 4)}, {}, (bad,), ("y",)), {}, [torch.zeros(1, 4)], 1, None)
-    odd = replace(node("y'; print()", "tanh.default", f32(B, 4), Ref("x); print(")), kwargs=())
-    graph = Graph({"x); print(": f32(B, 4)}, {}, (odd,), ("y'; print()",))
-    x = torch.ones(1, 4)
-    assert torch.equal(write_function(graph, {}, [x], 1, None)(x)[0], x.tanh())
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", [{}, {"normed": True, "sequence_first": True}], ids=str)
 def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, variant: dict[str, bool]) -> None:
@@ -428,44 +311,3 @@ def test_everything_of_a_call_is_on_its_device(make_artifact: MakeArtifact, vari
     results = [sample, network.logits(), network.condition(), *residuals.values()]
     assert len(results) == 3 + np.count_nonzero(plan == Source.COMPUTE)
     assert {each.device.type for each in results} == {"meta"}
-
-
-def rms_graph(axis: int = -1, power: int = 2) -> Graph:
-    kind, one = f32(B, 3, 4), f32(B, 3, 1)
-    nodes = (
-        node("square", "pow.Tensor_Scalar", kind, Ref("x"), power),
-        node("mean", "mean.dim", one, Ref("square"), (axis,), True),
-        node("added", "add.Tensor", one, Ref("mean"), 1e-5),
-        node("root", "rsqrt.default", one, Ref("added")),
-        node("scaled", "mul.Tensor", kind, Ref("x"), Ref("root")),
-        node("normed", "mul.Tensor", kind, Ref("scaled"), Ref("w")),
-        node("q", "linear.default", kind, Ref("normed"), Ref("wide")),
-        node("k", "linear.default", kind, Ref("normed"), Ref("wide")),
-    )
-    return Graph({"x": kind}, {"w": f32(4), "wide": f32(4, 4)}, nodes, ("q", "k", "normed"))
-
-
-@pytest.mark.parametrize(("axis", "power", "fused"), [(-1, 2, True), (-1, 4, False), (-2, 2, False)])
-def test_an_rms_norm_is_one_operation(axis: int, power: int, fused: bool) -> None:
-    """And nothing else is, which only looks like it; of axis -2 the mean is of another shape, which broadcasts too."""
-    graph, draw = rms_graph(axis, power), torch.Generator().manual_seed(0)
-    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
-    x = torch.randn(2, 3, 4, generator=draw)
-    function = write_function(graph, weights, [x], 2, None)
-    calls = function.__code__.co_names
-    assert (torch.rms_norm in [function.__globals__[name] for name in calls]) == fused
-    for found, expected in zip(function(x), evaluate(graph, weights, {"x": x}), strict=True):
-        assert_equal_but_for_rounding(found, expected, 64)
-
-
-def test_what_several_products_read_is_narrowed_once() -> None:
-    graph, draw = rms_graph(), torch.Generator().manual_seed(0)
-    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
-    x = torch.randn(2, 3, 4, generator=draw)
-    with torch.autocast("cpu", torch.bfloat16):
-        function = write_function(graph, weights, [x], 2, torch.bfloat16)
-        found, expected = function(x), evaluate(graph, weights, {"x": x})
-    assert [each.dtype for each in found] == [torch.bfloat16, torch.bfloat16, torch.float32]
-    assert [each.argval for each in dis.get_instructions(function)].count("narrow") == 1
-    for one, other in zip(found, expected, strict=True):
-        assert_equal_but_for_rounding(one.float(), other.float(), 64, unit=2.0**-8)

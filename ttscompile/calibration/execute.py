@@ -41,7 +41,6 @@ class Executor:
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
         axes: of the streams in each block's residual.
         alike: whether all blocks have residuals of one type.
-        pruner_graph: the pruner; None if the artifact has none.
     """
 
     def __init__(self, view: View, device: torch.device | None = None) -> None:
@@ -54,7 +53,6 @@ class Executor:
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
         self.alike = len({block.type for block in blocks}) == 1
-        self.pruner_graph = pieces.pruner
         self.correction: Correction | None = None
         self._dense = dense_plan(self.model.steps, self.model.blocks)[None]
 

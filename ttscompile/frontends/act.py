@@ -112,7 +112,7 @@ class ACT(nn.Module):
         seen = [self.encoder_img_feat_input_proj(self.backbone(image)) for image in images]
         tokens += [features.flatten(2).transpose(1, 2) for features in seen]
         latent = self.encoder_latent_input_proj.bias.expand(tokens[0].shape[0], 1, -1)  # of zeros
-        pixels = [positions_2d(*each.shape[2:], each.shape[1]).to(each.device) for each in seen]
+        pixels = [positions_2d(each.shape[2], each.shape[3], each.shape[1]).to(each.device) for each in seen]
         places = torch.cat((self.encoder_1d_feature_pos_embed.weight, *pixels))
         memory = self.encoder(torch.cat((latent, *tokens), dim=1), places)
         queries = self.decoder_pos_embed.weight.unsqueeze(0)

@@ -10,48 +10,44 @@ import torch
 from torch import nn
 
 
-class TokensDenoiser(nn.Module):
+class _Given(nn.Module):
+    """What is given an observation in some way."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+
+class TokensDenoiser(_Given):
     """The observed steps are tokens of the network's own.
 
     Args:
         model: ``model(sample, timestep, tokens)``.
     """
 
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
-
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         """``[B, T, Da]``, ``[B]``, normalised ``[B, To, Do]`` -> ``[B, T, Da]``."""
         return self.model(sample, timestep, obs)  # type: ignore[no-any-return]
 
 
-class GlobalDenoiser(nn.Module):
+class GlobalDenoiser(_Given):
     """The observed steps are one vector, the same for the whole chunk.
 
     Args:
         model: ``model(sample, timestep, global_cond=vector)``.
     """
 
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
-
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         """``[B, T, Da]``, ``[B]``, normalised ``[B, To, Do]`` -> ``[B, T, Da]``."""
         return self.model(sample, timestep, global_cond=obs.flatten(1))  # type: ignore[no-any-return]
 
 
-class LocalDenoiser(nn.Module):
+class LocalDenoiser(_Given):
     """The observed steps stand beside the first To of the sample; beside the others are zeros.
 
     Args:
         model: ``model(sample, timestep, local_cond=steps)``.
     """
-
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         """``[B, T, Da]``, ``[B]``, normalised ``[B, To, Do]`` -> ``[B, T, Da]``."""

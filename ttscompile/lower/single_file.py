@@ -4,46 +4,8 @@
     plan, or the pruner's -> repair -> coefficients --------+-> loop over steps -> unnormalise -> action, action_pred
     initial_noise, step_noise, rollout_rows ----------------'                  '-> rollout_rows_next, .._index_next
 
-Each stream of a batch may follow a plan of its own; those that follow one go through the loop together. For B streams,
-K steps and N blocks the inputs are, with the shapes of the policy:
-
-======================= =================== ==========================================================================
-(keys of observations)  ``[B, ...]``        as the policy's user has them, not normalised
-``initial_noise``       float32 [B,T,D]     the sample at step 0
-``step_noise``          float32 [K,B,T,D]   only if the sampler is stochastic
-``plan``                int8 [P,K,N]        0 COMPUTE, 1 FORWARD, 2 TIMESTEP, 3 ROLLOUT; P is 1 for all streams, or B
-``rollout_rows``        float32 [R,...]     residuals of earlier calls of the episode, one of one stream in each row;
-                                            R = 0 in its first call
-``rollout_index``       int64 [B,K,N]       which row is the residual of a cell; -1 where there is none
-``rollout_keep``        bool [K,N]          residuals that later calls of the episode may read; none for plans without
-                                            ROLLOUT, and the cache stays empty
-``use_pruner``          bool []             whether the plan is what the pruner makes of the observation, and not
-                                            ``plan``, which is not looked at then. False if left out. Only if the
-                                            policy has a pruner
-``pruner. ...``         float32             weights of the pruner, as ``Artifact.pruner`` names them. Those left out are
-                                            as they were at the time of ``convert``: not calibrated, which is dense
-======================= =================== ==========================================================================
-
-The observation of a corrected plan is held against what was recorded: inputs ``envelope [N,E]``, ``envelope_center``
-``[E]`` and ``plain_plan`` int8 ``[K,N]``, which takes the place of the plan far outside (``core.envelope``).
-
-A plan that has a correction wants it as further inputs, which ``Correction.inputs`` gives: ``correction``,
-``correction_bias`` and ``correction_anchors``, if it reads the observation ``correction_reading`` and
-``correction_observed``, and if it has jumps ``correction_jumps``, ``correction_inner``, ``correction_middle`` and
-``correction_outer``. Inputs that are left out correct nothing. onnxruntime warns, when it loads the file, that these
-have values and can be overridden. ``runtimes.single_file.inputs_of`` gives all that belongs to a plan of an artifact.
-The outputs are
-
-======================= =================== ==========================================================================
-``action``              float32 [B,Ta,Da]   what to execute; NaN where the pruner's weights are broken
-``action_pred``         float32 [B,T,Da]    the whole chunk
-``executed_plan``       int8 [B,K,N]        the plan with a dense step 0, and with TIMESTEP for every ROLLOUT of what
-                                            the cache does not have: ``legalize`` in ONNX
-``legalised``           int64 [B]           how many cells that has changed
-``outside``             float32 [B]         ``CallReport.outside``; zeros where nothing was recorded
-``rollout_rows_next``   float32 [R',...]    the next call's ``rollout_rows``
-``rollout_index_next``  int64 [B,K,N]       the next call's ``rollout_index``
-======================= =================== ==========================================================================
+Each stream of a batch may follow a plan of its own; those that follow one go through the loop together. Inputs and
+outputs are in ``docs/howto/cpp.md``; ``runtimes.single_file.inputs_of`` gives what belongs to a plan of an artifact.
 """
 
 from __future__ import annotations
