@@ -9,6 +9,8 @@ NOT_RUN = {
     "source": "of the shell, and for what make would have set up",
     "cd": "of the shell",
     "python examples/benchmark/sweep.py": "takes 20 minutes; tests/examples/test_benchmark_sweep.py runs it in short",
+    "python examples/benchmark/gpu.py": "needs a GPU; tests/examples/test_benchmark_gpu.py runs it on the CPU",
+    "pytest tests/runtimes/test_cuda.py": "needs a GPU",
     "python examples/evaluation/warm_start.py": "takes minutes; tests/examples has it in short",
     ".venv/bin/pytest": "a part of this suite, or of the test of the guide's own files",
     ".venv/bin/ruff": "make lint",
