@@ -207,7 +207,7 @@ class Runtime:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
         settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
-        reads = told is None or plan.cells is None or (plan.cells == Source.ROLLOUT)[~backend.keeps].any()
+        reads = told is None or plan.cells is None or (plan.cells == Source.ROLLOUT.value)[~backend.keeps].any()
         self._given |= name is None and bool(reads)  # NAME@bf16 reads what NAME does, which is kept where it reads that
         keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
         self._used = opened

@@ -148,13 +148,11 @@ def test_eager_and_compiled_agree(tiny: tuple[Path, dict[float, np.ndarray]]) ->
 
 
 def test_without_torch_compile_the_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(module: object, **_: object) -> object:
-        def call(**_: object) -> None:
+    class Refusing(nn.Module):
+        def forward(self, **_: object) -> None:
             raise RuntimeError("no C++\n\ncompiler\nand much more")
 
-        return call
-
-    monkeypatch.setattr(torch, "compile", refuse)
+    monkeypatch.setattr(torch, "compile", lambda module, **_: Refusing())
     with pytest.raises(RuntimeUnavailableError, match=r"RuntimeError: no C\+\+ compiler \(inductor needs"):
         rounds.torch_compile_contestant(random_network(16, "ddim", 8, layers=1), 1.0, 1)
 

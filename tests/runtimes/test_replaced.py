@@ -81,7 +81,7 @@ def test_exchanged_between_check_and_use(
     runtime: str,
     there_and_back: bool,
 ) -> None:
-    if runtime == "reference":
+    if runtime != "onnxruntime":  # whose sums are rounded otherwise
         found = ttscompile.load(places[0], runtime)
         expected = {found.info.identity: answer(found, read_manifest(places[0]).spec)}
 
