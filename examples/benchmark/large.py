@@ -5,6 +5,7 @@
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
+    python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
@@ -116,6 +117,19 @@ def convert_evo1(folder: Path) -> None:
     stages.end()
 
 
+def convert_xvla(folder: Path) -> None:
+    """Save an xvla of its real size, as lerobot does, and convert it."""
+    import large_xvla
+
+    import ttscompile
+
+    large_xvla.save(folder / "xvla")
+    print(f"{peak():5.2f} GiB before compiling")
+    stages = Stages()
+    ttscompile.convert(folder / "xvla", folder / "compiled", precision="int8", explain=stages)
+    stages.end()
+
+
 def convert_clip(folder: Path) -> None:
     """Compile a ``multi_task_dit`` of its real size."""
     import large_clip
@@ -157,6 +171,19 @@ def run_evo1(folder: Path, rounds: int) -> None:
         folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
     )
     large_calls.reusing(folder, spec, 2, rounds + 2)
+
+
+def run_xvla(folder: Path, rounds: int) -> None:
+    """See ``large_calls``; two of ten steps are computed."""
+    import large_calls
+    import large_smolvla
+
+    from ttscompile.frontends import load_checkpoint_policy
+
+    module, spec = load_checkpoint_policy(folder / "xvla")
+    large_calls.compare(
+        folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
+    )
 
 
 def _vision(module: nn.Module) -> nn.Module:
@@ -217,6 +244,7 @@ def main() -> None:
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
     parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
     parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
+    parser.add_argument("--xvla", action="store_true", help="LeRobot's xvla, likewise")
     parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
@@ -224,7 +252,7 @@ def main() -> None:
     parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
     options = parser.parse_args()
     policies = {"smolvla": (convert_smolvla, run_smolvla), "evo1": (convert_evo1, run_evo1)}
-    policies |= {"clip": (convert_clip, run_clip)}
+    policies |= {"xvla": (convert_xvla, run_xvla), "clip": (convert_clip, run_clip)}
     asked = next((own for name, own in policies.items() if getattr(options, name)), None)
     if asked is not None and options.only == "convert":
         asked[0](options.output)

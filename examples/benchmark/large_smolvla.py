@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ttscompile import Noise, PolicySpec
+from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.frontends.lerobot_smolvla import RELEASED, read_config
 from ttscompile.frontends.lerobot_vla import read_vla_config
@@ -102,27 +103,18 @@ def call(spec: PolicySpec) -> tuple[dict[str, np.ndarray], Noise]:
 def eager(module: nn.Module, vision: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
     """A call in eager PyTorch: the actions; and the seconds, of the processor, of image encoder, prefix and loop."""
     obs, noise = call(spec)
-    given = {spec.arguments[key]: torch.from_numpy(value) for key, value in obs.items()}
-    parts: Any = module
-    took, table = [0.0], spec.sampler
+    given = {key: torch.from_numpy(value) for key, value in obs.items()}
+    whole: Any = module
+    run, took = eager_policy(module, spec), dict[nn.Module, float]()
+    for part in (vision, whole.encoder):
+        part.register_forward_pre_hook(lambda one, _: took.update({one: took.get(one, 0.0) - process_time()}))
+        part.register_forward_hook(lambda one, _, __: took.update({one: took[one] + process_time()}))
 
-    def timed(_: nn.Module, __: Any) -> None:
-        took[0] -= process_time()
+    def timed() -> tuple[np.ndarray, list[float]]:
+        took.clear()
+        start = process_time()
+        sample = run(given, noise).numpy()
+        whole_call, seen, prefix = process_time() - start, took[vision], took[whole.encoder]
+        return spec.chunk.unnormalized(sample), [seen, prefix - seen, whole_call - prefix]
 
-    def done(_: nn.Module, __: Any, ___: Any) -> None:
-        took[0] += process_time()
-
-    vision.register_forward_pre_hook(timed)
-    vision.register_forward_hook(done)
-
-    @torch.inference_mode()
-    def run() -> tuple[np.ndarray, list[float]]:
-        took[0], start = 0.0, process_time()
-        encoded = parts.encoder(given)
-        prefix = process_time()
-        x = torch.from_numpy(noise.initial)
-        for length, time in zip(table.out_to_next, torch.from_numpy(table.timesteps), strict=True):
-            x = x + float(length) * parts.denoiser(x, time[None], encoded)
-        return spec.chunk.unnormalized(x.numpy()), [took[0], prefix - start - took[0], process_time() - prefix]
-
-    return run
+    return timed
