@@ -228,24 +228,22 @@ class Lines:
 def cuda_graphs(device: torch.device) -> Capture:
     """CUDA graphs of a device that share one pool of memory: they run one after the other.
 
-    Each is captured on a stream of that device; torch's own for captures is of whichever device had the first.
+    They are captured on a stream of that device (torch's own for captures is of whichever device had the first) on
+    which nothing else is computed. cuBLAS has scratch memory for each stream, and torch frees all of it when somebody
+    asks for that, as torch.compile does. So a graph has to have it from its own pool, as what is taken in a capture is.
     """
     pool = torch.cuda.graph_pool_handle()
+    first, side = (torch.cuda.Stream(device) for _ in range(2))  # type: ignore[no-untyped-call]
 
     def capture(line: Line) -> Line:
-        side: torch.cuda.Stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        side.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(side):
+        first.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(first):
             for _ in range(WARM_UP):
                 line()
-        torch.cuda.current_stream(device).wait_stream(side)
+        torch.cuda.current_stream(device).wait_stream(first)
         graph = torch.cuda.CUDAGraph()
-        # Torch keeps cuBLAS's scratch memory until somebody clears it, as torch.compile does. A graph that was captured
-        # with it then writes where other data is. Cleared here, it is taken anew, from the graph's own pool.
-        torch._C._cuda_clearCublasWorkspaces()
         with torch.cuda.graph(graph, pool=pool, stream=side):
             line()
-        torch._C._cuda_clearCublasWorkspaces()
         replay: Line = graph.replay
         return replay
 

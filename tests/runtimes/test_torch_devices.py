@@ -103,14 +103,17 @@ def test_a_device_has_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_of("cuda") == torch.device("cuda:1")
 
 
-def test_a_graph_is_captured_on_a_stream_of_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, runs, cuda = torch.device("cuda:1"), list[int](), MagicMock()
+def test_a_graph_is_captured_on_a_stream_of_its_device_that_nothing_else_uses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scratch memory of cuBLAS on that stream is then the graph's own, and nobody frees it."""
+    device, runs, cuda = torch.device("cuda:1"), list[object](), MagicMock()
+    streams = [MagicMock(), MagicMock()]
+    cuda.Stream.side_effect = streams
     for name in ("graph_pool_handle", "Stream", "current_stream", "stream", "CUDAGraph", "graph"):
         monkeypatch.setattr(torch.cuda, name, getattr(cuda, name))
-    cleared = list[int]()
-    monkeypatch.setattr(torch._C, "_cuda_clearCublasWorkspaces", lambda: cleared.append(len(runs)), raising=False)
-    replay = cuda_graphs(device)(lambda: runs.append(0))
-    assert [call.args for call in (*cuda.Stream.call_args_list, *cuda.current_stream.call_args_list)] == [(device,)] * 3
-    assert cuda.graph.call_args.kwargs["stream"] is cuda.Stream.return_value
-    assert len(runs) == 3 and cleared == [2, 3]
-    assert replay is cuda.CUDAGraph.return_value.replay
+    capture = cuda_graphs(device)
+    replays = [capture(lambda: runs.append(0)) for _ in range(2)]
+    assert [call.args for call in (*cuda.Stream.call_args_list, *cuda.current_stream.call_args_list)] == [(device,)] * 6
+    assert [call.args for call in cuda.stream.call_args_list] == [(streams[0],)] * 2
+    assert [call.kwargs["stream"] for call in cuda.graph.call_args_list] == [streams[1]] * 2
+    assert len(runs) == 6
+    assert replays == [cuda.CUDAGraph.return_value.replay] * 2
