@@ -102,6 +102,7 @@ class Runtime:
             self._opened_for(plan.otherwise)
         self._used = self._opened_for(plan)
         # Its thread is there before the first call.
+        self._reading = any(one.cells is None or Source.ROLLOUT in one.cells for one in artifact.plans.values())
         self._helper = Helper(HELPER) if any(one.pruned for one in artifact.plans.values()) else None
         self._given = False  # whether a plan that is not the artifact's ever was
         self._written: BoolArray | None = None
@@ -207,8 +208,7 @@ class Runtime:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
         settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
-        reads = told is None or plan.cells is None or (plan.cells == Source.ROLLOUT.value)[~backend.keeps].any()
-        self._given |= name is None and bool(reads)  # NAME@bf16 reads what NAME does, which is kept where it reads that
+        self._given |= name is None and (told is None or self._reading)  # of NAME@bf16 this variant may know no plan
         keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
         self._used = opened
         self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones

@@ -9,9 +9,11 @@ It shares no loop with the reference, which stays slow and literal: each is the 
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -104,7 +106,7 @@ class TorchBackend:
         """See ``Backend.logits``."""
         with self._settings():
             if self.device.type == "cuda":  # cuBLAS warns if it comes first in a thread, as in the one that prunes
-                torch.cuda.synchronize(self.device)
+                torch.cuda.current_stream(self.device).synchronize()
             return np.asarray(self.workspace.network.logits().float().cpu().numpy(), dtype=np.float32)
 
     def first_step(self) -> None:
@@ -195,7 +197,8 @@ class Lines:
 
     def __init__(self, capture: Capture | None) -> None:
         self._capture = capture
-        self._captured: OrderedDict[Hashable, Line | None] = OrderedDict()  # None: it came once
+        self._captured: OrderedDict[Hashable, Line] = OrderedDict()
+        self._once: deque[Hashable] = deque(maxlen=MOST)  # of what came for the first time
 
     @property
     def captures(self) -> bool:
@@ -210,40 +213,44 @@ class Lines:
             at_once: capture it when it comes for the first time, and not for the second, as one that may never return.
         """
         if self._capture is None:
-            line()
-            return
+            return line()
         found = self._captured.get(key)
+        if found is None and not (at_once or key in self._once):
+            self._once.append(key)
+            return line()
         if found is None:
-            found = self._captured[key] = self._capture(line) if at_once or key in self._captured else None
+            found = self._captured[key] = self._capture(line)
             if len(self._captured) > MOST:
                 self._captured.popitem(last=False)
         self._captured.move_to_end(key)
-        (found or line)()
+        found()
 
     def forget(self) -> None:
         """Let go of everything that was captured: its tensors are no more."""
         self._captured.clear()
+        self._once.clear()
 
 
 def cuda_graphs(device: torch.device) -> Capture:
     """CUDA graphs of a device that share one pool of memory: they run one after the other.
 
-    They are captured on a stream of that device (torch's own for captures is of whichever device had the first) on
-    which nothing else is computed. cuBLAS has scratch memory for each stream, and torch frees all of it when somebody
-    asks for that, as torch.compile does. So a graph has to have it from its own pool, as what is taken in a capture is.
+    They are captured on a stream that computes nothing else. cuBLAS has scratch memory for each stream, which torch
+    frees when somebody asks for that, as torch.compile does. So a graph has to have it from its own pool, as what is
+    taken in a capture is. A pool and its stream are done with when their graphs are: torch may still hold that memory.
     """
-    pool = torch.cuda.graph_pool_handle()
-    first, side = (torch.cuda.Stream(device) for _ in range(2))  # type: ignore[no-untyped-call]
+    alive: WeakSet[torch.cuda.CUDAGraph] = WeakSet()
+    own: list[Any] = []
 
     def capture(line: Line) -> Line:
-        first.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(first):
-            for _ in range(WARM_UP):
-                line()
-        torch.cuda.current_stream(device).wait_stream(first)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=pool, stream=side):
+        for _ in range(WARM_UP):
             line()
+        if not alive:
+            own[:] = torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        pool, stream = own
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=pool, stream=stream):
+            line()
+        alive.add(graph)
         replay: Line = graph.replay
         return replay
 

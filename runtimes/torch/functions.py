@@ -31,8 +31,8 @@ from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref
 Function = Callable[..., tuple[Tensor, ...]]
 """Takes the graph's inputs in order, and gives its outputs in order."""
 
-_ROOT_MEAN_SQUARE = ("mul.Tensor", "rsqrt.default", "add.Tensor", "mean.dim", "pow.Tensor_Scalar")
-"""What divides a value by the root of the mean of its squares, the last operation first."""
+_RMS_NORM = ("mul.Tensor", "mul.Tensor", "rsqrt.default", "add.Tensor", "mean.dim", "pow.Tensor_Scalar")
+"""What an RMSNorm is captured as, the last operation first."""
 
 _PRODUCTS = frozenset(f"aten.{name}.default" for name in ("linear", "addmm", "mm", "matmul", "bmm", "convolution"))
 """Operations that autocast computes in the narrower type, so that their constants can be kept in it."""
@@ -111,23 +111,22 @@ class _Writer:
 
     def _norm(self, node: Node) -> tuple[Node, Callable[..., Any]] | None:
         """RMSNorm, where a node is the last of the six that it was captured as; None for any other node."""
-
-        def made_by(argument: Argument, op: str) -> Node | None:
+        chain, found = list[Node](), self._nodes.get(node.name)
+        for place, op in enumerate(_RMS_NORM):
+            if found is None or found.op != f"aten.{op}" or found.kwargs:
+                return None
+            chain.append(found)
+            argument = found.args[place == 1]
             found = self._nodes.get(argument.name) if isinstance(argument, Ref) else None
-            return found if found is not None and found.op == f"aten.{op}" else None
-
-        chain = [node if node.op == "aten.mul.Tensor" else None]
-        for place, op in enumerate(_ROOT_MEAN_SQUARE):
-            before = chain[-1]
-            chain.append(None if before is None else made_by(before.args[place == 1], op))
         _, scaled, _, added, mean, square = chain
-        if scaled is None or added is None or mean is None or square is None:
-            return None
         (value, _), (_, weight), (_, eps) = scaled.args, node.args, added.args
         if square.args != (value, 2) or mean.args[1:] != ((-1,), True) or not isinstance(weight, Ref):
             return None
-        shape = self._values[scaled.name].shape[-1:]
-        if weight.name not in self._fixed or self._values[weight.name].shape != shape or not isinstance(eps, float):
+        shape, factor = self._values[scaled.name].shape[-1:], self._values[weight.name]
+        alike = (
+            factor.shape == shape and factor.dtype == self._value(node, value).dtype
+        )  # else torch has no kernel for it
+        if weight.name not in self._fixed or not alike or not isinstance(eps, float):
             return None
         return replace(node, args=(value, tuple(shape), weight, eps)), torch.rms_norm
 

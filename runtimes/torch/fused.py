@@ -8,6 +8,7 @@ change within a run, and is added to the offsets before it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -25,6 +26,17 @@ LARGEST = 2**18
 
 TILE = 2**12
 """Numbers of a matrix that are multiplied at a time."""
+
+
+def works(device: torch.device) -> bool:
+    """Whether Triton compiles here, which takes a C compiler; a warning says why not."""
+    try:
+        _one[(1,)](torch.zeros(1, device=device))
+    except Exception as error:  # RuntimeError without a compiler, CalledProcessError without Python.h
+        told = f"Triton cannot compile: {type(error).__name__}: {str(error)[:200]}"
+        warnings.warn(f"{told}. Steps without a computed block take a dozen kernels each. Install gcc.", stacklevel=2)
+        return False
+    return True
 
 
 def fits(advance: Advance, k: int, count: int) -> bool:
@@ -52,6 +64,11 @@ def run(idle: IdleSteps, known: Prepared, advance: Advance, state: State, k: int
     )  # fmt: skip
     made = features[count % 2]
     return State(made[..., :horizon].contiguous(), state.history, made[..., (places - memories) * horizon :])
+
+
+@triton.jit
+def _one(number):
+    tl.store(number, 1.0)
 
 
 @triton.jit

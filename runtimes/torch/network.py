@@ -59,7 +59,8 @@ class Parts:
         self.idle = None if form is None else IdleSteps(form, placed.device)
         if self.idle is not None and placed.device.type == "cuda":
             with suppress(ModuleNotFoundError):  # Triton comes with most builds of torch for CUDA, not with all
-                self.idle.fused = import_module(f"{__package__}.fused")
+                fused = import_module(f"{__package__}.fused")
+                self.idle.fused = fused if fused.works(placed.device) else None
 
     def zeros(self, shape: tuple[int, ...], dtype: str) -> Tensor:
         """Zeros on the device."""

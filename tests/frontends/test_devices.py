@@ -13,6 +13,8 @@ from ttscompile.frontends.eager import evaluation
 
 from . import acts, evo1s, groots, pis, xvlas
 
+TRAINED = Path(__file__).parents[2] / "examples" / "policies" / "vla" / "trained"
+
 SAVED: dict[str, Callable[[Path], Path]] = {
     "act": lambda folder: acts.save(next(iter(acts.VARIANTS)), folder),
     "evo1": lambda folder: evo1s.save("words", folder),
@@ -20,6 +22,8 @@ SAVED: dict[str, Callable[[Path], Path]] = {
     "pi0": lambda folder: pis.save("pi0", folder),
     "pi05": lambda folder: pis.save("pi05", folder),
     "xvla": lambda folder: xvlas.save("ee6d", folder),
+    "multi_task_dit": lambda _: TRAINED / "multi_task_dit" / "policy",
+    "smolvla": lambda _: TRAINED / "smolvla" / "policy",
 }
 
 

@@ -17,7 +17,7 @@ import torch
 import ttscompile
 from tests.families import cameras
 from tests.plans import store_schedules
-from tests.rounding import assert_equal_but_for_rounding, bound
+from tests.rounding import FLOAT32, assert_equal_but_for_rounding, bound
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import DENSE, Plan
@@ -183,9 +183,35 @@ def test_a_policy_goes_and_another_comes(artifact: Artifact, make_artifact: Make
         for name in (DENSE, DENSE, f"{DENSE}@bf16"):
             obs, noise = random_inputs(one, rng, 2)
             ours = runtimes[0].predict(obs, noise, one.plan(name))[0]
-            if "@" not in name:
-                assert_equal_but_for_rounding(
-                    ours, runtimes[1].predict(obs, noise, one.plan(name))[0], 2 * call_terms(one)
-                )
+            theirs = runtimes[1].predict(obs, noise, one.plan(DENSE))[0]
+            unit = 2.0**-8 if "@" in name else FLOAT32
+            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(one), unit=unit)
         del runtimes
         gc.collect()
+
+
+def test_what_comes_again_is_replayed(artifact: Artifact) -> None:
+    """A matrix of the caller's runs as it is, is captured, and is replayed; so is a plan in another precision."""
+    runtimes, rng = both(artifact), np.random.default_rng(0)
+    matrix = Plan(cells=uniform_plan(artifact.manifest.steps, len(artifact.manifest.groups), 3))
+    for _ in range(4):
+        obs, noise = random_inputs(artifact, rng, 1)
+        for plan, unit in ((matrix, FLOAT32), (artifact.plan("evenly@bf16"), 2.0**-8)):
+            ours, theirs = runtimes[0].predict(obs, noise, plan)[0], runtimes[1].predict(obs, noise, plan.exact)[0]
+            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact), unit=unit)
+
+
+def test_scratch_memory_that_somebody_frees_is_not_the_graphs(artifact: Artifact) -> None:
+    """As torch.compile does it with CUDA graphs of its own; another number of streams is captured after it, too."""
+    runtimes, rng = both(artifact), np.random.default_rng(0)
+    for streams in (1, 2, 1):
+        for runtime in runtimes:
+            runtime.reset()
+        for _ in range(3):
+            torch._C._cuda_clearCublasWorkspaces()
+            torch.cuda.empty_cache()
+            taken = torch.full((2**22,), np.nan, device=DEVICE)  # where that memory was
+            obs, noise = random_inputs(artifact, rng, streams)
+            ours, theirs = (runtime.predict(obs, noise, artifact.plans["evenly"])[0] for runtime in runtimes)
+            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+            assert bool(taken.isnan().all())

@@ -153,15 +153,23 @@ def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_is_capt
         assert len(lines) == 1 + len(seen) + (number > 0)
 
 
-def test_a_plan_in_another_precision_is_captured_and_keeps_what_its_own_does(calibrated: Artifact) -> None:
+def test_a_plan_in_another_precision_is_captured(calibrated: Artifact) -> None:
     lines: list[Line] = []
     runtime, rng = both(calibrated, lines)[0], np.random.default_rng(0)
     for number in range(3):
         runtime.predict(*random_inputs(calibrated, rng, 1), calibrated.plan("evenly@bf16"))
         assert len(lines) == 1 + (number > 0), "the prologue, and the second call"
-    assert not runtime._given
-    runtime.predict(*random_inputs(calibrated, rng, 1), calibrated.plan("mixed@bf16"))
-    assert runtime._given, "it reads residuals of earlier calls, so that all are kept from now on"
+
+
+def test_a_plan_in_another_precision_keeps_what_others_read(calibrated: Artifact, make_artifact: MakeArtifact) -> None:
+    runtime, rng = open_runtime(calibrated, "torch"), np.random.default_rng(0)
+    for name in ("dense@bf16", "mixed@bf16"):
+        _, report = runtime.predict(*random_inputs(calibrated, rng, 1), calibrated.plan(name))
+    assert report.plan_name == "mixed@bf16" and (report.plan == Source.ROLLOUT).any() and sum(report.legalised) == 0
+    unread = make_artifact(toy_program(normed=True, pruner=False))
+    runtime = open_runtime(unread, "torch")
+    runtime.predict(*random_inputs(unread, rng, 1), unread.plan("dense@bf16"))
+    assert not runtime._given, "no plan of the artifact reads an earlier call"
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from contextlib import nullcontext
 from unittest.mock import MagicMock
 
@@ -103,17 +104,21 @@ def test_a_device_has_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_of("cuda") == torch.device("cuda:1")
 
 
-def test_a_graph_is_captured_on_a_stream_of_its_device_that_nothing_else_uses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scratch memory of cuBLAS on that stream is then the graph's own, and nobody frees it."""
+def test_a_graph_is_captured_on_a_stream_of_its_device_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a pool of its own, both of which are new once no graph is left: its scratch memory is then nobody else's."""
     device, runs, cuda = torch.device("cuda:1"), list[object](), MagicMock()
-    streams = [MagicMock(), MagicMock()]
-    cuda.Stream.side_effect = streams
-    for name in ("graph_pool_handle", "Stream", "current_stream", "stream", "CUDAGraph", "graph"):
+    cuda.CUDAGraph.side_effect = cuda.Stream.side_effect = cuda.graph_pool_handle.side_effect = lambda *_: MagicMock()
+    for name in ("graph_pool_handle", "Stream", "CUDAGraph", "graph"):
         monkeypatch.setattr(torch.cuda, name, getattr(cuda, name))
     capture = cuda_graphs(device)
-    replays = [capture(lambda: runs.append(0)) for _ in range(2)]
-    assert [call.args for call in (*cuda.Stream.call_args_list, *cuda.current_stream.call_args_list)] == [(device,)] * 6
-    assert [call.args for call in cuda.stream.call_args_list] == [(streams[0],)] * 2
-    assert [call.kwargs["stream"] for call in cuda.graph.call_args_list] == [streams[1]] * 2
+    graphs = [capture(lambda: runs.append(0)) for _ in range(2)]
+    given = [call.kwargs for call in cuda.graph.call_args_list]
+    assert given[0] == given[1] and [call.args for call in cuda.Stream.call_args_list] == [(device,)]
     assert len(runs) == 6
-    assert replays == [cuda.CUDAGraph.return_value.replay] * 2
+    del graphs
+    cuda.reset_mock()  # which holds them, too
+    gc.collect()
+    kept = capture(lambda: runs.append(0))
+    (last,) = (call.kwargs for call in cuda.graph.call_args_list)
+    assert last["stream"] is not given[0]["stream"] and last["pool"] is not given[0]["pool"]
+    assert kept is not None

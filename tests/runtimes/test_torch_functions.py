@@ -128,3 +128,27 @@ def test_what_several_products_read_is_narrowed_once() -> None:
     assert [each.argval for each in dis.get_instructions(function)].count("narrow") == 1
     for one, other in zip(found, expected, strict=True):
         assert_equal_but_for_rounding(one.float(), other.float(), 64, unit=2.0**-8)
+
+
+def test_an_rms_norm_of_a_product_stays_in_fp32() -> None:
+    """What a product gives is narrow, and torch would norm it in that type; so it is computed as it was captured."""
+    graph, draw = rms_graph(), torch.Generator().manual_seed(0)
+    first = node("x", "linear.default", f32(B, 3, 4), Ref("given"), Ref("wide"))
+    graph = replace(graph, inputs={"given": f32(B, 3, 4)}, nodes=(first, *graph.nodes), outputs=("normed",))
+    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
+    x = torch.randn(2, 3, 4, generator=draw)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = write_function(graph, weights, [x], 2, torch.bfloat16)(x)[0]
+        expected = evaluate(graph, weights, {"given": x})[0]
+    assert found.dtype == expected.dtype == torch.float32
+    assert_equal_but_for_rounding(found, expected, 64)
+
+
+def test_an_rms_norm_with_other_arguments_is_another_one() -> None:
+    graph = rms_graph()
+    added = next(one for one in graph.nodes if one.name == "added")
+    nodes = tuple(replace(one, kwargs=(("alpha", 3),)) if one is added else one for one in graph.nodes)
+    graph, x = replace(graph, nodes=nodes), 1e-3 * torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(0))
+    weights = {name: torch.ones(kind.at(1)) for name, kind in graph.constants.items()}
+    found, expected = write_function(graph, weights, [x], 2, None)(x), evaluate(graph, weights, {"x": x})
+    assert_equal_but_for_rounding(found[2], expected[2], 64)

@@ -13,14 +13,8 @@ It mixes time steps of the chunk, never action dimensions, and costs ``12 T^2 D`
 The second line reads the observation, as the policy's own encoder gives it to the pruner: ``condition [B, N]``. It
 depends on nothing in the loop, so one product before the loop makes it for all steps.
 
-Where enough was recorded, there are *jumps*, too. From an anchor to the next one all is known once the anchor is
-computed, so a small network with two hidden layers says what the steps between them leave over. It mixes everything::
-
-    known         = [condition @ reading, history]                                  [B, F + 4 T D], history as D, 4 T
-    sample_e+1   += relu(relu(known @ inner[j]) @ middle[j]) @ outer[j]             [B, T D], as D, T
-
-Each of the three has a last row that is added. The history is that after anchor j, and e is the last step before the
-next anchor; an anchor that the next one follows at once has no jump, and neither has the last.
+Where enough was recorded, there are *jumps*, too: from an anchor to the next a small network says what the steps
+between leave over (``docs/design.md``, section 2, has its formula). Anchors with no step between them have none.
 
 The idea is that of solvers fitted to one model (Bespoke solvers, arXiv 2310.19075; DPM-Solver-v3, arXiv 2310.13268),
 here fitted to one model *and* one schedule of reuse, by least squares, with the policy's own noise.

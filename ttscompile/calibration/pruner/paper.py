@@ -6,21 +6,7 @@ with the plans that it makes, the rollout cache carried from call to call withou
 absolute error of the executed actions, and of the sample after every step, against the dense policy with the same
 noise.
 
-What differs from the authors' training, and why:
-
-- *The default.* Theirs is always a head. Here ``tts`` is the default, whose schedule is the same for every observation:
-  no head was nearer to the original at as many computed cells (``docs/evidence/ablation.md``).
-- *The head.* Theirs has a decoder layer. This one is of low rank, so that it costs little beside a sparse loop.
-- *The budget.* They add ``|reuse - target|`` to the loss. In the few hundred updates that there is time for, that
-  holds no budget. Here COMPUTE has a price, which is set in every update so that the calls of the batch keep the budget
-  on average: what such a term comes to where it is strong enough.
-- *The start.* The head of an artifact that was never calibrated, and a schedule of whole steps that computes more than
-  the budget has, and shrinks to it. From one that keeps the budget every first move of a single cell does harm, and
-  training does not get past that.
-- *What is kept.* The head at its best, on calls that it was not trained on; or the best of some schedules of whole
-  steps that keep the budget, if no head was better.
-- *The optimiser.* Adam with one size for each array of the head, as ``gates`` has it: a cell that hardly matters must
-  not move as far as one that does.
+``docs/evidence/ablation.md`` says what differs from the authors' training, and why.
 
 At the end the price is fixed, on calls that the head was not trained on: their mean and two standard errors more are
 within the budget. A single call may compute more; the notes say how many cells the largest computes. The schedule that
