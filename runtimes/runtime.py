@@ -101,9 +101,9 @@ class Runtime:
         if plan.otherwise is not None:
             self._opened_for(plan.otherwise)
         self._used = self._opened_for(plan)
-        # Its thread is there before the first call.
-        self._reading = any(one.cells is None or Source.ROLLOUT in one.cells for one in artifact.plans.values())
-        self._helper = Helper(HELPER) if any(one.pruned for one in artifact.plans.values()) else None
+        plans = artifact.plans.values()
+        self._reading = any(one.cells is None or Source.ROLLOUT in one.cells for one in plans)  # of earlier calls
+        self._helper = Helper(HELPER) if any(one.pruned for one in plans) else None  # there before the first call
         self._given = False  # whether a plan that is not the artifact's ever was
         self._written: BoolArray | None = None
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
@@ -192,7 +192,8 @@ class Runtime:
         self.require_streams(streams)
         if plan.otherwise is not None and self._chunk is None:
             plan = plan.otherwise
-        name, told = self._artifact.name_of(plan), self._artifact.told(plan)
+        name = self._artifact.name_of(plan)
+        told = name or self._artifact.told(plan)
         opened = self._opened_for(plan)
         view, backend = opened.view, opened.backend
         spec, manifest = view.manifest.spec, view.manifest
@@ -208,7 +209,7 @@ class Runtime:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
         settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
-        self._given |= name is None and (told is None or self._reading)  # of NAME@bf16 this variant may know no plan
+        self._given |= name is None and (told is None or self._reading)
         keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
         self._used = opened
         self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones

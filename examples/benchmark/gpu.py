@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,17 +24,14 @@ import large_smolvla
 import numpy as np
 import torch
 from networks import Network, compile_with_plans, plan_name, pusht_network, random_network
-from rounds import EAGER, TORCH_COMPILE
-from torch import nn
-from torch.utils._pytree import tree_map
+from rounds import EAGER, TORCH_COMPILE, eager_contestant, torch_compile_contestant
 
 import ttscompile
-from ttscompile.cli.contestants import network_contestant
+from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results_console, run, say, table
 from ttscompile.core.spec import ORIGINAL, Noise
+from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.eager import eager_policy
-from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.report.timing import Contestant, measure, plan_contestant
 from ttscompile.runtimes.random_calls import Observation, random_calls
@@ -42,7 +39,6 @@ from ttscompile.runtimes.random_calls import Observation, random_calls
 UNET = Path(__file__).parents[1] / "policies" / "unet" / "pusht_unet_ema_fp16.ckpt"
 COMPARED = 2
 """Observations that actions are compared on."""
-
 
 SMOLVLA = "smolvla"
 
@@ -70,13 +66,14 @@ NETWORKS: Mapping[str, tuple[Callable[[Path], Network], float]] = {
 
 @dataclass(frozen=True)
 class Row:
-    """What one contestant took, and how far its actions are off; None for a network of which no call was compared."""
+    """What a contestant took; how far its actions are off, and how many kernels it has; None where that is unknown."""
 
     network: str
     contestant: str
     median_ms: float
     quartiles_ms: tuple[float, float]
     off: float | None
+    kernels: int | None
     times_ms: tuple[float, ...]
 
 
@@ -103,48 +100,60 @@ def time_network(name: str, folder: Path, device: str, calls: int, say_that: Cal
         for plan in ("dense", sparse)
     }
     network.module.to(device)
-    entered = [network_contestant(EAGER, eager_policy(network.module, spec), spec, None)]
+    flops = load_artifact(directory).manifest.flops.dense
+    eager = eager_contestant(network, flops)
+    entered = [eager, _autocast(eager, device)]
     for label, plan in (("dense", "dense"), (f"{share:.0%} reused", sparse)):
-        for precision in ("fp32", "bf16"):
+        for precision in ("fp32", "bf16+blocks", "bf16"):
             policy = ttscompile.load(directory, "torch", device=device, plan=f"{plan}@{precision}")
             entered.append(plan_contestant(f"{label}, {precision}", policy, f"{plan}@{precision}", spec))
+    unfused = f"{share:.0%} reused, fp32, idle steps not fused"
+    entered.append(plan_contestant(unfused, _unfused(directory, sparse, device), sparse, spec))
     if name != SMOLVLA:  # of which a call takes seconds there
         one = ttscompile.load(directory, plan=sparse)
         entered.append(plan_contestant(f"{share:.0%} reused, fp32, one core", one, sparse, spec))
     off = {one.label: _off(one, calls_compared, expected[one.plan.partition("@")[0]]) for one in entered}
+    counted = {one.label: kernels(one, device) for one in entered}
     say_that("torch.compile")
     try:
-        entered.insert(1, _torch_compile(network))
-    except Exception as error:  # dynamo's and inductor's have no class of their own, and the others are worth a table
-        say_that(f"left out: {type(error).__name__}: {str(error)[:500]}")
+        entered.insert(1, torch_compile_contestant(network, flops, 1, "reduce-overhead"))
+    except RuntimeUnavailableError as error:
+        say_that(f"left out: {error}")
     say_that("timing")
     measured = measure(entered, calls, seed=0)
-    return [Row(network.name, m.label, m.median_ms, m.quartiles_ms, off.get(m.label), m.times_ms) for m in measured]
+    return [
+        Row(network.name, m.label, m.median_ms, m.quartiles_ms, off.get(m.label), counted.get(m.label), m.times_ms)
+        for m in measured
+    ]
 
 
-class _Cloned(nn.Module):
-    """A compiled module whose results outlive its next call, which a CUDA graph of torch's writes over."""
+def _autocast(one: Contestant, device: str) -> Contestant:
+    """Eager PyTorch with its products in bf16."""
 
-    def __init__(self, module: nn.Module) -> None:
-        super().__init__()
-        self.run: Any = torch.compile(module, fullgraph=True, dynamic=False, mode="reduce-overhead")
+    def call(obs: Observation, noise: Noise) -> object:
+        with torch.autocast(device, torch.bfloat16):
+            return one.call(obs, noise)
 
-    def forward(self, *given: Any) -> Any:
-        """What the module gives."""
-        return tree_map(torch.clone, self.run(*given))
+    return replace(one, label=f"{one.label}, bf16", call=call)
 
 
-def _torch_compile(network: Network) -> Contestant:
-    """The same loop over ``torch.compile``'s code, each evaluation of which is a CUDA graph (``reduce-overhead``)."""
-    torch.compiler.reset()
-    module: Any = network.module
-    if isinstance(module, EncodedDenoiser):
-        module = EncodedDenoiser(_Cloned(module.encoder), _Cloned(module.denoiser))
-    else:
-        module = torch.compile(module, fullgraph=True, dynamic=False, mode="reduce-overhead")
-    made = network_contestant(TORCH_COMPILE, eager_policy(module, network.spec), network.spec, None)
-    made.call(*random_calls(network.spec, 1, seed=0)[0])
-    return made
+def _unfused(directory: Path, plan: str, device: str) -> ttscompile.CompiledPolicy:
+    """A policy whose idle steps are kernels of torch's, as where there is no Triton."""
+    policy = ttscompile.load(directory, "torch", device=device, plan=plan)
+    backend: Any = policy._runtime.backend
+    if backend._parts.idle is not None:
+        backend._parts.idle.fused = None
+    return policy
+
+
+def kernels(one: Contestant, device: str) -> int | None:
+    """Kernels of a call of a contestant; None on the processor."""
+    if device == "cpu":
+        return None
+    obs, noise = random_calls(one.spec, 1, seed=0)[0]
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profiler:
+        one.call(obs, noise)
+    return sum(event.count for event in profiler.key_averages() if event.self_device_time_total)
 
 
 def _off(one: Contestant, calls: Sequence[tuple[Observation, Noise]], expected: Sequence[np.ndarray]) -> float:
@@ -159,13 +168,13 @@ def _off(one: Contestant, calls: Sequence[tuple[Observation, Noise]], expected: 
 
 def results_table(rows: Sequence[Row]) -> None:
     """Of one network: medians, quartiles, how many times faster than eager PyTorch and than torch.compile."""
-    made = table(rows[0].network, "ms", "quartiles", "eager / it", "torch.compile / it", "actions off")
+    made = table(rows[0].network, "ms", "quartiles", "eager / it", "torch.compile / it", "actions off", "kernels")
     own = {one.contestant: one.median_ms for one in rows}
     for row in rows:
         low, high = row.quartiles_ms
         factors = (f"{own[name] / row.median_ms:.1f}" if name in own else "" for name in (EAGER, TORCH_COMPILE))
-        off = "" if row.off is None else f"{row.off:.1e}"
-        made.add_row(row.contestant, f"{row.median_ms:.4g}", f"{low:.4g}..{high:.4g}", *factors, off)
+        rest = (*factors, "" if row.off is None else f"{row.off:.1e}", str(row.kernels or ""))
+        made.add_row(row.contestant, f"{row.median_ms:.4g}", f"{low:.4g}..{high:.4g}", *rest)
     results_console().print(made)
 
 

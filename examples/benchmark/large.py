@@ -23,6 +23,7 @@ import tempfile
 import time
 import timeit
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from torch import nn
 
 STEPS = 4
+
+WHOLE = ("smolvla", "evo1", "xvla")
+"""LeRobot's policies that are compiled whole, from what is saved of them."""
 
 MOST_NOTES = 8
 """Of a stage, that are printed."""
@@ -91,43 +95,27 @@ def convert(folder: Path, network: nn.Module, horizon: int) -> None:
         np.save(folder / "expected.npy", eager().numpy())
 
 
-def convert_smolvla(folder: Path) -> None:
-    """Save a SmolVLA of its real size, as lerobot does, and convert it."""
-    import large_smolvla
-
+def convert_whole(folder: Path, name: str) -> None:
+    """Save a policy of its real size, as lerobot does, and convert it."""
     import ttscompile
 
-    large_smolvla.save(folder / "smolvla")
+    directory, task = saved(folder, name)
     print(f"{peak():5.2f} GiB before compiling")
     stages = Stages()
-    ttscompile.convert(folder / "smolvla", folder / "compiled", precision="int8", explain=stages)
+    ttscompile.convert(directory, folder / "compiled", precision="int8", task=task, explain=stages)
     stages.end()
 
 
-def convert_evo1(folder: Path) -> None:
-    """Save an evo1 of its real size, as lerobot does, and convert it for one instruction."""
+def saved(folder: Path, name: str) -> tuple[Path, str | None]:
+    """Where a whole policy is saved, by which it is written unless it is there; and the instruction of evo1 alone."""
     import large_evo1
-
-    import ttscompile
-
-    directory = large_evo1.save(folder)
-    print(f"{peak():5.2f} GiB before compiling")
-    stages = Stages()
-    ttscompile.convert(directory, folder / "compiled", precision="int8", task=large_evo1.TASK, explain=stages)
-    stages.end()
-
-
-def convert_xvla(folder: Path) -> None:
-    """Save an xvla of its real size, as lerobot does, and convert it."""
+    import large_smolvla
     import large_xvla
 
-    import ttscompile
-
-    large_xvla.save(folder / "xvla")
-    print(f"{peak():5.2f} GiB before compiling")
-    stages = Stages()
-    ttscompile.convert(folder / "xvla", folder / "compiled", precision="int8", explain=stages)
-    stages.end()
+    directory = folder / name
+    if not directory.exists():
+        {"smolvla": large_smolvla.save, "evo1": large_evo1.save, "xvla": large_xvla.save}[name](directory)
+    return directory, large_evo1.TASK if name == "evo1" else None
 
 
 def convert_clip(folder: Path) -> None:
@@ -143,47 +131,20 @@ def convert_clip(folder: Path) -> None:
     stages.end()
 
 
-def run_smolvla(folder: Path, rounds: int) -> None:
-    """See ``large_calls``; two of ten steps are computed."""
+def run_whole(folder: Path, rounds: int, name: str) -> None:
+    """See ``large_calls``; two steps are computed. xvla's encoder has no tokens that could be reused."""
     import large_calls
-    import large_smolvla
-
-    from ttscompile.frontends import load_checkpoint_policy
-
-    module, spec = load_checkpoint_policy(folder / "smolvla")
-    large_calls.compare(
-        folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
-    )
-    large_calls.reusing(folder, spec, 2, rounds + 2)
-
-
-def run_evo1(folder: Path, rounds: int) -> None:
-    """See ``large_calls``; two of 32 steps are computed."""
-    import large_calls
-    import large_evo1
     import large_smolvla
 
     from ttscompile.frontends import load_checkpoint_policy
     from ttscompile.frontends.families import LoadOptions
 
-    module, spec = load_checkpoint_policy(folder / "evo1", options=LoadOptions(task=large_evo1.TASK))
-    large_calls.compare(
-        folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
-    )
-    large_calls.reusing(folder, spec, 2, rounds + 2)
-
-
-def run_xvla(folder: Path, rounds: int) -> None:
-    """See ``large_calls``; two of ten steps are computed."""
-    import large_calls
-    import large_smolvla
-
-    from ttscompile.frontends import load_checkpoint_policy
-
-    module, spec = load_checkpoint_policy(folder / "xvla")
-    large_calls.compare(
-        folder, "vision, prefix, loop", large_smolvla.eager(module, _vision(module), spec), spec, 2, rounds
-    )
+    directory, task = saved(folder, name)
+    module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
+    original = large_smolvla.eager(module, _vision(module), spec)
+    large_calls.compare(folder, "vision, prefix, loop", original, spec, 2, rounds)
+    if name != "xvla":
+        large_calls.reusing(folder, spec, 2, rounds + 2)
 
 
 def _vision(module: nn.Module) -> nn.Module:
@@ -251,8 +212,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
     options = parser.parse_args()
-    policies = {"smolvla": (convert_smolvla, run_smolvla), "evo1": (convert_evo1, run_evo1)}
-    policies |= {"xvla": (convert_xvla, run_xvla), "clip": (convert_clip, run_clip)}
+    policies = {name: (partial(convert_whole, name=name), partial(run_whole, name=name)) for name in WHOLE}
+    policies["clip"] = partial(convert_clip), partial(run_clip)
     asked = next((own for name, own in policies.items() if getattr(options, name)), None)
     if asked is not None and options.only == "convert":
         asked[0](options.output)

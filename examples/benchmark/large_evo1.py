@@ -38,9 +38,9 @@ _STEPS = {"chunk_size": 50, "num_inference_timesteps": 32}
 _MARKS = {"<img>": 151665, "</img>": 151666, "<IMG_CONTEXT>": 151667}
 
 
-def save(folder: Path) -> Path:
-    """What lerobot's ``save_pretrained`` writes of an evo1 with its default configuration. Returns the directory."""
-    directory, model = folder / "evo1", folder / "InternVL3-1B-hf"
+def save(directory: Path) -> None:
+    """What lerobot's ``save_pretrained`` writes of an evo1 with its default configuration."""
+    model = directory.parent / "InternVL3-1B-hf"
     for each in (directory, model):
         each.mkdir(parents=True, exist_ok=True)
     write_json(model / "config.json", MODEL)
@@ -68,7 +68,6 @@ def save(folder: Path) -> Path:
     draw = torch.Generator().manual_seed(0)
     weights = {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()}
     save_file(weights, directory / "model.safetensors")
-    return directory
 
 
 def _weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from networks import Network
+from torch import nn
+from torch.utils._pytree import tree_map
 
 from ttscompile.cli.contestants import network_contestant
 from ttscompile.errors import RuntimeUnavailableError
 from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.report.timing import WARM_UP, Contestant, Measurement, measure
 from ttscompile.runtimes.random_calls import random_calls
 
@@ -39,19 +42,24 @@ def eager_contestant(network: Network, dense_flops: float) -> Contestant:
     return network_contestant(EAGER, eager_policy(network.module, network.spec), network.spec, dense_flops)
 
 
-def torch_compile_contestant(network: Network, dense_flops: float, threads: int) -> Contestant:
+def torch_compile_contestant(network: Network, dense_flops: float, threads: int, mode: str | None = None) -> Contestant:
     """The same loop over ``torch.compile``'s code, which is made anew for each number of threads.
 
     Args:
-        network: whose module is compiled.
+        network: whose module is compiled, encoder and denoiser apart where it has both.
         dense_flops: of a call.
         threads: what it is compiled for now, to see whether that can be done.
+        mode: of torch.compile; ``reduce-overhead`` makes a CUDA graph of each evaluation.
 
     Raises:
         RuntimeUnavailableError: it cannot be had here; inductor needs a C++ compiler.
     """
     torch.compiler.reset()  # it gives up on a function that it compiled for too many modules
-    module: Any = torch.compile(network.module, fullgraph=True, dynamic=False)
+    module: Any = network.module
+    if isinstance(module, EncodedDenoiser):
+        module = EncodedDenoiser(_Cloned(module.encoder, mode), _Cloned(module.denoiser, mode))
+    else:
+        module = torch.compile(module, fullgraph=True, dynamic=False, mode=mode)
     contestant = network_contestant(TORCH_COMPILE, eager_policy(module, network.spec), network.spec, dense_flops)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -66,6 +74,18 @@ def torch_compile_contestant(network: Network, dense_flops: float, threads: int)
     finally:
         torch.set_num_threads(before)
     return contestant
+
+
+class _Cloned(nn.Module):
+    """A compiled module whose results outlive its next call, which a CUDA graph of torch's writes over."""
+
+    def __init__(self, module: nn.Module, mode: str | None) -> None:
+        super().__init__()
+        self.run: Any = torch.compile(module, fullgraph=True, dynamic=False, mode=mode)
+
+    def forward(self, *given: Any) -> Any:
+        """What the module gives."""
+        return tree_map(torch.clone, self.run(*given))
 
 
 def measure_in_passes(

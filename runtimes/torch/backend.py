@@ -246,9 +246,8 @@ def cuda_graphs(device: torch.device) -> Capture:
             line()
         if not alive:
             own[:] = torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        pool, stream = own
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=pool, stream=stream):
+        with torch.cuda.graph(graph, pool=own[0], stream=own[1]):
             line()
         alive.add(graph)
         replay: Line = graph.replay
