@@ -6,6 +6,9 @@ what was expected, what was found, and what to do about it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class TtscompileError(Exception):
     """Base of all errors of this package; the CLI prints its message and exits with status 2."""
@@ -122,3 +125,20 @@ class ProtocolError(ExecutorError):
 def first_line(error: BaseException) -> str:
     """What an error of another library says, on one line; its class where it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+@contextmanager
+def needing(what: str, extra: str, otherwise: str = "") -> Iterator[None]:
+    """Within the block, which imports, a package that is not installed is told with the extra that installs it.
+
+    Args:
+        what: is in need of it, for the message; ``otherwise`` says after the command what else can be done.
+
+    Raises:
+        RuntimeUnavailableError: see above.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        told = f"{what} needs {error.name}, which is not installed"
+        raise RuntimeUnavailableError(f"{told}. Run: pip install 'ttscompile[{extra}]'{otherwise}.") from error

@@ -11,12 +11,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self
 from uuid import uuid4
 
 from .artifact.load import Artifact, load_artifact
-from .errors import CalibrationError, ClusterError, RuntimeUnavailableError, TtscompileError, first_line
+from .errors import CalibrationError, ClusterError, TtscompileError, first_line, needing
 
 LOCAL = "local"
 """In the place of an address: a cluster of this machine's cores, for as long as the command runs."""
@@ -85,12 +84,8 @@ class RayPool:
     """
 
     def __init__(self, address: str, cores: int | None = None) -> None:
-        try:
+        with needing("--ray", "ray"):
             import ray
-        except ModuleNotFoundError as error:
-            raise RuntimeUnavailableError(
-                "--ray needs 'ray', which is not installed. Run: pip install 'ttscompile[ray]'."
-            ) from error
         self._ray = ray
         try:
             if address == LOCAL:
@@ -133,9 +128,7 @@ class RayPool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ray.shutdown()
 
 

@@ -107,14 +107,8 @@ class Feasibility:
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        return asdict(self) | {
-            "needed": self.needed,
-            "play": self.play,
-            "predicted": self.predicted,
-            "max_latency": self.max_latency,
-            "max_policy_hz": self.max_policy_hz,
-            "feasible": self.feasible,
-        }
+        derived = ("needed", "play", "predicted", "max_latency", "max_policy_hz", "feasible")
+        return asdict(self) | {name: getattr(self, name) for name in derived}
 
 
 def fast_enough(judged: Mapping[str, Feasibility], refuse: bool) -> tuple[str, ...]:

@@ -112,7 +112,6 @@ class Schedule:
         given out in their place would stay, and what went wrong is what a policy corrects with its first ones.
 
         Args:
-            new: the chunk.
             meant: its rows as they were before the guard clipped them.
             late: rows that are overdue.
             steps: rows to make up for it in, or more if the guard's bounds leave no room.

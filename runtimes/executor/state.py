@@ -33,7 +33,6 @@ class Job:
         epoch: number of resets before it.
         frames: of the window, oldest first.
         observed: time of the newest.
-        plan: to run.
         started: when it was handed to the policy.
         deadline: when the scheduled actions run out, but for those in reserve; None if there were none, and nothing can
             be missed.
@@ -275,10 +274,7 @@ class ExecutorState:
         """Take the chunk of a call.
 
         Args:
-            job: the call.
             actions: ``[horizon + reserve, Da]``, the playable part of the prediction.
-            now: when it was done.
-            far: see ``CallReport``.
 
         Returns:
             What became of it: ``scheduled``, ``discarded``, ``refused`` or ``overdue``.

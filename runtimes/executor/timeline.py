@@ -180,7 +180,6 @@ def average(old: Timeline, new: Timeline, coefficient: float) -> Timeline:
 
     Args:
         old: means so far, of ticks that ``new`` has.
-        new: the chunk.
         coefficient: 0 for a plain mean; the larger, the more the oldest prediction counts.
     """
     n, rows, chunks, clipped = old.chunks, new.rows.copy(), new.chunks.copy(), new.clipped.copy()

@@ -14,7 +14,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from ttscompile.errors import ArtifactChangedError, ClusterError, RuntimeUnavailableError, TtscompileError, first_line
+from ttscompile.errors import ArtifactChangedError, ClusterError, TtscompileError, first_line, needing
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.load import load
 
@@ -133,12 +133,9 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
         RuntimeUnavailableError: Ray is not installed.
         ClusterError: nothing answers at the address, or the copies do not start.
     """
-    try:
+    with needing("a fleet", "ray,serve"):
         import ray
         from ray import serve
-    except ModuleNotFoundError as error:
-        problem = f"a fleet needs {error.name}, which is not installed"
-        raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[ray,serve]'.") from error
     name = f"ttscompile-{uuid4().hex[:12]}"  # a cluster may have several fleets
     given: dict[str, Any] = {"num_cpus": settings.copies * settings.threads} if address == LOCAL else {}
     try:

@@ -34,7 +34,6 @@ class OpenPiServer(FleetServer):
     """Serves one policy to openpi's clients. It is the caller's, and computes one request at a time, each an episode.
 
     Args:
-        artifact: of the policy.
         policy: all requests are computed with the plan that it was loaded with.
         limits: what clients may do; None for the defaults, with an hour between two requests.
         lock: who may come in; None lets every program of this machine in, and nobody else.

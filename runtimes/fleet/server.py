@@ -86,7 +86,6 @@ class FleetServer(Listener):
 
     Args:
         artifact: loaded and checked; only what it says of itself is looked at.
-        copies: they compute.
         plan: of requests that name none; None for the artifact's default.
         waiting: requests that may be under way; further ones are refused.
         limits: what clients may do; None for the defaults.

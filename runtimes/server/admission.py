@@ -51,7 +51,6 @@ class Admission:
     """Counts and limits; used by the server's event loop alone.
 
     Args:
-        limits: what clients may do.
         clock: seconds that never go back.
     """
 

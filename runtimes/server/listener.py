@@ -21,7 +21,7 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, cast
 
 from ttscompile.core.coercion import integer
-from ttscompile.errors import ExecutorError, RuntimeUnavailableError, TtscompileError
+from ttscompile.errors import ExecutorError, TtscompileError, needing
 
 from .admission import Admission, AdmittingSocket, Pace
 from .limits import ServerLimits
@@ -115,14 +115,11 @@ class Listener(ABC):
         if not host:  # asyncio would listen on every address of the machine
             raise ExecutorError("cannot listen: host is empty. Give 127.0.0.1, or 0.0.0.0 for every address.")
         port = integer(port, "port", ExecutorError, 0, 65535)
-        try:
+        with needing("the server", "serve"):
             self.greeting()  # may need a package, too
             from websockets.asyncio.server import serve
 
             from .connection import CountedConnection
-        except ModuleNotFoundError as error:
-            problem = f"the server needs {error.name}, which is not installed"
-            raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[serve]'.") from error
         quiet = logging.getLogger("ttscompile.serve.socket")
         quiet.setLevel(logging.CRITICAL)  # what clients do wrong is told to them
         entrances = await self._listen(host, port)

@@ -32,7 +32,7 @@ def test_the_folder_lives_as_long_as_the_artifact(written: Path) -> None:
     artifact = load_artifact(packed(written))
     folder = artifact.path
     gc.collect()
-    assert artifact.onnx_path("stem").is_file()
+    assert (artifact.path / artifact.manifest.pieces["stem"].file).is_file()
     del artifact
     gc.collect()
     assert not folder.exists()

@@ -28,7 +28,9 @@ ROOT = Path(__file__).resolve().parents[2]
 def logits(path: Path) -> np.ndarray:
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(load_artifact(path).onnx_path("pruner"), providers=["CPUExecutionProvider"])
+    artifact = load_artifact(path)
+    model = artifact.path / artifact.manifest.pieces["pruner"].file
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     return np.asarray(session.run(None, {"memory": np.ones((2, 1, 16), np.float32)})[0])
 
 

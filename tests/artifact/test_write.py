@@ -76,7 +76,8 @@ def test_nothing_of_the_machine_is_written(written: Path) -> None:
 def run(artifact: Artifact, piece: str, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(artifact.onnx_path(piece), providers=["CPUExecutionProvider"])
+    model = artifact.path / artifact.manifest.pieces[piece].file
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     return [np.asarray(output) for output in session.run(None, inputs)]
 
 
@@ -104,7 +105,7 @@ def test_onnxruntime_reads_the_weights_from_the_safetensors_files(written: Path,
 
 def test_the_models_hold_references_and_not_the_weights(written: Path) -> None:
     artifact = load_artifact(written)
-    model = onnx.load(artifact.onnx_path("pruner"), load_external_data=False)
+    model = onnx.load(artifact.path / artifact.manifest.pieces["pruner"].file, load_external_data=False)
     tensors = {tensor.name: tensor for tensor in model.graph.initializer}
     where = {entry.key: entry.value for entry in tensors["pruner.weight"].external_data}
     assert where["location"] == artifact.manifest.stores.pruner

@@ -14,8 +14,8 @@ from click.testing import CliRunner, Result
 import ttscompile
 from tests.calibration import policies
 from tests.plans import store_schedules
-from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.write import choose_default
 from ttscompile.cli import main
 from ttscompile.cli.bench import choosable, choose_again
 from ttscompile.core.lattice import uniform_plan

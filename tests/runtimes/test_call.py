@@ -264,7 +264,7 @@ def test_single_blocks_of_an_artifact_that_has_changed_since_are_refused(own_art
     obs, noise = random_inputs(own_artifact, np.random.default_rng(0), 1)
     partial = uniform_plan(5, 5, 3)
     partial[4, 2] = Source.COMPUTE
-    path = own_artifact.onnx_path("block_02")
+    path = own_artifact.path / own_artifact.manifest.pieces["block_02"].file
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     with pytest.raises(ArtifactError, match=r"since it was loaded \(block_02\.onnx\)"):
         runtime.predict(obs, noise, Plan(cells=partial))

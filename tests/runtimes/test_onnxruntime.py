@@ -310,7 +310,7 @@ except RuntimeUnavailableError as error:
 def test_a_graph_that_onnxruntime_refuses_is_an_artifact_error(
     own_artifact: Artifact, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    path = own_artifact.onnx_path("dense_step")
+    path = own_artifact.path / own_artifact.manifest.pieces["dense_step"].file
     path.write_bytes(b"")
     edit_manifest(path.parent)
     with pytest.raises(ArtifactError, match=rf"^{path}: onnxruntime .* cannot load"):
@@ -352,7 +352,8 @@ one = open_runtime(artifact, threads=1)
 print(count() - before)
 several = [open_runtime(artifact, threads=n) for n in (3, 2, 1)]
 print(count() - before > 0)
-onnxruntime.InferenceSession(str(artifact.onnx_path("stem")))  # other code may have any session it likes
+stem = artifact.path / artifact.manifest.pieces["stem"].file
+onnxruntime.InferenceSession(str(stem))  # other code may have any session it likes
 """
     assert python(THREADS.format(path=str(toy_artifact.path), body=body)).split() == ["0", "True"]
 

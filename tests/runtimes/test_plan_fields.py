@@ -44,7 +44,8 @@ def in_eight_bits(artifact: Artifact, weights: Mapping[str, np.ndarray]) -> dict
     known, made = {**artifact.weights, **weights}, dict[str, np.ndarray]()
     record = artifact.manifest.precision
     for piece in filter(is_block, () if record is None else record.models):
-        made |= quantize_model(onnx.load(artifact.onnx_path(piece), load_external_data=False), known)[1]
+        path = artifact.path / artifact.manifest.pieces[piece].file
+        made |= quantize_model(onnx.load(path, load_external_data=False), known)[1]
     return made
 
 

@@ -32,9 +32,6 @@ _AGAIN = "Zip the artifact's directory again, or give the directory itself."
 class Unpacked:
     """A temporary folder that goes when this object does, but for a copy of this object in a forked process.
 
-    Attributes:
-        path: the folder.
-
     Raises:
         OSError: there is no place for temporary files.
     """

@@ -30,7 +30,6 @@ class Place:
     """Where the value of a constant lies.
 
     Attributes:
-        value: the array itself.
         file: name of the safetensors file, in the folder of the model.
         offset: of its first byte.
         length: in bytes.
@@ -47,10 +46,8 @@ class LoweredPieces:
     """What ``lower_precision`` made of blocks and prologue.
 
     Attributes:
-        name: of the precision.
         models: by piece, those that hold all blocks among them.
         weights: the constants that these models have and the program has not.
-        asked: see ``PrecisionRecord``.
     """
 
     name: str
@@ -71,7 +68,6 @@ def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: b
     Args:
         model: from ``lower``; initializers that are constants of the program hold no data.
         places: by name of the constant.
-        piece: name of the model, for messages.
         again: the model is bound already; the constants in ``places`` get new values.
 
     Raises:
@@ -106,13 +102,7 @@ def store_pieces(
     """Write pieces beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
 
     Args:
-        folder: of the artifact.
-        lowered: what to write.
-        pieces: of the artifact.
         places: of the program's constants, which these models read too.
-
-    Raises:
-        ArtifactError: a model that does not fit its piece, or a constant that has the name of another.
     """
     where = f"precision {lowered.name!r}"
     if taken := sorted(set(lowered.weights) & set(places)):

@@ -37,11 +37,7 @@ def envelope_arrays(envelope: Envelope | None) -> dict[str, npt.NDArray[Any]]:
 
 
 def read_envelope(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> Envelope | None:
-    """The envelope among some arrays; None if there is none.
-
-    Raises:
-        ArtifactError: one with too few or too many fields, or that does not fit the policy.
-    """
+    """The envelope among some arrays; None if there is none."""
     parts = {name.removeprefix(ENVELOPE): array for name, array in stored.items() if name.startswith(ENVELOPE)}
     if not parts:
         return None
@@ -63,11 +59,6 @@ def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest,
 
     Args:
         stored: arrays; those of other names are left alone.
-        manifest: of the artifact.
-        where: for messages.
-
-    Raises:
-        ArtifactError: a correction of no plan, with too few or too many fields, or that does not fit the policy.
     """
     parts = {name.removeprefix(PREFIX): array for name, array in stored.items() if name.startswith(PREFIX)}
     wanted = dict[str, tuple[str, ...]]()

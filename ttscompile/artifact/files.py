@@ -59,11 +59,7 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """The content of a file of at most so many bytes; of a larger one no more is read, and the last byte is too many.
-
-    Raises:
-        ArtifactError: see ``opened``.
-    """
+    """The content of a file of at most so many bytes; of a larger one no more is read, and the last is too many."""
     with opened(path) as file:
         return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)  # Python allocates what is asked for
 
@@ -233,7 +229,6 @@ class Folder:
     stamp as well: exchanged and exchanged back, it has another time of change, too.
 
     Args:
-        path: of the directory.
         shown: what messages name; the zip file that was unpacked there.
 
     Attributes:

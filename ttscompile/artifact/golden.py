@@ -27,7 +27,6 @@ from .strict_json import REMEDY
 
 if TYPE_CHECKING:
     from .load import Artifact
-    from .manifest import Manifest
 
 Array = npt.NDArray[Any]
 
@@ -215,11 +214,7 @@ def _wanted_of(
 
 
 def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]:
-    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none.
-
-    Raises:
-        ArtifactError: records that do not fit.
-    """
+    """Records of the plans of an artifact by name, of B ``streams`` as its ``Golden`` has; empty if it has none."""
     manifest = artifact.manifest
     if manifest.stores.golden_plans is None:
         return {}
@@ -235,8 +230,8 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
         wanted[f"{name}/path"] = "float32", (2, steps, streams, DIGITS)
         wanted[f"{name}/sample"] = "float32", (2, streams, *manifest.spec.sample)
     tensors.check_arrays("array", arrays, wanted, f"{artifact.path}: golden record of plans")
-    fields = ("plan", "path", "sample")
-    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in fields}) for name in sorted(names)}
+    own = [each.name for each in fields(GoldenPlan)]
+    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in own}) for name in sorted(names)}
 
 
 def is_sparse(plan: PlanRecord) -> bool:
@@ -275,7 +270,6 @@ def project(array: Array, axis: int | None) -> FloatArray:
     """Random projections of each stream, float32 ``[B, DIGITS]``, whose norm is about the stream's.
 
     Args:
-        array: of any shape.
         axis: of the streams; None for one stream.
     """
     rows = array[None] if axis is None else np.moveaxis(array, axis, 0)

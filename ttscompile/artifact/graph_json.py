@@ -32,11 +32,7 @@ _UNUSUAL_FLOATS = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
 def graph_to_json(graph: Graph) -> dict[str, Any]:
-    """The JSON form of a graph: dictionaries, lists, strings and finite numbers only.
-
-    Raises:
-        ArtifactError: an argument that has none; names the node.
-    """
+    """The JSON form of a graph: dictionaries, lists, strings and finite numbers only."""
     return {
         "inputs": [{"name": n, "type": _type_to_json(t)} for n, t in graph.inputs.items()],
         "constants": [{"name": n, "type": _type_to_json(t)} for n, t in graph.constants.items()],

@@ -96,10 +96,6 @@ class Artifact:
                     raise self._folder.changed([name]) from error
             yield
 
-    def onnx_path(self, piece: str) -> Path:
-        """Where the model of a piece in fp32 is, for other programs; what is there by then was not checked."""
-        return self.path / self.manifest.pieces[piece].file
-
     @property
     def default(self) -> Plan:
         """The plan that is taken when none is given."""
@@ -148,11 +144,7 @@ class Artifact:
 
     @cached_property
     def graphs(self) -> Mapping[str, Graph]:
-        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``.
-
-        Raises:
-            ArtifactError: ``program.json`` is not valid, or asks for a constant that the artifact lacks.
-        """
+        """Graphs of all pieces: ``condition``, ``step``, ``pruner``, ``stem``, ``block_00``..., ``tail``."""
         graphs, own = {}, {names.of_loop(names.PRUNER, loop): one for loop, one in self.loop_pruners.items()}
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)

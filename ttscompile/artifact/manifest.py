@@ -72,7 +72,6 @@ class PieceRecord:
     """One ONNX graph.
 
     Attributes:
-        file: its name in the artifact.
         inputs: names of all its inputs, in order.
         stream: the input that carries the sample (``stem``) or the residual stream (blocks, ``advance``); None for the
             pieces outside the loop.
@@ -189,7 +188,6 @@ class Stores:
     Attributes:
         program: graphs of all pieces.
         weights: constants of all pieces but the pruner's, and tables.
-        pruner: its constants.
         plans: schedules and corrections.
         golden: what the original network answered (``artifact.golden``).
         golden_plans: what the reference runtime made of the plans when they were calibrated.
@@ -274,8 +272,6 @@ class Manifest:
     """The manifest.
 
     Attributes:
-        schema_version: of this format.
-        ttscompile_version: that wrote the artifact.
         identity: sha256 of what the artifact computes; independent of paths, time and calibration record.
         model_identity: the same without plans and pruner weights: what a calibration belongs to.
         spec: the policy beside its network.
@@ -285,12 +281,10 @@ class Manifest:
             ``pixels_00`` and ``tokens_00`` of each frame piece in ``tokens``.
         contexts: binding and type of every context.
         features: condition values that the pruner reads, and corrections.
-        flops: see ``FlopsRecord``.
         plans: beside ``dense``, by name.
         default_plan: ``dense`` or a name in ``plans``.
         calibration: record of the calibration, JSON (``codec.check_record``); None before any.
         stores: names of the files that are not ONNX.
-        requires: what the ONNX graphs need.
         files: every file but the manifest.
         precision: models in another precision than fp32, which plans may take; None if there are none.
         loop_pruners: by further loop with a pruner of its own, name of the file with its constants.

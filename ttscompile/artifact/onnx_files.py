@@ -11,7 +11,6 @@ Source: the format of messages, https://protobuf.dev/programming-guides/encoding
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ArtifactError
@@ -53,19 +52,12 @@ _FOREIGN = {("model", 20), ("model", 25), ("node", 10)}
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
-@dataclass
-class _Left:
-    """How many fields may still be read."""
-
-    fields: int = MAX_FIELDS
-
-
 def check_models(directory: Path, names: Iterable[str], files: Mapping[str, FileRecord]) -> None:
     """Raise ArtifactError unless models run what ``convert`` writes, and all weights are in them or in these files.
 
     A model runs operators of the standard that surely end, and those of ``INTEGER``. The files were checked.
     """
-    left, names = _Left(), sorted(names)
+    left, names = iter(range(MAX_FIELDS)), sorted(names)  # of the fields that may still be read
     if (total := sum(files[name].bytes for name in names)) > MAX_BYTES:
         raise ArtifactError(f"{directory}: expected ONNX models of {MAX_BYTES} bytes at most; found {total}. {REMEDY}")
     for path in (directory / name for name in names):
@@ -83,7 +75,9 @@ def check_models(directory: Path, names: Iterable[str], files: Mapping[str, File
             raise ArtifactError(f"{path}: expected an ONNX model; found {found}. {REMEDY}") from error
 
 
-def _places(message: memoryview, kind: str, depth: int, left: _Left, scanned: bool = False) -> Iterator[dict[str, str]]:
+def _places(
+    message: memoryview, kind: str, depth: int, left: Iterator[int], scanned: bool = False
+) -> Iterator[dict[str, str]]:
     """The entries of ``external_data`` of each tensor below a message that has not its data itself."""
     if depth > MAX_DEPTH:
         raise ValueError("messages too deep in each other")
@@ -126,12 +120,11 @@ def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:
     return int(offset) + int(length) <= files[location].bytes
 
 
-def _read(message: memoryview, left: _Left) -> Iterator[tuple[int, memoryview | None]]:
+def _read(message: memoryview, left: Iterator[int]) -> Iterator[tuple[int, memoryview | None]]:
     """Number and content of each field; None for numbers."""
     position, end = 0, len(message)
     while position < end:
-        left.fields -= 1
-        if left.fields < 0:
+        if next(left, None) is None:
             raise ValueError(f"more than {MAX_FIELDS:,} fields in the models of one artifact")
         key, position = _varint(message, position)
         number, wire = key >> 3, key & 7

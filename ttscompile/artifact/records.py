@@ -92,13 +92,9 @@ def piece_records(
     """One record an ONNX model.
 
     Args:
-        program: in its pieces.
         models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
             ``dense_step``, and perhaps ``idle`` and ``layers``.
         files: file name of each model.
-
-    Raises:
-        ArtifactError: models and pieces do not have the same names, inputs or outputs.
     """
     optional = {names.IDLE, *(names.of_loop(names.ADVANCE, loop) for loop in program.spec.loops)}
     expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}
@@ -132,7 +128,6 @@ def plan_records(manifest: Manifest, plans: Mapping[str, Plan], record: Mapping[
     """Records of plans by name, ``dense`` left out; see ``write.update_plans``.
 
     Raises:
-        ArtifactError: names that cannot be, fields that name what the artifact lacks, or sparsities that are no shares.
         IllegalPlanError: cells that do not fit the policy.
     """
     made = dict[str, PlanRecord]()

@@ -27,7 +27,6 @@ class BlockWeights:
     """Constants of residual blocks that a plan has in place of the original's.
 
     Attributes:
-        weights: by name.
         precision: what the artifact's other precision makes of them, by name; empty where it has none.
     """
 
@@ -101,7 +100,6 @@ def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockW
     """Write weights of blocks, in files that nothing has yet; the manifest with their record.
 
     Raises:
-        ArtifactError: a weight that is no constant of the artifact, or is one of another type.
         OSError: they cannot be written.
     """
     files = dict(manifest.files)

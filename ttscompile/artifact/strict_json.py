@@ -27,11 +27,7 @@ class Value:
     path: str
 
     def fail(self, expected: str) -> NoReturn:
-        """Raise for this value.
-
-        Raises:
-            ArtifactError: always.
-        """
+        """Raise for this value."""
         raise ArtifactError(f"{self.path}: expected {expected}; found {_shorten(self.data)}. {REMEDY}")
 
     def keys(self, *names: str) -> dict[str, Value]:
@@ -93,13 +89,8 @@ def parse(content: bytes, where: str, limit: int = MAX_BYTES, values: int = MAX_
     """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
 
     Args:
-        content: the document.
-        where: name of the file, for messages.
         limit: largest accepted size in bytes.
         values: largest accepted number of values.
-
-    Raises:
-        ArtifactError: not such a document.
     """
     try:
         return Value(parse_json(content, limit, values=values, shown=True), where)

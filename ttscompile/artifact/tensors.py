@@ -55,8 +55,6 @@ class Entry:
     """Where one tensor lies.
 
     Attributes:
-        dtype: of its elements.
-        shape: of the tensor.
         offset: of its first byte, from the start of the file.
         length: in bytes.
     """
@@ -136,7 +134,6 @@ def read(path: Path) -> Mapping[str, Array]:
         Read-only arrays. Of a file of ``MAPPED`` bytes or more they are views: nothing is read before it is used.
 
     Raises:
-        ArtifactError: see ``read_header``.
         ArtifactChangedError: the file has become shorter meanwhile.
     """
     with opened(path) as file:
@@ -174,20 +171,12 @@ def check_arrays(
 
 
 def serialize(arrays: Mapping[str, Array]) -> bytes:
-    """The bytes of a safetensors file, the same whatever the order of the arrays.
-
-    Raises:
-        ArtifactError: an array of a dtype that the format or the reader lacks.
-    """
+    """The bytes of a safetensors file, the same whatever the order of the arrays."""
     return b"".join(_chunks(arrays))
 
 
 def write(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write a new safetensors file, one array after the other: all of them together may be half of the memory.
-
-    Raises:
-        ArtifactError: see ``serialize``.
-    """
+    """Write a new safetensors file, one array after the other: all of them together may be half of the memory."""
     write_synced(path, _chunks(arrays))
 
 

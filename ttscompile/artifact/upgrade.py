@@ -22,13 +22,9 @@ def upgraded(document: Mapping[str, Any], where: str) -> dict[str, Any]:
 
     Args:
         document: the manifest of schema 10, without its checksum, which was right.
-        where: for messages.
 
     Returns:
         A manifest of schema 11, whose identities are those of before, and not those of what it describes.
-
-    Raises:
-        ArtifactError: it is no manifest of schema 10.
     """
     try:
         return _upgraded(document)

@@ -91,7 +91,6 @@ class View:
         """Name of the ONNX file of a piece, in its precision and with its weights.
 
         Args:
-            piece: its name.
             first_step: of step 0, whose blocks have the original's weights.
         """
         manifest = self.artifact.manifest

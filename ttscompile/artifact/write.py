@@ -118,7 +118,6 @@ def update_plans(
     are gone. To keep what is there, pass ``artifact.plans``.
 
     Args:
-        path: the artifact's directory.
         plans: by name; ``dense`` may be among them, and is as it was.
         default_plan: what a call has that is given no plan.
         record: what was done to get here, JSON; ``record["plans"]`` has ``sparsity`` and ``flops_sparsity`` of plans
@@ -181,6 +180,35 @@ def update_plans(
             ) from error
         finally:
             _remove_stale(directory)
+    return manifest
+
+
+def choose_default(
+    path: str | os.PathLike[str],
+    name: str,
+    record: Mapping[str, Any],
+    precision: Mapping[str, str] | None,
+    seen: Artifact,
+) -> Manifest:
+    """Make a plan that is there the default.
+
+    Args:
+        precision: that the plan has from now on; None leaves it.
+        seen: the artifact as it was looked at; another one that has taken its place is refused.
+    """
+    directory = require_unzipped(path)
+    with locked(directory):
+        manifest = read_manifest(directory)
+        if manifest.identity != seen.manifest.identity:
+            raise ArtifactError(f"{directory}: it was replaced meanwhile, and was not changed. Try again.")
+        own = manifest.plans[name]
+        plans = {**manifest.plans, name: own if precision is None else replace(own, precision=precision)}
+        told = records.calibration_record(record)
+        manifest, content = finished(replace(manifest, plans=plans, default_plan=name, calibration=told))
+        try:
+            files.replace_file(directory / MANIFEST, content)
+        except OSError as error:
+            raise ArtifactError(f"{directory}: cannot be updated: {error}. It is as it was.") from error
     return manifest
 
 

@@ -45,11 +45,7 @@ def require_limits(validation_fraction: float, max_minutes: float) -> None:
 
 
 def require_alone(learn: Sequence[str], *budgets: float | None) -> None:
-    """Raise where loops are learned, and something that they cannot keep is asked for.
-
-    Raises:
-        CalibrationError: a schedule too, or a budget in cells.
-    """
+    """Raise where loops are learned, and something that they cannot keep is asked for."""
     if "schedule" in learn:
         raise CalibrationError("learn: expected a schedule or loops; found both. Leave one of them out.")
     if any(one is not None for one in budgets):
@@ -64,7 +60,6 @@ def require_directory(path: Path) -> None:
 
     Raises:
         ArtifactError: it is none at all.
-        CalibrationError: it is zipped, or nothing can be written there.
     """
     if not path.is_dir():
         load_artifact(path)

@@ -104,8 +104,6 @@ def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
     """Computed cells of a goal that can be worked out: ``target_sparsity`` or ``target_flops``.
 
     Args:
-        goal: one of the two.
-        manifest: the manifest of the artifact.
         pruned: whether the pruner may run.
 
     Raises:

@@ -60,7 +60,6 @@ def load_episodes(
     """The recorded episodes, as the policy observes them; see ``load_trajectories``.
 
     Raises:
-        CalibrationError: there is only one.
         TrajectoryError: the recordings do not fit the policy.
     """
     steps = spec.chunk.stop - spec.chunk.start

@@ -30,7 +30,6 @@ class Frontier:
             ``Request.farthest``; ``on_frontier`` whether no other is faster and nearer; ``kept`` whether the artifact
             gets it.
         plans: that the artifact gets, by name; ``schedule`` is the default.
-        scores: of these, by name.
     """
 
     tried: tuple[dict[str, Any], ...]

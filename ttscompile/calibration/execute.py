@@ -170,16 +170,11 @@ class Executor:
 
 
 class State:
-    """Caches of all streams; what step 0 has to write is there after it, since it is dense.
-
-    Attributes:
-        forward: by group.
-        timestep: by block.
-    """
+    """Caches of all streams; what step 0 has to write is there after it, since it is dense."""
 
     def __init__(self) -> None:
-        self.forward: dict[int, Tensor] = {}
-        self.timestep: dict[int, Tensor] = {}
+        self.forward: dict[int, Tensor] = {}  # by group
+        self.timestep: dict[int, Tensor] = {}  # by block
 
     def copy(self) -> State:
         """Another one with the same residuals; what is written to one of the two is not written to the other."""

@@ -25,8 +25,6 @@ class Kept:
     Attributes:
         trials: of the artifact with all that is kept.
         judged: the plans that these scores are of, by name.
-        weights: of blocks, that came with them.
-        starts: loops, that came with them.
         pruner: constants, and the loop whose pruner has them; None where they stay.
         refused: why plans are left out, by name.
         learned: whether any proposal but those ``beside`` was kept.

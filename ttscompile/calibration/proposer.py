@@ -78,17 +78,14 @@ class Request:
     """What was asked for, as far as proposers read it.
 
     Attributes:
-        goal: the budget.
         strategy: how schedules are found; a name of ``strategies``.
         correct: whether a correction is fitted to what a strategy finds that fits none itself.
         intervals: of a search, at most; None for its own number.
         rank: of the low-rank update to each weight matrix.
-        updates: of the weights.
         margin: what a proposer allows in place of its own (``Proposal.margin``); None leaves that to it.
         bound: distance from the original that the default may have, see ``near``; for who chooses among loops.
         farthest: that any plan may have, and the default where none is within ``bound``.
         deadline_ms: of a call, for the same; None for the fastest that is near enough.
-        threads: of calls that are timed.
     """
 
     goal: Goal
@@ -112,7 +109,6 @@ class Proposer(ABC):
     """Something that learns. Made of a ``Request``.
 
     Attributes:
-        request: what was asked for.
         told: one sentence on what became of it, for people; read after ``propose`` is exhausted or left.
         margin: its own ``Proposal.margin``, or what was asked for in place of that.
     """
@@ -207,11 +203,7 @@ NAMES = tuple(row.name for row in PROPOSERS)
 
 
 def rows_of(learn: tuple[str, ...]) -> tuple[Row, ...]:
-    """The rows of these names, in the order of ``PROPOSERS``.
-
-    Raises:
-        CalibrationError: none is of a name, or there is no name.
-    """
+    """The rows of these names, in the order of ``PROPOSERS``."""
     unknown = [name for name in learn if name not in NAMES]
     if unknown or not learn:
         found = repr(unknown[0]) if unknown else "none"

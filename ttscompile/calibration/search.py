@@ -12,11 +12,7 @@ from .trials import Trials
 
 
 def open_search(name: str, task: Task) -> Search:
-    """The search of the strategy of this name, ready to begin.
-
-    Raises:
-        CalibrationError: there is no such strategy, or it cannot keep the budget.
-    """
+    """The search of the strategy of this name, ready to begin."""
     strategy, model = strategy_of(name), task.executor.model
     strategy.require_reach(model.steps, model.blocks, task.budget)
     return strategy.make()(task)
@@ -33,7 +29,6 @@ def search_plan(
 
     Args:
         search: after its first ``first`` intervals.
-        clock: with the limit of the search.
         most: intervals; None for the strategy's own number.
         first: the interval to begin with.
         after: told after each interval how many are done, and how many seconds the longest took.

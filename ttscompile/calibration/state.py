@@ -109,11 +109,7 @@ class StateFile:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Within the block an error is one of the state: it has everything that was written, and yet does not fit.
-
-        Raises:
-            CalibrationError: it does not.
-        """
+        """Within the block an error is one of the state: it has everything that was written, and yet does not fit."""
         try:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError) as error:

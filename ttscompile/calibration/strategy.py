@@ -18,7 +18,6 @@ class Strategy:
     """A way to find a plan.
 
     Attributes:
-        name: what users call it.
         source: where the method is from.
         maker: where the function is that makes a ``Search`` of a ``Task``, as ``module:function`` below ``ttscompile``.
         least: how many cells its plans compute at least, of ``(steps, blocks)``; by default those of step 0.
@@ -40,12 +39,7 @@ class Strategy:
     baseline: bool = False
 
     def make(self) -> Callable[[Task], Search]:
-        """The function that ``maker`` names.
-
-        Raises:
-            ImportError: there is no such module, or it needs a package that is not installed.
-            AttributeError: the module has no such function.
-        """
+        """The function that ``maker`` names. Raises ImportError or AttributeError: there is none."""
         found: Callable[[Task], Search] = pkgutil.resolve_name(f"ttscompile.{self.maker}")
         return found
 

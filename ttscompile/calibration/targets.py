@@ -86,11 +86,7 @@ def where(executor: Executor) -> tuple[str, str, str]:
 
 
 def executor_elsewhere(path: str, identity: str, loop: str) -> Executor:
-    """The same executor in another process, which may be on another machine.
-
-    Raises:
-        CalibrationError: there is another artifact, or none.
-    """
+    """The same executor in another process, which may be on another machine."""
     return Executor(view_of(artifact_elsewhere(path, identity), Plan(loop)))
 
 

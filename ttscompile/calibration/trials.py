@@ -69,7 +69,6 @@ class Sample:
     """Calls of one part that the original has answered, each several times, with other noise.
 
     Attributes:
-        part: ``LEARNED`` or ``HELD_OUT``.
         stretches: number of the episode, first row and last row of each stretch of consecutive calls, ``[S, 3]``.
         calls: number of the stretch and row of each answered call, ``[N, 2]``; where its stretch is longer than one
             call there is one before it in the stretch.

@@ -299,36 +299,13 @@ def _innermost(trace: str) -> str:
     return f"{PurePath(path).name}:{line} in {function}"
 
 
-Tensors = Sequence[Tensor]
-
-
-def _hstack(tensors: Tensors) -> Tensor:
-    """Along the first axis of vectors, along the second of all others."""
-    wide = [one.reshape(-1) if one.ndim == 0 else one for one in tensors]
-    return torch.cat(wide, 0 if wide[0].ndim == 1 else 1)
-
-
-def _vstack(tensors: Tensors) -> Tensor:
-    """Along the first axis, where a vector is a row."""
-    return torch.cat([one.reshape(1, -1) if one.ndim < 2 else one for one in tensors], 0)
-
-
-def _dstack(tensors: Tensors) -> Tensor:
-    """Along the third axis, where a vector is a row, and a matrix has one number there."""
-    rows = [one.reshape(1, -1) if one.ndim < 2 else one for one in tensors]
-    return torch.cat([one.unsqueeze(-1) if one.ndim == 2 else one for one in rows], 2)
-
-
-def _column_stack(tensors: Tensors) -> Tensor:
-    """Along the second axis, where a vector is a column."""
-    return torch.cat([one.reshape(-1, 1) if one.ndim < 2 else one for one in tensors], 1)
-
-
-AS_CAT: Mapping[Any, Callable[[Tensors], Tensor]] = {
-    torch.ops.aten.hstack.default: _hstack,
-    torch.ops.aten.vstack.default: _vstack,
-    torch.ops.aten.dstack.default: _dstack,
-    torch.ops.aten.column_stack.default: _column_stack,
+AS_CAT: Mapping[Any, Callable[[Sequence[Tensor]], Tensor]] = {
+    torch.ops.aten.hstack.default: lambda some: torch.cat([*map(torch.atleast_1d, some)], int(some[0].ndim > 1)),
+    torch.ops.aten.vstack.default: lambda some: torch.cat([*map(torch.atleast_2d, some)], 0),
+    torch.ops.aten.dstack.default: lambda some: torch.cat([*map(torch.atleast_3d, some)], 2),
+    torch.ops.aten.column_stack.default: lambda some: torch.cat(
+        [one if one.ndim > 1 else one.reshape(-1, 1) for one in some], 1
+    ),
 }
 """Operations that put tensors beside each other, as the ``cat`` that they are: for ``run_decompositions``.
 

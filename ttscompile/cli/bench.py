@@ -11,9 +11,9 @@ import click
 from rich.console import Console
 
 from ttscompile.artifact.ceiling import BOUND, FARTHEST
-from ttscompile.artifact.default_plan import choose_default
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
+from ttscompile.artifact.write import choose_default
 from ttscompile.calibration.proposer import near
 from ttscompile.cli import options
 from ttscompile.cli.comparison import compare, draw_comparison, print_comparison

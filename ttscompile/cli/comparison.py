@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ttscompile.artifact.load import Artifact
 from ttscompile.calibration.progress import Bar
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress, say, table
-from ttscompile.errors import ArtifactChangedError, RuntimeUnavailableError
+from ttscompile.errors import ArtifactChangedError, needing
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
 from ttscompile.plots.figure import write_picture
@@ -30,12 +30,8 @@ def compare(
         ArtifactChangedError: an artifact was replaced meanwhile.
         RuntimeUnavailableError: there is no torch.
     """
-    try:
+    with needing("-t", "compile"):
         from ttscompile.calibration.compare import compare as measure
-    except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"-t needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]'."
-        ) from error
     with only_results_on_stdout(), Bar(shown=True) as bar:
         found = measure(directory, trajectories, others, progress=bar.tell, **how)
     pairs = zip((directory, *others), artifacts.values(), strict=True)

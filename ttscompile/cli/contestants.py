@@ -14,7 +14,7 @@ from ttscompile.artifact.manifest import marked
 from ttscompile.artifact.view import view_of
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import Noise, PolicySpec
-from ttscompile.errors import RuntimeUnavailableError, SpecError
+from ttscompile.errors import SpecError, needing
 from ttscompile.report.timing import Contestant, plan_contestant
 from ttscompile.runtimes.liveness import reads_earlier_calls
 from ttscompile.runtimes.load import open_policy
@@ -103,24 +103,18 @@ def originals(
         checkpoint: as ``convert`` took it.
         encoders: the folder that ``convert`` was given with it, if it was.
         threads: of PyTorch.
-        artifact: that was made from it.
         device: where PyTorch computes, None for the CPU. Its settings are torch's own: convolutions may use TF32.
 
     Raises:
         RuntimeUnavailableError: there is no torch, or no such device.
         SpecError: the checkpoint is of another policy.
     """
-    try:
+    with needing("the original network", "compile", ", or leave --checkpoint out"):
         import torch
 
         from ttscompile.frontends.eager import eager_policy
         from ttscompile.frontends.encoded import parts
         from ttscompile.runtimes.torch.devices import device_of
-    except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"the original network needs {error.name}, which is not installed. Run: pip install 'ttscompile[compile]',"
-            " or leave --checkpoint out."
-        ) from error
     module, saved = original_policy(checkpoint, artifact.manifest.spec, encoders)
     torch.set_num_threads(threads)
     module.to(device_of(device or "cpu"))

@@ -146,10 +146,8 @@ def write_page(
 
     Args:
         path: see ``require_page``.
-        artifact: loaded.
         policy: the same, with a seed; its calls are timed now.
         given: what the page shows beside the artifact.
-        progress: told what is under way.
 
     Returns:
         What was written, for people.

@@ -18,7 +18,7 @@ from ttscompile.cli.options import artifact_argument, json_option, seed_option
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
 from ttscompile.core.spec import ObservationSpec
-from ttscompile.errors import ObservationError, RuntimeUnavailableError
+from ttscompile.errors import ObservationError, needing
 from ttscompile.plots.figure import write_picture
 from ttscompile.plots.frontier import plot_chunk
 from ttscompile.runtimes.load import open_policy
@@ -153,11 +153,8 @@ def _camera(name: str, specs: Mapping[str, ObservationSpec]) -> str:
 
 def _picture(path: Path, spec: ObservationSpec, what: str) -> Array:
     """A PNG or JPEG as float32 ``[C, H, W]`` in 0..1."""
-    try:
+    with needing(f"{what}: a picture", "compile", ", or give arrays with --observation FILE.npz"):
         from PIL import Image
-    except ModuleNotFoundError as error:
-        remedy = "Run: pip install 'ttscompile[compile]', or give arrays with --observation FILE.npz."
-        raise RuntimeUnavailableError(f"{what}: pictures need Pillow, which is not installed. {remedy}") from error
     channels, height, width = spec.shape[-3:]
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as image:

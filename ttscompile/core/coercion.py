@@ -24,9 +24,7 @@ def integer(value: Any, what: str, error: Errors, least: int = 0, most: int | No
     """A whole number, whatever says that it is one: of Python, numpy or torch, an array of no axes; not a bool.
 
     Args:
-        value: what the caller gave.
         what: the name of the argument.
-        error: class of the error.
         least: the smallest that is taken.
         most: the largest; None for no limit.
         more: what else is taken, for the message.
@@ -55,9 +53,7 @@ def plain(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array
     """The numpy array of an array or a tensor, of numpy's own class; no copy if it can be helped.
 
     Args:
-        value: what the caller gave.
         what: for the message, ``observation 'obs'``.
-        error: class of the error.
         dtype: that is expected in the end, for the message; it is not checked.
 
     Raises:

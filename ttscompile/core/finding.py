@@ -20,7 +20,6 @@ class Finding:
     """One thing that was looked at.
 
     Attributes:
-        found: what was found, for people.
         remedy: what to do; every warning and problem has one.
     """
 

@@ -24,8 +24,6 @@ def parse_json(
     """Parse UTF-8 JSON without a key twice, numbers or texts that JSON does not have, or absurd size, number or depth.
 
     Args:
-        content: the document.
-        limit: of bytes.
         values: limit of those, as ``most_values`` counts them.
         allow_nan: accept NaN and infinity, as ``json.dumps`` writes them.
         shown: refuse texts and keys that a terminal does not show as they are: control characters, and those that turn

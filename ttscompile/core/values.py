@@ -76,7 +76,6 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
         array: ``[..., C, h, w]``.
         spec: of the observation, of a window or of a frame.
         what: for the message, ``observation 'obs'``.
-        error: class of the error.
 
     Raises:
         TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.

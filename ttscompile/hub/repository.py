@@ -16,7 +16,7 @@ from typing import Any
 
 from ..core.paths import HUB
 from ..core.untrusted_json import parse_json
-from ..errors import HubError, RuntimeUnavailableError, TtscompileError
+from ..errors import HubError, TtscompileError, needing
 from .name import HubName, plain, read_name, require_repository
 
 MANIFEST = "manifest.json"
@@ -191,13 +191,10 @@ def library() -> Any:
     Raises:
         RuntimeUnavailableError: it is not installed.
     """
-    try:
+    with needing("a name that begins with hf://", "hub"):
         import huggingface_hub
         import huggingface_hub.errors
         import huggingface_hub.hf_api
-    except ModuleNotFoundError as error:
-        problem = f"names that begin with hf:// need {error.name}, which is not installed"
-        raise RuntimeUnavailableError(f"{problem}. Run: pip install 'ttscompile[hub]'.") from error
     return huggingface_hub
 
 

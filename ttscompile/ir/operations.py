@@ -48,7 +48,6 @@ class Operation:
         name: without ``aten.``, and without the overload if the row is for all of them.
         movement: set if it moves numbers and computes none.
         elementwise: each number of the result depends on the numbers of its place alone, after broadcasting.
-        linear: see ``Linear``.
         along: the place among its arguments of the axis, or axes, that it works along; slices across them are treated
             alike and each for itself.
         mixes: the number of last axes of its first argument that it mixes; what lies before them are rows, which are

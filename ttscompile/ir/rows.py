@@ -32,7 +32,6 @@ class Rows:
 
     Attributes:
         name: of the value [.., m * B, ..].
-        type: of that value.
         crossing: its name where it crosses.
         unfolded: its type there, with an axis of size B.
     """

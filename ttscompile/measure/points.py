@@ -58,7 +58,6 @@ class MeasuredPoint(Point):
         error_p90: 90th percentile of that over the calls.
         quartiles_ms: first and third quartile of the latency.
         sparsity: share of the cells that are reused, mean over the calls.
-        flops: of a call, mean.
         by_number: the distance of each number of the action alone.
         errors: the error of each number of the action, in its units; empty where there is none.
         furthest: the calls with the largest distance, the largest first.

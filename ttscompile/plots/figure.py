@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import OutputError, RuntimeUnavailableError
+from ..errors import OutputError, needing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,14 +37,9 @@ def new_figure(width: float, height: float, told: str = "the figures") -> Figure
     Raises:
         RuntimeUnavailableError: matplotlib is not installed.
     """
-    try:
+    with needing(f"a picture of {told}", "compile", f", or read {told} with --json"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise RuntimeUnavailableError(
-            f"a picture of {told} needs matplotlib, and {error.name!r} is not installed. Install"
-            f" 'ttscompile[compile]', or read {told} with --json."
-        ) from error
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -99,7 +94,6 @@ def write_picture(figure: Figure, path: str | Path) -> None:
     """Write a picture, see ``encoded``.
 
     Args:
-        figure: drawn.
         path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
 
     Raises:

@@ -34,7 +34,6 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     Args:
         points: of all series; those at no distance (the dense policy) are told in the title: the axis is logarithmic.
         efficient: points that no other beats, fastest first.
-        title: over the picture.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()

@@ -75,7 +75,6 @@ def plot_errors(
         steps: number of each of the A steps.
         kinds: kind of each block, in order of execution.
         tolerance: errors above it are framed.
-        title: over the picture.
         cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
     """
     count, blocks = errors.shape

@@ -53,10 +53,8 @@ def build(
     """Measure what has to be measured, draw, and put the page together.
 
     Args:
-        artifact: loaded.
         policy: the same, with its default runtime and a seed.
         given: what the report shows beside the artifact.
-        progress: told what is under way.
 
     Raises:
         RuntimeUnavailableError: matplotlib or Jinja2 is not installed.

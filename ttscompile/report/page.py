@@ -7,7 +7,7 @@ import importlib
 from dataclasses import dataclass
 from importlib.resources import files
 
-from ..errors import RuntimeUnavailableError
+from ..errors import needing
 
 
 @dataclass(frozen=True)
@@ -77,14 +77,9 @@ class Page:
 
 def require_packages() -> None:
     """Raise before anything is measured for a page that could not be made."""
-    for name in ("jinja2", "matplotlib"):
-        try:
-            importlib.import_module(name)
-        except ModuleNotFoundError as error:
-            raise RuntimeUnavailableError(
-                f"the page needs {name}, and {error.name!r} is not installed. Run: pip install 'ttscompile[compile]',"
-                " or read the figures with: ttscompile inspect DIR --json."
-            ) from error
+    with needing("the page", "compile", ", or read the figures with: ttscompile inspect DIR --json"):
+        importlib.import_module("jinja2")
+        importlib.import_module("matplotlib")
 
 
 def render(page: Page) -> str:

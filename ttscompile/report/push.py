@@ -44,7 +44,6 @@ class Success:
     Attributes:
         variant: artifact and plan, as the evaluation calls them.
         figures: mean and 95 % interval by name: ``success`` and ``score``.
-        machine: that ran the episodes.
     """
 
     environment: str
@@ -56,10 +55,6 @@ class Success:
 
 def read_success(path: Path, identity: str) -> list[Success]:
     """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact.
-
-    Args:
-        path: of the document.
-        identity: of the artifact.
 
     Raises:
         ReportError: it is no such document, or not of this artifact.

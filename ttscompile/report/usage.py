@@ -30,7 +30,6 @@ class Use:
 
     Attributes:
         kind: ``head``, which makes plans; ``branch``, one way to go on of several; or ``table``, numbers.
-        name: what it is, for people.
         plans: names of the plans that use it, ``dense`` among them.
         of: the block whose branch it is, or the context whose values are in the table; None of what is alone.
     """

@@ -73,18 +73,12 @@ def observation_frames(
     """The frames of each key of the observation.
 
     Args:
-        path: of the file, for messages.
-        frames: what the file holds.
-        observations: what the policy observes, by key.
         sources: by key, the arrays that it is made of where they are called otherwise: flattened frame by frame and
             joined; ``NAME:N`` are the first N numbers of one.
 
     Returns:
         By key ``[F, *frame]``. Images ``[F, H, W, C]`` become ``[F, C, H, W]``, divided by 255, where the policy takes
         them so: what the original data sets do.
-
-    Raises:
-        TrajectoryError: an array is missing; names those that there are.
     """
     found = {}
     for key, spec in observations.items():
@@ -216,7 +210,6 @@ def instruction_rows(
 
     Args:
         held: what it holds: ``task``, texts ``[F]`` or their bytes ``[F, L]``.
-        told: how the policy is told its task.
         tokenizer: path of ``tokenizer.json``, or of its folder.
 
     Returns:

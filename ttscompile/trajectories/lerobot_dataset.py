@@ -167,12 +167,9 @@ def video_frames(
     """The frames of one camera, uint8 ``[1, H, W, 3]`` each, in the order of the rows.
 
     Args:
-        path: of the data set.
-        name: of the camera.
         info: ``meta/info.json``.
         episodes: ``[F]`` the episode of each row.
         times: ``[F]`` seconds since its episode began, of each row.
-        column: reads tables.
 
     Raises:
         ModuleNotFoundError: PyAV is not installed.

@@ -45,11 +45,7 @@ serve_alone(request)
 
 
 def sandboxed_frames(path: Path, kind: str, wanted: Sequence[str]) -> Frames:
-    """The wanted arrays of a data set that is one of ``FORMATS``; those that it lacks are left out.
-
-    Raises:
-        TrajectoryError: it cannot be read, or the process that reads it ended.
-    """
+    """The wanted arrays of a data set that is one of ``FORMATS``; those that it lacks are left out."""
     arrays, own = dict[str, Array](), dict[str, Array]()
     with reader({"path": os.fsdecode(path), "kind": kind, "wanted": list(wanted)}) as stream:
         names = _line(stream)["names"]
@@ -64,11 +60,7 @@ def sandboxed_frames(path: Path, kind: str, wanted: Sequence[str]) -> Frames:
 
 @contextmanager
 def reader(request: Mapping[str, Any]) -> Iterator[IO[bytes]]:
-    """The stream of a process that answers a request.
-
-    Raises:
-        TrajectoryError: the process ended before its answer did.
-    """
+    """The stream of a process that answers a request."""
     told = {**request, "sys_path": [each for each in sys.path if isinstance(each, str)]}
     command = [sys.executable, "-I", "-c", _CODE]
     env = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}  # the other one takes a gigabyte when it begins
@@ -121,7 +113,6 @@ def _line(stream: IO[bytes]) -> dict[str, Any]:
     """The next line of an answer.
 
     Raises:
-        TrajectoryError: the reader refused the file.
         EOFError: the stream ends before the answer does.
     """
     line = stream.readline()

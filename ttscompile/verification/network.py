@@ -35,7 +35,6 @@ class Probe:
     """The pieces on one observation.
 
     Args:
-        view: of an artifact.
         obs: normalised observations by key, ``[B, ...]``.
     """
 
@@ -97,9 +96,7 @@ class Probe:
         """One call, the first of its episode, by the definitions in ``docs/design.md`` section 2.
 
         Args:
-            noise: of the call.
             plan: int8 ``[B, K, blocks]``, without ROLLOUT.
-            correction: of the plan.
 
         Returns:
             The sample after every step, and the prediction at every step, ``[K, B, T, D]`` each.

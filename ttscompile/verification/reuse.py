@@ -129,11 +129,7 @@ def check_episodes(
 
 
 class Unpaired:
-    """What a plan and the dense policy answer to the same two draws of noise, over many calls.
-
-    Args:
-        plan: its name.
-    """
+    """What a plan and the dense policy answer to the same two draws of noise, over many calls."""
 
     def __init__(self, plan: str) -> None:
         self.plan = plan

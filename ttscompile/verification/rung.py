@@ -25,7 +25,6 @@ class Rung:
         remedy: what to do; empty if nothing is to be done.
         step: first denoising step that differs; None if none does, or none can be named.
         blocks: residual blocks that differ.
-        details: further figures, JSON.
     """
 
     name: str
