@@ -81,7 +81,7 @@ def print_frontier(artifact: Artifact, directory: Path, output: Console, threads
         "Times faster: than the same policy with every step computed, compiled too. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
         f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
-        *(facts.chosen(record) if record.get("other_noise") else facts.remarks(record)),
+        *((*facts.chosen(record), *facts.learned(record)) if record.get("other_noise") else facts.remarks(record)),
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
         "    policy.reset()  # a new episode",

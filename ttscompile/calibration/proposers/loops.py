@@ -74,6 +74,7 @@ class Loops(Proposer):
         self._bound, self._farthest = request.bound, request.farthest
         self._left_out: list[str] = []
         self._scores: dict[str, Score] = {}
+        self._tasks: dict[str, Task] = {}
         self._best: Proposal | None = None
         self._fastest = float("inf")  # ms of the best one, by its ``Cost``
         self._nearest: Proposal | None = None  # of those within ``farthest``, where none is within the bound
@@ -104,8 +105,9 @@ class Loops(Proposer):
         if best is None:
             raise CalibrationFailedError(self._none())
         yield best
-        left = f"; left out: {', '.join(self._left_out)}" if self._left_out else ""
-        self.told = f"{best.name} is the {found}{left}"
+        left = f"left out: {', '.join(self._left_out)}" if self._left_out else ""
+        more = self._tasks[best.name].whole.told_of_episodes(best.notes["steps"])
+        self.told = "; ".join(filter(None, (f"{best.name} is the {found}", left, more)))
 
     def _by_distance(self, trials: Trials, costs: Mapping[str, Cost]) -> tuple[list[str], list[str]]:
         """Other loops than the original's that may give the default, and those that may give ``fast``; cheapest first.
@@ -141,7 +143,7 @@ class Loops(Proposer):
             share = _ending(clock, clock.left() / (len(counts) - number))
             search = open_search("tts", replace(task, clock=share, budget=count * own.executor.model.blocks))
             found = searched(own, search, share, None, f"search, {loop}, {count} steps")[0]
-            yield from self._judged(self._proposal(loop, count, found), cost.of(count))
+            yield from self._judged(self._proposal(task, loop, count, found), cost.of(count))
             further, enough = self._reached(loop, count, wanted), further
             if enough or (further and wanted < self._bound):
                 break
@@ -167,13 +169,14 @@ class Loops(Proposer):
             if quick.error > hopeless and count != counts[-1]:
                 continue
             hopeful.append(count)
-            yield from self._judged(self._proposal(loop, count, task.whole_steps(quick.steps)), cost.of(count))
+            yield from self._judged(self._proposal(task, loop, count, task.whole_steps(quick.steps)), cost.of(count))
             further, enough = self._reached(loop, count, wanted), further
             if enough or (further and safer):
                 break
         return hopeful
 
-    def _proposal(self, loop: str, count: int, found: Found) -> Proposal:
+    def _proposal(self, task: Task, loop: str, count: int, found: Found) -> Proposal:
+        self._tasks[_name(loop, count)] = task
         name, made = _name(loop, count), Plan(loop, found.schedule, found.correction, repair=True)
         return Proposal(name, made, found.notes, beside=True, refusal=partial(self._refusal, name))
 
