@@ -148,7 +148,7 @@ def test_an_environment_without_its_package_names_the_extra(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("pusht:edgy", "disturbance of the environment 'pusht': expected one of edge, noisy; found 'edgy'."),
+        ("pusht:edgy", "disturbance of the environment 'pusht': expected one of edge, long, noisy; found 'edgy'."),
         ("metaworld:dark", "disturbance of the environment 'metaworld': it has none; found 'dark'."),
     ],
 )

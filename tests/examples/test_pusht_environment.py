@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from environments.disturbed.pusht import GOALS, PushTLong
 from environments.pusht import KEYPOINTS, PushT, keypoints, observation, place
 from environments.pusht_pixels import SIZE, PushTPixels
 
@@ -162,3 +163,34 @@ def test_pixels_are_what_gym_pusht_observes() -> None:
     np.testing.assert_array_equal(np.round(frame["observation.image"] * 255), np.moveaxis(seen["pixels"], -1, 0))
     np.testing.assert_allclose(frame["observation.state"], seen["agent_pos"], rtol=1e-6)
     assert environment.title != PushT.title
+
+
+def test_a_long_episode_puts_the_block_elsewhere_where_its_goal_is_reached() -> None:
+    """Begun with the block on the goal: one of five is earned at once, and the agent stays where it was."""
+    environment = PushTLong()
+    environment.reset(3, [100.0, 100.0, 256.0, 256.0, np.pi / 4])
+    before = environment.state[2:].copy()
+    environment.step(np.array([100.0, 100.0]))
+    assert (environment.score, environment.measures) == (1 / GOALS, {"goals": 1.0})
+    assert not environment.done and not environment.success
+    assert np.abs(environment.state[2:4] - before[:2]).max() > 1, "the block is elsewhere"
+    np.testing.assert_allclose(environment.state[:2], 100, atol=5)
+    for _ in range(PushT.max_steps):
+        environment.step(np.array([100.0, 100.0]))
+    assert environment.measures == {"goals": 1.0}, "the second was in vain"
+    assert 1 / GOALS <= environment.score < 2 / GOALS
+
+
+def test_all_goals_are_a_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever it is put, it is on the goal."""
+    monkeypatch.setattr(PushT, "success", property(lambda self: True))
+    monkeypatch.setattr(PushT, "score", property(lambda self: 1.0))
+    environment = PushTLong()
+    environment.reset(0)
+    monkeypatch.setattr(PushT, "step", lambda self, action: setattr(self, "done", True))
+    for goals in range(1, GOALS + 1):
+        assert not environment.done and not environment.success
+        environment.step(environment.rest())
+        assert environment.measures == {"goals": goals}
+        assert environment.score == min(goals + 1, GOALS) / GOALS, "the next one counts at once, too"
+    assert environment.done and environment.success

@@ -1,4 +1,4 @@
-"""Push-T from where no recording begins, and with a sensor that errs."""
+"""Push-T from where no recording begins, with a sensor that errs, and five times as long."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ NEAREST, RECORDED = 20.0, (100.0, 400.0)
 """Pixels: every keypoint is that far from the walls; where gym-pusht puts the block, in x and in y."""
 NOISE = 4.0
 """Pixels, standard deviation of what every number of a frame is off by; the demonstrations have none."""
+GOALS = 5
+"""One after the other, in a long episode."""
 
 
 class PushTEdge(PushT):
@@ -58,4 +60,48 @@ class PushTNoisy(PushT):
         self._frame[1] += 1
 
 
-DISTURBED = {"edge": PushTEdge, "noisy": PushTNoisy}
+class PushTLong(PushT):
+    """See ``PushT``: five of its episodes in one.
+
+    Where the goal is reached, or as many actions as it has were in vain, the block is put elsewhere and all goes on:
+    nobody resets the policy, and the agent stays where it is. The score is the mean of the five.
+    """
+
+    title, max_steps = f"Push-T, {GOALS} goals in a row", GOALS * PushT.max_steps
+
+    def reset(self, seed: int, state: Sequence[float] | None = None) -> None:
+        """Start the episode of this seed, which decides where the block is put, too."""
+        super().reset(seed, state)
+        self._places, self._begun, self._taken = np.random.default_rng((seed, 1)), 0, 0
+        self._scores, self._reached = 0.0, 0
+
+    @property
+    def success(self) -> bool:
+        """Whether all goals were reached."""
+        return self._reached == GOALS
+
+    @property
+    def score(self) -> float:
+        """Mean over the goals; 0 of those that are still to come."""
+        return (self._scores + (0.0 if self.done else super().score)) / GOALS
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """How many goals were reached."""
+        return {"goals": float(self._reached)}
+
+    def step(self, action: npt.ArrayLike) -> None:
+        """See ``PushT``."""
+        super().step(action)
+        self._taken += 1
+        if not self.done and self._taken < PushT.max_steps:
+            return
+        self._scores, self._reached = self._scores + super().score, self._reached + super().success
+        self._begun, self._taken = self._begun + 1, 0
+        self.done = self._begun == GOALS
+        if not self.done:
+            block, angle = self._places.uniform(*RECORDED, 2), self._places.uniform(-np.pi, np.pi)
+            super().reset(int(self._places.integers(2**31)), [*self.state[:2].tolist(), *block.tolist(), float(angle)])
+
+
+DISTURBED = {"edge": PushTEdge, "long": PushTLong, "noisy": PushTNoisy}

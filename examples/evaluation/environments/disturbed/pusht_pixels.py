@@ -1,10 +1,11 @@
-"""Push-T from pixels with a red block, where all demonstrations and recordings have a grey one."""
+"""Push-T from pixels: with a red block, where all demonstrations have a grey one, and five times as long."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from ..pusht_pixels import PushTPixels
+from .pusht import GOALS, PushTLong
 
 RED = (205, 92, 92, 255)
 
@@ -21,4 +22,10 @@ class PushTPixelsRed(PushTPixels):
             shape.color = RED
 
 
-DISTURBED = {"red": PushTPixelsRed}
+class PushTPixelsLong(PushTLong, PushTPixels):
+    """See ``PushTLong``; what is observed are pictures."""
+
+    title = f"Push-T from pixels, {GOALS} goals in a row"
+
+
+DISTURBED = {"long": PushTPixelsLong, "red": PushTPixelsRed}
