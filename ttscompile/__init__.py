@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from .runtimes.policy import CompiledPolicy as CompiledPolicy
     from .runtimes.report import CallReport as CallReport
     from .runtimes.torch.module import to_module as to_module
-    from .samplers.direct import DirectDenoiser as DirectDenoiser, direct_table as direct_table
     from .samplers.edm import EDMDenoiser as EDMDenoiser, edm_table as edm_table
     from .samplers.flow import flow_matching_table as flow_matching_table
+    from .samplers.table import DirectDenoiser as DirectDenoiser, direct_table as direct_table
     from .verification import Verification as Verification, verify as verify
 
 _HOMES = {
@@ -61,7 +61,7 @@ _HOMES = {
         "runtimes.load": ("load",),
         "runtimes.policy": ("CompiledPolicy",),
         "runtimes.torch.module": ("to_module",),
-        "samplers.direct": ("DirectDenoiser", "direct_table"),
+        "samplers.table": ("DirectDenoiser", "direct_table"),
         "samplers.edm": ("EDMDenoiser", "edm_table"),
         "samplers.flow": ("flow_matching_table",),
         "verification": ("Verification", "verify"),

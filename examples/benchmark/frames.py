@@ -39,8 +39,8 @@ from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.frontends.clip import TextConfig, VisionConfig
+from ttscompile.frontends.diffusion_policy_images import MultiImageEncoder, View
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
 from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from ttscompile.frontends.resnet import group_norm
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings

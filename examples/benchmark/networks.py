@@ -17,7 +17,7 @@ from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import PlanArray, uniform_plan
 from ttscompile.core.spec import ORIGINAL, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.conditioning import TokensDenoiser
+from ttscompile.frontends.diffusion_policy_parts import TokensDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_sampler
 from ttscompile.frontends.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion

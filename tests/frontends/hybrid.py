@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile.frontends.robomimic_encoder import FEATURES, Camera, ObservationEncoder
+from ttscompile.frontends.diffusion_policy_hybrid import FEATURES, Camera, ObservationEncoder
 from ttscompile.frontends.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 Array = npt.NDArray[np.float32]

@@ -11,7 +11,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from tests.rounding import Counted, allowed, assert_equal_but_for_rounding
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.diffusion_policy_weights import choose_weights
+from ttscompile.frontends.diffusion_policy_parts import choose_weights
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.samplers.table import sampler_table
 

@@ -18,11 +18,11 @@ from ttscompile.capture.export import capture
 from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
+from ttscompile.frontends.diffusion_policy_hybrid import SpatialSoftmax
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.frontends.resnet import ResidualBlock
-from ttscompile.frontends.robomimic_encoder import SpatialSoftmax
 from ttscompile.ir.flops import frames_flops, graph_flops
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_graph

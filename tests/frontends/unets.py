@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
-from ttscompile.frontends.multi_image_encoder import MultiImageEncoder, View
-from ttscompile.frontends.point_cloud_encoder import PointCloudEncoder, PointNet
+from ttscompile.frontends.diffusion_policy_images import MultiImageEncoder, View
+from ttscompile.frontends.dp3 import PointCloudEncoder, PointNet
 from ttscompile.frontends.resnet import group_norm
 
 from . import hybrid

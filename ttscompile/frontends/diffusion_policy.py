@@ -17,8 +17,7 @@ from ..core.spec import ChunkSpec, PolicySpec
 from ..errors import CheckpointError
 from . import diffusion_policy_transformer as transformer, diffusion_policy_unet as unet, dp3
 from .checkpoint import plain_config, read_checkpoint
-from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved
-from .diffusion_policy_weights import affine, choose_weights
+from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved, affine, choose_weights
 from .families import LoadOptions
 from .interpolation import Config
 from .refusals import refuse_file, refuse_payload, refuse_policy

@@ -16,9 +16,21 @@ from torch import nn
 from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from . import diffusion_policy_hybrid as hybrid
-from .conditioning import InpaintingDenoiser, TokensDenoiser
-from .diffusion_policy_parts import Rebuilt, Saved, network_settings, observation_specs, read_shape_meta, require_sizes
-from .diffusion_policy_weights import Weights, affine, load_network, network_weights, require_room
+from .diffusion_policy_parts import (
+    InpaintingDenoiser,
+    Rebuilt,
+    Saved,
+    TokensDenoiser,
+    Weights,
+    affine,
+    load_network,
+    network_settings,
+    network_weights,
+    observation_specs,
+    read_shape_meta,
+    require_room,
+    require_sizes,
+)
 from .encoded import EncodedDenoiser
 from .interpolation import Config
 from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion

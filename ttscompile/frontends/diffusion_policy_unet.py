@@ -14,19 +14,25 @@ from torch import nn
 from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
 from .conditional_unet1d import ConditionalUnet1D, UNetConfig
-from .conditioning import GlobalDenoiser, InpaintingDenoiser, LocalDenoiser
 from .diffusion_policy_hybrid import ENCODER_KEYS, build_encoder as build_robomimic_encoder
 from .diffusion_policy_images import build_encoder as build_image_encoder, encoder_settings
 from .diffusion_policy_parts import (
+    GlobalDenoiser,
+    InpaintingDenoiser,
+    LocalDenoiser,
     Observed,
     Rebuilt,
     Saved,
+    Weights,
+    affine,
+    load_network,
     network_settings,
+    network_weights,
     observation_specs,
     read_shape_meta,
+    require_room,
     require_sizes,
 )
-from .diffusion_policy_weights import Weights, affine, load_network, network_weights, require_room
 from .encoded import EncodedDenoiser
 
 _NETWORK = "ConditionalUnet1D"

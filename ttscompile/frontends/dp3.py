@@ -1,21 +1,82 @@
-"""3D Diffusion Policy: configuration and weights to an observation encoder and a U-Net.
+"""3D Diffusion Policy: its observation encoder, rebuilt, and configuration and weights to that and a U-Net.
 
-Its checkpoints have the form of Diffusion Policy's, and its networks are the U-Net of that with other conditions.
+Its checkpoints have the form of Diffusion Policy's, and its networks are the U-Net of that with other conditions. The
+encoder, a small PointNet and an MLP for the robot's state, is written from the description of the networks, with
+attribute names under which the weights of an original checkpoint load.
 
-Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., arXiv 2403.03954).
+Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., arXiv 2403.03954); PointNet of Qi et al.
+(arXiv 1612.00593).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import torch
+from torch import nn
+
 from ..errors import CheckpointError
-from .diffusion_policy_parts import COMMON_KEYS, Observed, Rebuilt, Saved, read_shape_meta
+from .diffusion_policy_parts import COMMON_KEYS, Observed, Rebuilt, Saved, Weights, read_shape_meta, require_room
 from .diffusion_policy_unet import DEFAULTS, behind_encoder
-from .diffusion_policy_weights import Weights, require_room
-from .point_cloud_encoder import COLOURED, PLACE, POINTS, ROBOT, STATE, PointCloudEncoder, PointNet
 from .saved_weights import require_weights
 from .settings import Settings
+
+POINTS, STATE, ROBOT = "point_cloud", "agent_pos", "imagin_robot"
+"""Keys of the observation: the points seen, the robot's state, and points of the robot that are added to those seen."""
+PLACE, COLOURED = 3, 6
+"""Channels of a point: where it is, and its colour."""
+
+_STATE_WIDTH = 64
+_WIDTHS = (64, 128, 256)
+_COLOURED_WIDTHS = (*_WIDTHS, 512)
+
+
+class PointNet(nn.Module):
+    """Points to a vector: an MLP of each point, the largest of each feature over all points, and a linear layer.
+
+    Args:
+        coloured: whether points have a colour; the MLP is a layer deeper then, which has no norm.
+        features: of the vector; None for those of the MLP, without a layer after it.
+        norms: whether the MLP has layer norms.
+    """
+
+    def __init__(self, coloured: bool, features: int | None, norms: bool, last_norm: bool) -> None:
+        super().__init__()
+        widths = _COLOURED_WIDTHS if coloured else _WIDTHS
+        layers: list[nn.Module] = []
+        before = COLOURED if coloured else PLACE
+        for width in widths:
+            layers += [nn.Linear(before, width), nn.LayerNorm(width) if norms else nn.Identity(), nn.ReLU()]
+            before = width
+        self.mlp = nn.Sequential(*(layers[:-2] if coloured else layers))
+        self.final_projection: nn.Module = nn.Identity()
+        self.width = features or before
+        if features is not None:
+            linear = nn.Linear(before, features)
+            self.final_projection = nn.Sequential(linear, nn.LayerNorm(features)) if last_norm else linear
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        """``[N, points, channels]`` -> ``[N, width]``."""
+        return self.final_projection(self.mlp(points).amax(1))  # type: ignore[no-any-return]
+
+
+class PointCloudEncoder(nn.Module):
+    """Points and the robot's state to one vector for each observed step."""
+
+    def __init__(self, extractor: PointNet, channels: int, state: int) -> None:
+        super().__init__()
+        self.extractor, self.channels = extractor, channels
+        self.state_mlp = nn.Sequential(nn.Linear(state, _STATE_WIDTH), nn.ReLU(), nn.Linear(_STATE_WIDTH, _STATE_WIDTH))
+        self.width = extractor.width + _STATE_WIDTH
+
+    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """By key ``[B, To, ...]``, normalised -> ``[B, To, width]``."""
+        clouds = [observations[key][..., : self.channels] for key in (POINTS, ROBOT) if key in observations]
+        points = torch.cat(clouds, dim=2)
+        features = self.extractor(points.flatten(0, 1)).reshape(*points.shape[:2], self.extractor.width)
+        return torch.cat((features, self.state_mlp(observations[STATE])), dim=-1)
+
 
 _NAME = "3D Diffusion Policy"
 _CHANGED = "The policy was changed; use ttscompile.compile_denoiser(module, spec)."

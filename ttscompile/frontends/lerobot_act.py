@@ -18,7 +18,7 @@ from torch import nn
 
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
-from ..samplers.direct import DirectDenoiser, direct_table
+from ..samplers.table import DirectDenoiser, direct_table
 from .act import ACT, ACTConfig
 from .families import LoadOptions
 from .lerobot_config import ENVIRONMENT, MOST, STATE, LeRobotConfig, read_lerobot_config

@@ -21,6 +21,7 @@ from torch import nn
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
 from .conditional_unet1d import ConditionalUnet1D, UNetConfig
+from .diffusion_policy_hybrid import SpatialSoftmax
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
@@ -28,7 +29,6 @@ from .lerobot_config import ENVIRONMENT, MOST, MOST_PIXELS, STATE, LeRobotConfig
 from .lerobot_policy import Measured, diffusion_loops, policy_spec, read_weights
 from .lerobot_processors import Processors, read_processors
 from .resnet import DEPTHS, SHRINKS, Norm, group_norm, resnet
-from .robomimic_encoder import SpatialSoftmax
 from .saved_weights import require_weights
 from .settings import Settings, is_shape
 

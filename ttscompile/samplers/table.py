@@ -3,7 +3,7 @@
 The maths of DDPM, DDIM and DPM-Solver++ is not written down here a second time: every coefficient is measured on the
 scheduler itself, in float64, and the finished table is held against it on random inputs. Whatever does not have the
 form of ``SamplerTable`` (dynamic thresholding, scaled inputs, learned variances) is refused. Flow matching needs no
-scheduler (``flow``).
+scheduler (``flow``), and neither does a policy that gives its actions in one evaluation (``direct_table``).
 
 The scheduler is driven through whole chains. A multistep solver remembers what the network's outputs of the last steps
 meant for the sample (``model_outputs`` of the scheduler: predictions of the clean sample for DPM-Solver++, of the noise
@@ -24,10 +24,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
 
 from ..core.coercion import integer
 from ..core.spec import SamplerTable
 from ..errors import SpecError
+from .flow import deterministic_table
 
 _SHAPE = (2, 3, 4)  # of a probe; small, with no two sizes equal, so that a broadcast along the wrong axis shows
 _SMALL, _FAR = 2.0**-30, 2.0**30  # inside any clip that is there, and outside of it
@@ -297,3 +299,24 @@ def sampler_table(
         memory_to_next=rows.before.astype(np.float32),
         to_memory=np.tile(shift, (steps, 1, 1)).astype(np.float32),
     )
+
+
+class DirectDenoiser(nn.Module):
+    """The network as ``compile_denoiser`` takes it: ``forward(sample, timestep, **observations)``.
+
+    ``network(**observations)`` gives the actions ``[B, T, D]``; all of it leaves the loop. A residual stream begins
+    with the sample, so that is read, and nothing depends on it.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, **observations: torch.Tensor) -> torch.Tensor:
+        """``[B, T, D]``, ``[B]`` -> ``[B, T, D]``."""
+        return self.network(**observations) + 0 * sample  # type: ignore[no-any-return]
+
+
+def direct_table() -> SamplerTable:
+    """The loop of a ``DirectDenoiser``: one step, whose result is the prediction."""
+    return deterministic_table("direct", np.zeros(1), None, out_to_x0=np.ones(1), x0_to_next=np.ones(1))
