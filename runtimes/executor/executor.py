@@ -30,8 +30,7 @@ from .feasibility import Feasibility
 from .measure import Clock, MonotonicClock, require_prefix
 from .settings import ExecutorSettings, Policy, resolve
 from .state import ExecutorState
-from .statistics import ExecutorStatistics, statistics
-from .trace import CONTROL, Trace
+from .statistics import CONTROL, ExecutorStatistics, Trace, statistics
 from .window import FrameSpec
 from .worker import Worker
 

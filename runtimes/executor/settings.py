@@ -13,8 +13,7 @@ from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
-from .guard import GuardLimits
-from .stall import StallRule
+from .guard import GuardLimits, StallRule
 from .window import FrameSpec
 
 if TYPE_CHECKING:

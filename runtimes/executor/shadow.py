@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ttscompile.errors import ObservationError
-from ttscompile.measure.energy import Numbers
+from ttscompile.measure.points import Numbers
 from ttscompile.runtimes.helper import Helper
 
 from .measure import Clock, MonotonicClock

@@ -14,10 +14,9 @@ from ttscompile.core.spec import Affine, FloatArray
 from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObservationError
 
 from .feasibility import LatencyWindow, Tiers
-from .guard import Guard
+from .guard import Guard, Watchdog
 from .schedule import Schedule
 from .settings import Resolved
-from .stall import Watchdog
 from .statistics import Recorder
 from .window import Frame, ObservationWindow
 

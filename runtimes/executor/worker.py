@@ -23,7 +23,7 @@ from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import Clock, measure_latencies
 from .settings import Policy, Resolved, SeeingPolicy
 from .state import ExecutorState, Job
-from .trace import Trace
+from .statistics import Trace
 from .window import Frame
 
 

@@ -17,7 +17,7 @@ from ttscompile.core.tokenizer import TASK
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.lock import Lock
 from ttscompile.runtimes.server.protocol import DTYPES, Message, Request, read_arrays
 

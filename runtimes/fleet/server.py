@@ -19,7 +19,7 @@ from ttscompile.artifact.view import view_of
 from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.liveness import reading_earlier_calls
-from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock
 from ttscompile.runtimes.server.metrics import Metric

@@ -5,7 +5,7 @@ cannot change, its workers spin, and every other session of the process that wan
 robot runs other things beside the policy. So threads belong to sessions.
 
 Steps that compute all blocks run in one session, at any number of threads. Single blocks are in sessions of their own
-with one thread, the caller's. With more, one session holds all of them (``ir.joint``). Its threads and those of the
+with one thread, the caller's. With more, one session holds all of them (``ir.pieces``). Its threads and those of the
 whole steps, ``threads - 1`` each, stay awake from one block to the next: they look for work for ``SPIN_US`` after each,
 and then sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
 
@@ -34,7 +34,7 @@ from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir import pieces as kinds
 from ttscompile.ir.graph import TensorType
-from ttscompile.ir.joint import Joint, join
+from ttscompile.ir.pieces import Joint, join
 from ttscompile.measure.machine import has_integer_dot_product
 from ttscompile.runtimes.contexts import ContextValues
 

@@ -10,8 +10,7 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import CTRL_OPCODES, Frame
 
-from .admission import Admission, Pace
-from .limits import ServerLimits
+from .admission import Admission, Pace, ServerLimits
 
 SLICE = 4096
 """Bytes that are read at once: of pings they hold 680, which take some milliseconds."""

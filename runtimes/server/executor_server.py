@@ -13,7 +13,7 @@ from typing import Any
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.executor import AsyncExecutor
 
-from .limits import ServerLimits
+from .admission import ServerLimits
 from .listener import Listener
 from .lock import Lock
 from .metrics import Metric, of_statistics

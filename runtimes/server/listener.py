@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ttscompile.core.coercion import integer
 from ttscompile.errors import ExecutorError, TtscompileError, needing
 
-from .admission import Admission, AdmittingSocket, Pace
-from .limits import ServerLimits
+from .admission import Admission, AdmittingSocket, Pace, ServerLimits
 from .lock import Lock
 from .metrics import CONTENT_TYPE, Metric, exposition
 from .protocol import LARGE, Message, Methods, Request, answer, read_request

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from ttscompile.core.correction import HISTORY
 
-from .idle_steps import IdleSteps, Prepared
-from .sampler import Advance, State
+from .sampler import Advance, IdleSteps, Prepared, State
 
 LARGEST = 2**18
 """Numbers of a step's matrices: a larger step is no faster on the one multiprocessor that a stream has."""

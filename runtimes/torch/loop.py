@@ -15,8 +15,7 @@ from torch import Tensor
 
 from ttscompile.runtimes.instructions import Instructions
 
-from .idle_steps import IdleSteps
-from .sampler import Advance, State, begin
+from .sampler import Advance, IdleSteps, State, begin
 
 
 class Network(Protocol):

@@ -21,7 +21,7 @@ from ttscompile.runtimes.contexts import ContextValues
 
 from . import devices
 from .functions import Function, write_function
-from .idle_steps import IdleSteps
+from .sampler import IdleSteps
 
 Array: TypeAlias = npt.NDArray[np.generic]
 

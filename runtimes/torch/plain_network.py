@@ -22,8 +22,7 @@ from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, block_name
 from ttscompile.ir.program import Binding, frame_values
 
-from .idle_steps import IdleSteps
-from .sampler import Advance
+from .sampler import Advance, IdleSteps
 
 Tensors = Mapping[str, Tensor]
 

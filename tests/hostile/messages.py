@@ -99,8 +99,8 @@ def _server() -> Any:
     from tests.runtimes.executor.simulation import FakeClock
     from tests.runtimes.server.serving import Quick
     from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+    from ttscompile.runtimes.server.admission import ServerLimits
     from ttscompile.runtimes.server.executor_server import ExecutorServer
-    from ttscompile.runtimes.server.limits import ServerLimits
 
     settings = ExecutorSettings(max_hold=1000)
     return ExecutorServer(

@@ -30,9 +30,8 @@ from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, OpenPiServer, Plans, ray_copies
 from ttscompile.runtimes.load import open_policy
-from ttscompile.runtimes.server.admission import AUDIT
+from ttscompile.runtimes.server.admission import AUDIT, ServerLimits
 from ttscompile.runtimes.server.executor_server import ExecutorServer
-from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock, hashed, read_by_others, read_token, tls_context
 

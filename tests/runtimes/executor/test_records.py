@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 
 from ttscompile.runtimes.executor.statistics import (
+    CONTROL,
     COUNTS,
     MEASURED,
+    WORKER,
     ExecutorStatistics,
     Recorder,
     Samples,
+    Trace,
     statistics,
     summary,
 )
-from ttscompile.runtimes.executor.trace import CONTROL, WORKER, Trace
 from ttscompile.runtimes.report import Timings
 
 from .simulation import ScriptedPolicy, World

@@ -13,8 +13,8 @@ from hypothesis import given, strategies as st
 from ttscompile import Affine
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.executor.guard import StallRule, Watchdog
 from ttscompile.runtimes.executor.settings import resolve
-from ttscompile.runtimes.executor.stall import StallRule, Watchdog
 
 from .simulation import FakeClock, ScriptedPolicy, World
 

@@ -16,7 +16,7 @@ import ttscompile
 from tests.runtimes.server.serving import LIMITS, listening
 from ttscompile.artifact.load import load_artifact
 from ttscompile.runtimes.fleet import OpenPiServer
-from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.lock import Lock
 
 if any(importlib.util.find_spec(name) is None for name in ("websockets", "msgpack")):

@@ -25,7 +25,7 @@ from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes.arrays import check_observation, read_observation
 from ttscompile.runtimes.fleet import OpenPiServer
-from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.lock import Lock, hashed
 
 from .openpi_clients import (

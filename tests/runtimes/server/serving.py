@@ -20,8 +20,8 @@ import pytest
 from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.executor_server import ExecutorServer
-from ttscompile.runtimes.server.limits import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock
 

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from ttscompile import ObservationSpec
-from ttscompile.runtimes.server.admission import MOST_ADDRESSES, Admission, Pace
-from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.admission import MOST_ADDRESSES, Admission, Pace, ServerLimits
 
 
 def test_a_pace_lets_a_second_s_worth_through_at_once() -> None:

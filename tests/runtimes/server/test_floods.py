@@ -19,7 +19,7 @@ import pytest
 from tests.runtimes.server.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ProtocolError
-from ttscompile.runtimes.server.limits import ServerLimits
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.protocol import LARGE, read_request
 

@@ -22,8 +22,8 @@ import pytest
 from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError
 from ttscompile.runtimes.executor import AsyncExecutor
+from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.executor_server import ExecutorServer
-from ttscompile.runtimes.server.limits import ServerLimits
 
 from .serving import (
     CLIENT,
