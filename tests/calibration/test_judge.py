@@ -24,7 +24,7 @@ from ttscompile.calibration.trials import DRAWS, FEWEST_OBSERVATIONS, HELD_OUT, 
 from ttscompile.core.lattice import dense_plan, uniform_plan, whole_steps_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError
-from ttscompile.measure.energy import pairs, rooted
+from ttscompile.measure.points import pairs, rooted
 from ttscompile.samplers.flow import flow_matching_table
 
 from . import policies

@@ -17,7 +17,7 @@ from ttscompile.calibration.judge import judge, other_noise
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.trials import Trials
-from ttscompile.measure.energy import TENTH, pairs, rooted
+from ttscompile.measure.points import TENTH, pairs, rooted
 from ttscompile.report import facts
 
 SPEC = PolicySpec(

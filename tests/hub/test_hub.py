@@ -24,7 +24,7 @@ from ttscompile.errors import ArtifactError, HubError, RuntimeUnavailableError, 
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.hub import fetch_artifact, fetch_checkpoint
-from ttscompile.hub.name import HubName, read_name
+from ttscompile.hub.repository import HubName, read_name
 from ttscompile.report.push import card
 
 from .served import Hub, serving

@@ -14,7 +14,7 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node, Ref
 from ttscompile.ir.pieces import IDLE_OUTPUTS, TOTAL, LoopPiece
 from ttscompile.ir.program import Pieces, Program
-from ttscompile.lower.idle import lower_idle
+from ttscompile.lower.advance import lower_idle
 from ttscompile.lower.program import OPSET
 
 from .sessions import session

@@ -10,8 +10,7 @@ import torch
 
 from tests.runtimes.toys import toy_program
 from ttscompile.ir.graph import Batch, TensorType
-from ttscompile.ir.joint import join
-from ttscompile.ir.pieces import RESIDUAL, STREAM
+from ttscompile.ir.pieces import RESIDUAL, STREAM, join
 from ttscompile.lower.program import lower_program
 
 from .sessions import session

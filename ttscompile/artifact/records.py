@@ -17,8 +17,8 @@ from ..core.update import update_flops
 from ..errors import ArtifactError
 from ..ir import pieces as names
 from ..ir.flops import frames_flops, graph_flops
-from ..ir.joint import join
 from ..ir.layers import layers_graph
+from ..ir.pieces import join
 from ..ir.program import Program
 from .bind import REPORT, interface
 from .codec import check_record, plan_fault

@@ -9,7 +9,7 @@ has the energy distance of the two distributions of answers as its mean, whether
 of draw i of the original, as long as it shares none with another draw. Where it has, x_i is near y_i, the terms nearly
 cancel, and h varies little. ``distance`` is the root of the mean of h over the mean of |y_i - y_j|: 0 where nothing can
 be told apart; the root grows as the error does. ``docs/decisions.md`` has the measurements behind norm and root. Where
-noise changes nothing the unit is another one (``measure.energy.pairs``).
+noise changes nothing the unit is another one (``measure.points.pairs``).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ..core.lattice import Source, plan_flops, sparsity
 from ..core.plan import Plan
 from ..core.spec import FloatArray
 from ..errors import CalibrationError
-from ..measure.energy import SAME, Numbers, pairs, rooted
+from ..measure.points import SAME, Numbers, pairs, rooted
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport

@@ -1,4 +1,4 @@
-"""ONNX models that hold all residual blocks: one runs any of them, the other all in a row; see ``ir.joint``."""
+"""ONNX models that hold all residual blocks: one runs any of them, the other all in a row; see ``ir.pieces.Joint``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto,
 
 from ..ir import pieces as names
 from ..ir.graph import TensorType
-from ..ir.joint import halves, join
+from ..ir.pieces import halves, join
 from .onnx_model import opsets, own_model, value_info
 
 

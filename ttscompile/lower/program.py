@@ -24,8 +24,7 @@ from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
 from ..ir.layers import layers_graph
 from ..ir.pieces import IDLE, LAYERS, PRUNER, TAIL, of_loop
 from ..ir.program import Program
-from .advance import advances
-from .idle import lower_idle
+from .advance import advances, lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
 from .onnx_model import name_model, only
@@ -57,9 +56,9 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     Returns:
         By name: ``condition``, ``step`` (if any), ``pruner`` (if any), ``stem``, ``block_00``, ``block_01``..,
         ``advance`` (tail, sampler update and stem in one; see ``lower.advance``), ``blocks`` and ``dense_step`` (all
-        blocks in one; see ``ir.joint``), if stem and tail allow it ``idle`` (see ``lower.idle``), and of one block
-        alone ``layers`` (see ``ir.layers``). ``advance@NAME`` and ``pruner@NAME`` are those of a further loop, where
-        they differ from the original's. Graphs of one structure are exported once.
+        blocks in one; see ``ir.pieces.Joint``), if stem and tail allow it ``idle`` (see ``lower.advance``), and of one
+        block alone ``layers`` (see ``ir.layers``). ``advance@NAME`` and ``pruner@NAME`` are those of a further loop,
+        where they differ from the original's. Graphs of one structure are exported once.
     """
     pieces = program.pieces
     graphs = {name: graph for name, graph in pieces.graphs().items() if name != TAIL}

@@ -18,7 +18,7 @@ from ..core.spec import WITHOUT
 from ..core.untrusted_json import parse_json
 from ..errors import ReportError
 from ..hub import upload
-from ..hub.name import HubName, read_name, require_repository
+from ..hub.repository import HubName, read_name, require_repository
 from ..measure.machine import one_line
 from ..measure.units import share
 from ..runtimes.open import open_runtime

@@ -21,7 +21,7 @@ from ..artifact.manifest import PlanRecord
 from ..core.lattice import sparsity
 from ..core.plan import DENSE, FULL, UNIFORM
 from ..core.spec import Noise, PolicySpec
-from ..measure.energy import pairs, rooted
+from ..measure.points import pairs, rooted
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
@@ -68,7 +68,7 @@ def check_episodes(
 
     A plan of another sampler, or one that begins with the chunk before, answers the same noise with other actions; what
     is judged of it is how far its answers to two draws of noise are from two of the dense policy's, in units of what
-    other noise changes (``measure.energy``). Else:
+    other noise changes (``measure.points``). Else:
 
     The mean error of the default plan has to keep within what two dense calls with different noise are apart, or within
     what calibration measured on held-out calls (90th percentile), whichever is more. It also has to keep within
