@@ -52,7 +52,7 @@ MAY_IMPORT = {
 }
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
-RIVALS_READ = {f"ttscompile.calibration.{name}" for name in ("calls", "execute", "spacing", "strategy", "task")}
+RIVALS_READ = {f"ttscompile.calibration.{name}" for name in ("calls", "execute", "step_counts", "strategy", "task")}
 """What rivals know of calibration: what a strategy is given, and what it may compare."""
 
 FLEET = "ttscompile.runtimes.fleet"

@@ -43,7 +43,7 @@ from ttscompile.calibration.calls import (
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pruner.paper import UPDATES, Paper
-from ttscompile.calibration.search import search_plan
+from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Search, Task
 from ttscompile.calibration.trials import base_of

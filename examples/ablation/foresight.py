@@ -23,8 +23,8 @@ from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
-from ttscompile.calibration.spacing import spacings
 from ttscompile.calibration.sparse_loop import fit_correction
+from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.targets import REPEATS
 from ttscompile.calibration.task import Array
 from ttscompile.calibration.trials import base_of

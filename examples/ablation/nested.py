@@ -23,9 +23,9 @@ from ttscompile.calibration.calls import Actions, Calls, load_episodes, prepare_
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
-from ttscompile.calibration.search import search_plan
-from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.sparse_loop import SparseLoop
+from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.targets import REPEATS
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import base_of

@@ -23,7 +23,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import base_of

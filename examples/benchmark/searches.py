@@ -15,7 +15,7 @@ from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.compare import Entrant, Joining
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
-from ttscompile.calibration.search import open_search, search_plan
+from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.strategies import strategy_of
 from ttscompile.calibration.targets import executor_elsewhere, where

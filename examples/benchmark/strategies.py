@@ -17,7 +17,7 @@ from searches import LEARNED, Searching
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.strategies import NAMES
-from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
+from ttscompile.cli.contestants import compare, draw_comparison, print_comparison
 from ttscompile.cli.options import (
     MOST_SEED,
     artifact_argument,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.task import Array, Found, NothingAfter, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 

@@ -12,7 +12,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
-from ttscompile.calibration.search import open_search, search_plan
+from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.task import Found, Task
 from ttscompile.trajectories import load_trajectories
 from ttscompile.trajectories.episodes import Episode

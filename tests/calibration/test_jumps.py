@@ -8,7 +8,7 @@ import torch
 
 from ttscompile.calibration import sparse_loop
 from ttscompile.calibration.calls import IntArray
-from ttscompile.calibration.jumps import FOLDS, Layers, fit_jump
+from ttscompile.calibration.regression import FOLDS, Layers, fit_jump
 from ttscompile.calibration.sparse_loop import SparseLoop, fit_correction
 from ttscompile.core.correction import HIDDEN
 from ttscompile.core.lattice import PlanArray

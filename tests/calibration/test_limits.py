@@ -26,7 +26,7 @@ from ttscompile.calibration.compare import compare
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.search import open_search, search_plan
+from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from ttscompile.calibration import whole_steps
-from ttscompile.calibration.spacing import FEW, other_placements, spacings
 from ttscompile.calibration.sparse_loop import SparseLoop
+from ttscompile.calibration.step_counts import FEW, other_placements, spacings
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.whole_steps import ScheduleRuns
 from ttscompile.core.correction import Correction

@@ -12,7 +12,7 @@ import pytest
 
 import ttscompile
 from ttscompile.calibration.pruner import paper
-from ttscompile.calibration.search import open_search
+from ttscompile.calibration.schedule import open_search
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, strategy_of
 from ttscompile.calibration.strategy import Strategy
 from ttscompile.calibration.task import Found, Search

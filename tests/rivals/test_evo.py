@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 
 from tests.calibration.tasks import MakeTask
 from tests.rounding import Counted, allowed
-from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.step_counts import spacings
 from ttscompile.rivals.evo import POPULATION, Evo, mutate, repair
 
 

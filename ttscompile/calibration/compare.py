@@ -19,8 +19,7 @@ from ..artifact.load import Artifact, load_artifact
 from ..core.coercion import integer
 from ..core.plan import DENSE, Plan
 from ..errors import CalibrationError
-from ..measure.energy import pairs, rooted
-from ..measure.points import Comparison, FarCall, MeasuredPoint
+from ..measure.points import Comparison, FarCall, MeasuredPoint, pairs, rooted
 from ..runtimes.open import require_able
 from .calls import Split, load_episodes
 from .judge import Score, judge, other_noise, timed

@@ -1,13 +1,13 @@
-"""The proposer of schedules: what a strategy finds for a budget, the baseline, and plans beside the target."""
+"""The proposer of schedules: a strategy at work as long as there is time, the baseline, and plans beside the target."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
-from ..core.lattice import uniform_plan
+from ..core.lattice import sparsity, uniform_plan
 from ..core.plan import UNIFORM, Plan
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
@@ -16,11 +16,74 @@ from .budget import ERROR, FLOPS, LATENCY, Goal, cells_of, measure_budget
 from .clock import Clock
 from .judge import Score
 from .proposer import Proposal, Proposals, Proposer, Request
-from .search import open_search, searched
 from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
 from .strategies import FITTED, strategy_of
-from .task import Found, Task
+from .task import Found, Search, Task
 from .trials import Trials, base_of
+
+
+def open_search(name: str, task: Task) -> Search:
+    """The search of the strategy of this name, ready to begin."""
+    strategy, model = strategy_of(name), task.executor.model
+    strategy.require_reach(model.steps, model.blocks, task.budget)
+    return strategy.make()(task)
+
+
+def search_plan(
+    search: Search,
+    clock: Clock,
+    most: int | None = None,
+    first: int = 0,
+    after: Callable[[int, float], None] = lambda done, longest: None,
+) -> tuple[Found, int, str]:
+    """Intervals until the search is done, or the time is up; one at least.
+
+    Args:
+        search: after its first ``first`` intervals.
+        most: intervals; None for the strategy's own number.
+        first: the interval to begin with.
+        after: told after each interval how many are done, and how many seconds the longest took.
+
+    Returns:
+        What was found, after how many intervals, and why it stopped: ``finished`` or ``time limit``.
+
+    Raises:
+        CalibrationFailedError: the time was up before there was a plan within the budget.
+    """
+    count = search.intervals if most is None else min(most, search.intervals)
+    number, longest = first, 0.0
+    while number < count and not search.done:
+        start = clock.elapsed()
+        if number > 0 and not clock.has(longest + search.settling):
+            break
+        search.advance(number)
+        number += 1
+        longest = max(longest, clock.elapsed() - start)
+        after(number, longest)
+    return search.found(), number, "time limit" if clock.cut else "finished"
+
+
+def searched(
+    trials: Trials, search: Search, clock: Clock, most: int | None, name: str = "search"
+) -> tuple[Found, int, str]:
+    """``search_plan`` from where the state is; saved after every interval, under a name."""
+    state, bar, done_so_far = trials.state, trials.bar, f"{name} intervals"
+    first = int(state.progress.get(done_so_far, 0))
+    count = search.intervals if most is None else min(most, search.intervals)
+    if first:
+        with state.reading():
+            search.restore(state.get(name))
+    bar.stage(name, count, first)
+
+    def save(done: int, longest: float) -> None:
+        state.put(name, search.state())
+        state.progress.update({done_so_far: done, "seconds": clock.elapsed()})
+        state.save()
+        left = min(clock.left(), (count - done) * longest)
+        bar.update(done, f"error {search.loss:.4f}, sparsity {sparsity(search.plan):.2%}", left)
+
+    return search_plan(search, clock, most, first, save)
+
 
 SCHEDULE = "schedule"
 """Name in the artifact of the best plan that does not depend on the observation."""

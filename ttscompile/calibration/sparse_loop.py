@@ -21,8 +21,7 @@ from ..pool import workers
 from ..runtimes.reference.sampler import correct, features, through
 from .calls import Calls
 from .execute import Executor, State
-from .jumps import Layers, fit_jump
-from .regression import Components, Solved, solve
+from .regression import Components, Layers, Solved, fit_jump, solve
 
 STREAMS = 64
 """Calls that go through the loop at once."""

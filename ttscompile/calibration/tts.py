@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..core.lattice import PlanArray
-from .spacing import other_placements, spacings
+from .step_counts import other_placements, spacings
 from .task import Array, Found, Task
 
 DISTANCES = (8, 4, 2, 1)

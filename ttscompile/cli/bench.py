@@ -16,8 +16,7 @@ from ttscompile.artifact.manifest import abbreviated
 from ttscompile.artifact.write import choose_default
 from ttscompile.calibration.proposer import near
 from ttscompile.cli import options
-from ttscompile.cli.comparison import compare, draw_comparison, print_comparison
-from ttscompile.cli.contestants import Way, contestants, originals
+from ttscompile.cli.contestants import Way, compare, contestants, draw_comparison, originals, print_comparison
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table, warn_if_busy
 from ttscompile.cli.sections import Section, SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_facts

@@ -20,7 +20,7 @@ from ttscompile.calibration.kept import Kept, holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.pruner.paper import Paper
-from ttscompile.calibration.spacing import spacings
+from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import Source, whole_steps_plan
 from ttscompile.runtimes.plans import pruner_plan

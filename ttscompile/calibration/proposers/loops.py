@@ -26,7 +26,7 @@ from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
 from ...core.spec import Noise
 from ...errors import CalibrationFailedError
-from ...measure.energy import TENTH
+from ...measure.points import TENTH
 from ...runtimes.open import open_runtime
 from ...runtimes.random_calls import Observation
 from ...runtimes.runtime import Runtime
@@ -35,7 +35,7 @@ from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
-from ..search import open_search, searched
+from ..schedule import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
 from ..trials import Trials

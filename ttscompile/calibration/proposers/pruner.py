@@ -18,8 +18,7 @@ from ..clock import Clock
 from ..judge import Score
 from ..proposer import Proposal, Proposals, Proposer
 from ..pruner.paper import Paper
-from ..schedule import one_plan
-from ..search import searched
+from ..schedule import one_plan, searched
 from ..task import Task
 from ..trials import Trials, base_of
 

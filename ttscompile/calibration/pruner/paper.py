@@ -25,7 +25,7 @@ from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...ir.plan_head import first_numbers, has_head
 from ...runtimes.plans import pruner_plan
 from ..calls import Calls, IntArray
-from ..spacing import spacings
+from ..step_counts import spacings
 from ..task import Array, Found, NothingAfter, Task
 from .straight_through import Practice, legal, written
 
