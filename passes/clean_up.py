@@ -1,7 +1,5 @@
 """Remove what does nothing: identities, examples of a type, dead code, repeated expressions, work on constants."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar

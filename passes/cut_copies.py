@@ -1,7 +1,5 @@
 """Cut a doubled batch into its copies without a size that only the call knows: ONNX wants numbers to cut at."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

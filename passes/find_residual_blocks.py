@@ -1,7 +1,5 @@
 """Find the residual blocks of a denoiser by dataflow: no module name, attribute name or hint is read."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Sequence

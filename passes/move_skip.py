@@ -1,7 +1,5 @@
 """Have the sampler's table add the sample to a prediction ``sample + f``, so that the blocks inside f are found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from ttscompile.ir.graph import Graph, Ref

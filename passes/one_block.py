@@ -1,7 +1,5 @@
 """Make one residual block of a denoiser that has no residual stream, so that whole evaluations can be reused."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from ttscompile.ir.graph import Node, Ref, TensorType

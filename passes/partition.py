@@ -1,7 +1,5 @@
 """Cut the denoiser into prologue, stem, blocks and tail along its residual stream."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from ttscompile.ir.binding import numbering, one_step_at_a_time

@@ -1,7 +1,5 @@
 """Regroup sums of several branches, so that what is added to the residual stream is one value."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from ttscompile.ir.dataflow import dominators, reachable_from, reaching

@@ -1,7 +1,5 @@
 """A tower for some of its tokens: those whose patches changed; the others keep what they gave."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Split what is concatenated of parts with different binding times: tokens, and the features of a linear layer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import reduce

@@ -1,7 +1,5 @@
 """Give what crosses between the pieces of the program an axis of streams, where the batch is a multiple of B."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from ttscompile.ir.pieces import LoopPiece

@@ -1,7 +1,5 @@
 """Give every attention an axis of heads, and every mask a row for each query: ONNX has none without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from ttscompile.ir.graph import Argument, Node, Ref, TensorType

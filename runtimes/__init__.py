@@ -8,8 +8,6 @@
 - ``policy``: the object that users hold, around any of them; ``load``: how they get it.
 """
 
-from __future__ import annotations
-
 from .open import open_runtime
 from .report import CallReport, Timings
 from .runtime import Runtime

@@ -3,8 +3,6 @@
 Everything comes through ``core.coercion.plain`` first, so that what is checked here is what is computed with.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from typing import Any, TypeAlias

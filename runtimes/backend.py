@@ -1,7 +1,5 @@
 """What differs from one kind of machine to another: executing the pieces of an artifact. ``Runtime`` does the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

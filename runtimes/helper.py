@@ -1,7 +1,5 @@
 """One thread that works beside the caller's."""
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable

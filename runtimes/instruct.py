@@ -1,7 +1,5 @@
 """The text of a task in place of its tokens, for a robot that has the policy's tokenizer. Imports no torch."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from typing import Any

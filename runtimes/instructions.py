@@ -13,8 +13,6 @@ since most cells add what they added the step before, few of its rows have to be
 block by block in the order of the summation only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Which entries of the rollout cache a call of an artifact's plans can read, and what keeping them takes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """From the name of an artifact to a policy that can be called: ``load``. ``docs/design.md`` section 8."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ttscompile.artifact.files import check_file

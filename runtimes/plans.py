@@ -1,7 +1,5 @@
 """The plan that a call executes: a caller's that is legal, a named one that was repaired, or the pruner's."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar

@@ -4,8 +4,6 @@ The semantics are LeRobot's: the first frame of an episode stands for those befo
 end before the next one is computed.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Inputs for calls that stand for any other: to time them, or to hold two precisions against each other."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

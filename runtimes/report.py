@@ -1,7 +1,5 @@
 """What a runtime says about a call that it made."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from ttscompile.core.envelope import FAR

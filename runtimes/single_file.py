@@ -1,7 +1,5 @@
 """What a plan of an artifact wants as inputs of its single ONNX file; needs numpy alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

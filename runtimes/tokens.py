@@ -4,8 +4,6 @@ What a token gave is kept by camera and stream of the batch, with the pixels tha
 held against these pixels, not against the frame before, so that slow changes add up until they are seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias

@@ -1,7 +1,5 @@
 """From a checkpoint to the fastest policy that is safe, as one call: convert, learn, choose."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path

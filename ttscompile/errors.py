@@ -4,8 +4,6 @@ One tree, so that a caller can catch ``TtscompileError`` and print it: the messa
 what was expected, what was found, and what to do about it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -4,8 +4,6 @@ A part gives the same bits wherever it is done, as long as the processors are of
 in the same way, and whatever is random in it was drawn before, or has a seed of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager

@@ -12,8 +12,6 @@ Everything that decides is a state machine without clock or thread, driven by ``
 - ``shadow``: a compiled policy beside the original that acts.
 """
 
-from __future__ import annotations
-
 from .executor import AsyncExecutor
 from .feasibility import Feasibility
 from .guard import GuardLimits

@@ -14,8 +14,6 @@ Who owns what:
   that is over.
 """
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Mapping
 from numbers import Real

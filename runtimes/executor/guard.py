@@ -3,8 +3,6 @@
 No clock, no threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import copysign

@@ -1,7 +1,5 @@
 """Time as the executor sees it; and what calls take, measured by it."""
 
-from __future__ import annotations
-
 import inspect
 import threading
 import time

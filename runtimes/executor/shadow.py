@@ -4,8 +4,6 @@ The *original* belongs to whoever calls the shadow; the *compiled policy* to the
 their order. What was found is under one lock, held for microseconds.
 """
 
-from __future__ import annotations
-
 import atexit
 import copy
 import threading

@@ -3,8 +3,6 @@
 ``AsyncExecutor`` calls every method under its lock, so each takes microseconds.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Whoever is outside of this package imports it from here.
 """
 
-from __future__ import annotations
-
 from .copies import LOCAL, FleetSettings, ray_copies
 from .openpi import OpenPiServer
 from .server import FleetServer, Plans

@@ -1,7 +1,5 @@
 """Copies of a policy on a Ray cluster, which answer requests of one plan in batches (Ray Serve)."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The server that openpi's clients ask: that of a fleet, in openpi's protocol, with one policy of this process."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Mapping

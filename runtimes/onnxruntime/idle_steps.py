@@ -5,8 +5,6 @@ the session of ``advance`` takes 37 us at Push-T's size, and 14 us so. Sample, p
 lie one behind the other, so that every operation has plain memory to work on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The reference as a backend: an artifact in, the same calls as every other runtime."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

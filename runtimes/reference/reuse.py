@@ -1,7 +1,5 @@
 """What one cell of the lattice adds and writes: ``docs/design.md`` section 2, literally."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

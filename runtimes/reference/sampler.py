@@ -1,7 +1,5 @@
 """The sampler's step with torch, plain and differentiable: what is carried from step to step, and how it moves on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 The library answers pings by itself, as fast as they come, and keeps fragments of a message until the last one.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection

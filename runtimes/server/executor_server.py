@@ -4,8 +4,6 @@
 pool of a fixed size.
 """
 
-from __future__ import annotations
-
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any

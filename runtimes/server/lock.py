@@ -1,7 +1,5 @@
 """What a server asks of those who come: a token, and TLS so that nobody reads it on the way."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import os

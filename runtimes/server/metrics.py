@@ -1,7 +1,5 @@
 """Figures of a server in the text format that Prometheus reads (version 0.0.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

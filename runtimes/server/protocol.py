@@ -1,7 +1,5 @@
 """Messages of the executor's server: JSON texts, one answer a request. ``docs/serve.md`` has the protocol."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Mapping

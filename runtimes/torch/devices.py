@@ -1,7 +1,5 @@
 """Devices and types that torch may have, and whether it does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from copy import copy

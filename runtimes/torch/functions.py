@@ -14,8 +14,6 @@ as. In a narrower type, what several products read is converted once: autocast w
 every operation that is saved is a kernel of three microseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count

@@ -1,7 +1,5 @@
 """How far a plan may go: from the original, and with a number of denoising steps."""
 
-from __future__ import annotations
-
 from .manifest import Manifest
 
 BOUND = 0.1

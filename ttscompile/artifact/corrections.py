@@ -3,8 +3,6 @@
 Beside them stands what was recorded to fit them: ``envelope/FIELD``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from typing import Any

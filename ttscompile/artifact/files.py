@@ -1,7 +1,5 @@
 """Files on disk: hashes, and writes that either happened or did not."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import fcntl

@@ -6,8 +6,6 @@ objects with one key: ``{"ref": name}``, ``{"batch": multiple}``, ``{"enum": [ki
 run, in ``ir.evaluate``.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

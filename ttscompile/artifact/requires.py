@@ -1,7 +1,5 @@
 """What an artifact may ask of this machine: an onnxruntime for its graphs, and memory in proportion to its files."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os

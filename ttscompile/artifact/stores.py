@@ -1,7 +1,5 @@
 """Files of an artifact that an update writes anew: the plans' arrays, weights of pruners, and those of blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

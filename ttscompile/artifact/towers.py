@@ -1,7 +1,5 @@
 """Records of the manifest about image encoders that can compute some of their tokens."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The manifest of the schema before the present one, as JSON of the present one. ``docs/stability.md`` promises one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What calibrations of all kinds are given alike: refused where it cannot be, and what follows from it."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence

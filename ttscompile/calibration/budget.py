@@ -3,8 +3,6 @@
 A latency is measured, with onnxruntime on this machine.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The calls that calibration works on: observation, noise, and what the dense policy answers."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence

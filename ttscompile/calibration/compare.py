@@ -5,8 +5,6 @@ how far its actions are from those of the original, and what a call takes: all p
 else the machine does hits all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -12,8 +12,6 @@ be told apart; the root grows as the error does. ``docs/decisions.md`` has the m
 noise changes nothing the unit is another one (``measure.points.pairs``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

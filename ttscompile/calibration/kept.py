@@ -3,8 +3,6 @@
 Of a build also which of them is the default: all of them judged and timed, in one run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

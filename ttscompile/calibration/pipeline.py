@@ -1,7 +1,5 @@
 """Calibration, as one straight line: trials -> what each proposer proposes -> the judge -> artifact; and its result."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -1,7 +1,5 @@
 """The proposer of schedules: a strategy at work as long as there is time, the baseline, and plans beside the target."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a calibration has done so far: a file in the artifact's directory."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping

@@ -3,8 +3,6 @@
 As many as an error allows; twice and half as many for the plans beside the target.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations

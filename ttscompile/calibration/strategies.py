@@ -1,7 +1,5 @@
 """The strategies by name: this project's own, the paper's, and those of others."""
 
-from __future__ import annotations
-
 import pkgutil
 
 from ..errors import CalibrationError

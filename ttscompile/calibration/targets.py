@@ -1,7 +1,5 @@
 """The calls of a calibration, and what the dense policy answers to them: computed once, and saved as it grows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 

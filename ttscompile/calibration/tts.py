@@ -8,8 +8,6 @@ crowded schedules. Where there are few others, it tries them all; else it moves 
 at first, until no move helps. The winner's correction is fitted again, on all calls.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

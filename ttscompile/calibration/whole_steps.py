@@ -1,7 +1,5 @@
 """Schedules of whole steps, each with a correction of its own, and how good they are on calls it was not fitted on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

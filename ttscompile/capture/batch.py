@@ -6,8 +6,6 @@ take no longer. A size that is ``5 * c`` in one graph and ``7 * c`` in the other
 is a number; anything else is refused.
 """
 
-from __future__ import annotations
-
 from ..errors import CaptureError
 from ..ir.graph import Argument, Batch, Graph, Node, Size, TensorType
 

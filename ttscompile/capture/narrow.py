@@ -4,8 +4,6 @@ A policy executes the first actions of what it predicts. In a network with causa
 before it, so those at the end can be left out of sample and graph; what is left stays as it was, but for rounding.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

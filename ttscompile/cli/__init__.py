@@ -4,8 +4,6 @@ Results go to standard output, as a table or with ``--json`` as one JSON documen
 warnings go to standard error. ``ending`` has the exit statuses.
 """
 
-from __future__ import annotations
-
 import click
 
 from ttscompile import __version__

@@ -1,7 +1,5 @@
 """``ttscompile bench``: what calls take, whether they keep up with a loop, and how far off their actions are."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``ttscompile build``: from a checkpoint to the fastest policy that is safe."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``ttscompile calibrate``: an artifact learns its plan from a few trajectories."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

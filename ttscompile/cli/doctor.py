@@ -1,7 +1,5 @@
 """``ttscompile doctor``: what stands in the way of a machine, an artifact, a checkpoint and recordings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -11,8 +11,6 @@
 | 143 | ended from outside (SIGTERM) |
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

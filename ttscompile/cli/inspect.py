@@ -1,7 +1,5 @@
 """``ttscompile inspect``: what is in an artifact, as tables, as a picture of a plan, or all of it on a page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

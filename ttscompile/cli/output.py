@@ -1,7 +1,5 @@
 """Where results and progress of the commands go, and how tables are written."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -3,8 +3,6 @@
 That is given in the words of a command line: pictures, a state, or an archive of arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

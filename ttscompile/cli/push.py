@@ -1,7 +1,5 @@
 """``ttscompile push``: an artifact and its model card go to the hub."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """Options of a command in parts, each with a heading in the help; and those of commands that read recorded episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

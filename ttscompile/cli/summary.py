@@ -1,7 +1,5 @@
 """What an artifact is, as tables: for ``convert``, ``calibrate`` and ``inspect``; and what a ``build`` tried."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from rich.console import Console

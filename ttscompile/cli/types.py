@@ -4,8 +4,6 @@ click's own ranges let ``nan`` through, its paths the empty one, and its strings
 carries as halves of characters that nothing can print.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import math
 import os

@@ -1,7 +1,5 @@
 """``ttscompile verify``: is the artifact what it says, does it act as the original, and do its plans save anything?"""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

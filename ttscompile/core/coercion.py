@@ -5,8 +5,6 @@ that, and the code that computes does not; so it is refused here, or left behind
 tensors are known without importing torch.
 """
 
-from __future__ import annotations
-
 import operator
 import sys
 from typing import Any, TypeAlias

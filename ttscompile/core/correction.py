@@ -20,8 +20,6 @@ The idea is that of solvers fitted to one model (Bespoke solvers, arXiv 2310.190
 here fitted to one model *and* one schedule of reuse, by least squares, with the policy's own noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -9,8 +9,6 @@ encoder gives a correction, ``condition [B, N]``::
 In units of the deviation of each component that is Mahalanobis' distance, over the largest one that was recorded.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

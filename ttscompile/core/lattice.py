@@ -4,8 +4,6 @@ Everything here is numpy and pure. ``docs/design.md`` section 2 has the semantic
 executes them literally, and ``origins`` is the same meaning solved ahead of time, for lowering.
 """
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The one door for paths that somebody gives: files and directories come in, and nothing that may be read for ever."""
 
-from __future__ import annotations
-
 import os
 import stat
 from pathlib import Path

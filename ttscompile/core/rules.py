@@ -3,8 +3,6 @@
 A reader of records that somebody else wrote (``artifact.typed_json``) holds every value against the rules of its field.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Falcon (arXiv 2503.00339) begins a call with earlier actions and as much noise as a step in the middle of the loop has.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

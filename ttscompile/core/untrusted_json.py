@@ -1,7 +1,5 @@
 """The one reader of JSON that somebody else wrote: manifests, configurations of checkpoints, recordings."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -15,8 +15,6 @@ samples, never memories.
 After the last step a corrected sample is clipped where the sampler has clipped it (``bounded``).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from .correction import FEATURES, Correction, correction_flops

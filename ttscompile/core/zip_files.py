@@ -1,7 +1,5 @@
 """Zip files of strangers: a directory of at most so many entries, and bytes, before Python makes objects of them."""
 
-from __future__ import annotations
-
 import zipfile
 from typing import IO, Any
 

@@ -1,7 +1,5 @@
 """``python -m ttscompile.doctor [TARGET]``."""
 
-from __future__ import annotations
-
 import sys
 
 from .diagnosis import main

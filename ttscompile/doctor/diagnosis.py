@@ -4,8 +4,6 @@ Needs the standard library alone, so that it can say that numpy is missing: ``py
 works where the command line does not. Nothing is sent anywhere, and nothing is changed.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Sequence

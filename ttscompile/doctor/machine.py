@@ -1,7 +1,5 @@
 """Processor, cores, memory, clock and load of this machine, from ``/proc`` and ``/sys``; standard library alone."""
 
-from __future__ import annotations
-
 import os
 import platform
 import statistics

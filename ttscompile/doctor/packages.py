@@ -1,7 +1,5 @@
 """Python, the packages that matter, and what onnxruntime offers; standard library alone."""
 
-from __future__ import annotations
-
 import importlib
 import platform
 import re

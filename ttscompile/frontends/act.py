@@ -7,8 +7,6 @@ Source: Zhao et al., Learning Fine-Grained Bimanual Manipulation with Low-Cost H
 ``lerobot.policies.act`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

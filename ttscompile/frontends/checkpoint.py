@@ -5,8 +5,6 @@ answered by the inert stand-ins below, so neither package is needed and neither 
 own list is refused before a single object is built.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import zipfile

@@ -56,7 +56,8 @@ class TowerConfig:
     def __post_init__(self) -> None:
         settings = Settings(vars(self), "an encoder's ")
         for field in fields(self):
-            if field.type == "int" and (field.name, vars(self)[field.name]) != ("eos_token_id", 0):  # no size: 0 is one
+            whole = field.type in (int, "int")  # a text where annotations are not evaluated
+            if whole and (field.name, vars(self)[field.name]) != ("eos_token_id", 0):  # no size: 0 is one
                 settings.number(field.name, most=_MOST.get(field.name, _MOST_OTHERWISE))
         settings.choice("hidden_act", *ACTIVATIONS)
         if self.hidden_size % self.num_attention_heads:

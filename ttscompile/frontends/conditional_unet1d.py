@@ -7,8 +7,6 @@ Source: Chi et al., Diffusion Policy (arXiv 2303.04137), the convolutional netwo
 2205.09991); FiLM of Perez et al. (arXiv 1709.07871).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal

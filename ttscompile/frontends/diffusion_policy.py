@@ -5,8 +5,6 @@ policy is rebuilt from configuration and weights; neither these packages nor rob
 for all of them is here; each kind of policy is a row of ``_POLICIES``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

@@ -9,8 +9,6 @@ Source: robomimic 0.2 (Mandlekar et al., arXiv 2108.03298), from which ``Diffusi
 (arXiv 1509.06113).
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections import OrderedDict

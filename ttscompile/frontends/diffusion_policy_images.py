@@ -5,8 +5,6 @@ It is resize, centre crop, a ResNet and the mean over its map.
 Source: ``MultiImageObsEncoder`` and ``get_resnet`` of real-stanford/diffusion_policy (Chi et al., arXiv 2303.04137).
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ given the observation: as tokens, as a vector, at its steps, or in the sample. E
 gives the features of each observed step.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Collection, Mapping

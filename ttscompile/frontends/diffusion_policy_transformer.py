@@ -6,8 +6,6 @@ Source: ``DiffusionTransformerLowdimPolicy`` and ``DiffusionTransformerHybridIma
 real-stanford/diffusion_policy.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

@@ -4,8 +4,6 @@ Source: ``DiffusionUnetLowdimPolicy``, ``DiffusionUnetHybridImagePolicy`` and ``
 real-stanford/diffusion_policy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from typing import Any, Literal
 

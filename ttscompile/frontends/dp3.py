@@ -8,8 +8,6 @@ Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., ar
 (arXiv 1612.00593).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -3,8 +3,6 @@
 The compiler changes no module that it was given, and holds no weight more often than it has to.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import NamedTuple
 

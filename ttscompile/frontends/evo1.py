@@ -5,8 +5,6 @@ An attribute's name is that of lerobot's weights, but for those that ``lerobot_e
 Sources: Lin et al., Evo-1 (arXiv 2511.04555); ``lerobot.policies.evo1`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

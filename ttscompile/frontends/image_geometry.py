@@ -1,7 +1,5 @@
 """Resizing and centre-cropping images as torchvision does, as matrix products: without torchvision, and exportable."""
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 from torch.nn import functional

@@ -1,7 +1,5 @@
 """An instruction that is compiled in: its tokens, as the tokenizer of the checkpoint makes them."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ worked out here, lazily: a key that is never asked for may hold anything. ``eval
 comparisons and if/else, read with ``ast`` and evaluated by hand; Python's ``eval`` is never called.
 """
 
-from __future__ import annotations
-
 import ast
 import itertools
 import operator

@@ -6,8 +6,6 @@ part of the module, so that the compiled policy takes what the robot measures.
 Source: ``ACTPolicy.predict_action_chunk`` of huggingface/lerobot 0.6, and its processors.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A LeRobot policy's ``config.json``: what all types of policies have in it, read and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

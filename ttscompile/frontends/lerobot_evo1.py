@@ -4,8 +4,6 @@ Neither lerobot nor transformers is needed. Sizes of the language model, InternV
 folder, which lerobot needs, too. Source: ``Evo1Policy.predict_action_chunk`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Neither lerobot nor transformers is needed. Source: ``SmolVLAPolicy.predict_action_chunk`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Neither lerobot nor transformers is needed. Source: ``XVLAPolicy.predict_action_chunk`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The denoising loops of a checkpoint: the one that it was trained to run in, and the one that was asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 

@@ -7,8 +7,6 @@ Source: ``lerobot.policies.multi_task_dit`` of huggingface/lerobot 0.6, after Pe
 with Transformers (arXiv 2212.09748): adaLN-Zero with six modulations a layer.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Written from the description of the network, with the attribute names of torchvi
 Source: He et al. (arXiv 1512.03385); group norm in the place of batch norm as in Diffusion Policy (arXiv 2303.04137).
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 

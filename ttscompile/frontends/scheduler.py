@@ -12,8 +12,6 @@ one sampler are told apart. So ``leading``, diffusers' own default, stays that o
 DPM-Solver++ where the sample is bounded.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Mapping
 from typing import Any

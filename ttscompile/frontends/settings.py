@@ -1,7 +1,5 @@
 """JSON that another program wrote, a checkpoint's configuration, each entry checked as it is taken."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Attribute names are those under which lerobot saves the weights. Sources: Shukor
 ``lerobot.policies.smolvla`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ An attribute's name is that of lerobot's weights, but for those that ``lerobot_x
 Sources: Zheng et al., X-VLA (arXiv 2510.10274); ``lerobot.policies.xvla`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -6,8 +6,6 @@ is no network, that folder is all that is read. Nothing of a repository is execu
 checked by ``load`` as any other, and a checkpoint read by ``convert`` as any other.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

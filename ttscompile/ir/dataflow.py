@@ -1,7 +1,5 @@
 """Analyses of a graph: what depends on what, and through which values every path must go."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from .graph import Graph, Node

@@ -1,7 +1,5 @@
 """FLOPs of a graph: multiply and add counted as two, contractions only (element-wise work is not counted)."""
 
-from __future__ import annotations
-
 from .graph import Graph, Node
 from .operations import Types, operation
 from .program import Pieces

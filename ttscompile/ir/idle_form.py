@@ -18,8 +18,6 @@ Where the tail is affine itself, y is [0, 1] and the rest of the above: predicti
 the whole network (``passes.one_block``) A H is zero, and the prediction is the total's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

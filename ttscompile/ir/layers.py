@@ -1,7 +1,5 @@
 """The layers inside a network that is one block: what ``verify`` looks at when it names the one that is broken."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from .flops import node_flops

@@ -9,8 +9,6 @@ To add an operation, add its name to the group below that says what it is, or a 
 more to do: operations are evaluated by torch under their own names, and lowered by torch's ONNX exporter.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -5,8 +5,6 @@ in the manifest and of its session. Values between pieces have the names that th
 inputs and outputs that no denoiser has are named here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final

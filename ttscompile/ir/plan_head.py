@@ -1,7 +1,5 @@
 """The numbers that the plan head begins with: ``insert_pruner`` writes them, and training starts from them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -5,8 +5,6 @@ stream's own, so a value that crosses from one piece of the program to another n
 crosses as ``[m, B, ...]``, ``[B, m, ...]``, or ``[c, B, r, ...]`` where both happened, which is a reshape.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The tokens of a vision transformer: which values of a tower have a row for each patch, and which row is of which."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

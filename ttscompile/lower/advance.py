@@ -10,8 +10,6 @@ Steps without a computed block need a model of the sum that they add alone (``ir
 Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficient and one for the correction; 31 us so.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

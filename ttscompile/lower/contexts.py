@@ -1,7 +1,5 @@
 """Values that the loop reads beside the stream, in the model of the whole call: made once, read by step."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

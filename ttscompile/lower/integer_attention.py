@@ -11,8 +11,6 @@ Keys and values are in -64..64: then no processor's sums saturate, whatever the 
 for constants. ``docs/decisions.md`` has the figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

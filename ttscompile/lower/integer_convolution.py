@@ -4,8 +4,6 @@ The input becomes uint8 first, with one scale and zero point for the whole tenso
 quarter of the bytes; then it is what ``precision`` makes of a matrix product. ``docs/decisions.md`` has the figures.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

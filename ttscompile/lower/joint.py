@@ -1,7 +1,5 @@
 """ONNX models that hold all residual blocks: one runs any of them, the other all in a row; see ``ir.pieces.Joint``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from onnx import GraphProto, ModelProto, NodeProto, TensorProto, ValueInfoProto, helper

@@ -19,8 +19,6 @@ After (two dimensions, as a matrix product wants them)::
     %y : [B, 16, 64]  = aten.reshape.default(%l, [B, 16, 64])
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -14,8 +14,6 @@ branch that reads them, where onnxruntime packs them. The loop is written anew h
 the package, and its tests hold it against the runtimes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

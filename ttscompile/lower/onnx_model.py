@@ -1,7 +1,5 @@
 """From what torch's exporter writes to the ONNX model of a piece: our names, weights without data, nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 

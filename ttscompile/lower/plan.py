@@ -5,8 +5,6 @@ that are there when the step begins (``from_table``, ``from_rollout``), plus FOR
 same step (``from_step``). A step has one gap more than it has computed blocks. Rows are in order of execution.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@
 A schedule is one plan for all streams, so this loop runs once; so it does for one stream, whatever its plan.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

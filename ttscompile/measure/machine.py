@@ -1,7 +1,5 @@
 """What a timing was taken on: without it a figure in milliseconds says little."""
 
-from __future__ import annotations
-
 import os
 import platform
 from contextlib import suppress

@@ -4,8 +4,6 @@ The distance between what a plan and the original answer is the energy distance 
 ``calibration.judge``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations

@@ -5,8 +5,6 @@ another one waits for ever, and so for a lock that another one held at that mome
 relied on there, even one without threads of its own: calls report to a thread of onnxruntime's, with its locks.
 """
 
-from __future__ import annotations
-
 import os
 
 LONGEST_WAIT = 10.0

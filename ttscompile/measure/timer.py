@@ -1,7 +1,5 @@
 """The one timer: candidates take turns, so that whatever else the machine does hits all of them alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median, quantiles

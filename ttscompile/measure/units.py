@@ -1,7 +1,5 @@
 """How figures are written for people."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 

@@ -1,7 +1,5 @@
 """This package's version, and versions to compare; the standard library alone, for the doctor."""
 
-from __future__ import annotations
-
 import re
 
 VERSION = "0.1.0"

@@ -1,7 +1,5 @@
 """The report of an artifact: its facts, what is measured now, and what was measured before."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What a page is made of, and the page as HTML in which everything is escaped."""
 
-from __future__ import annotations
-
 import base64
 import importlib
 from dataclasses import dataclass

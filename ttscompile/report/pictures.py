@@ -3,8 +3,6 @@
 They are narrow, so that their text can be read where a phone makes them narrower still.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

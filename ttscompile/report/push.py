@@ -1,7 +1,5 @@
 """An artifact, with a card made of what it says of itself, into a repository of the hub."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """What an artifact is, as a JSON document: what ``inspect --json`` prints."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import Any
 

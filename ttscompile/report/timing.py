@@ -1,7 +1,5 @@
 """Timing of policies that take turns, call by call, on the same observations and noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial

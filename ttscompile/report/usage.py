@@ -1,7 +1,5 @@
 """Which heads, branches and tables of an artifact its plans use, and what the calls of an episode execute."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ residual stream; but all of it is linear, so that F alone is the denoiser, and t
 Source: Karras et al., arXiv 2206.00364, table 1, and Euler's method, which is DDIM in these variables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Nothing is probed here: the methods are written down, and tests hold them against an integration in float64. Numpy only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -14,8 +14,6 @@ when the table is held against it. One operation of diffusers' own is not in flo
 rounds the sample to float32.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Whatever is wrong with a recording is a ``TrajectoryError`` of any function of this room.
 """
 
-from __future__ import annotations
-
 from .episodes import Episode, load_trajectories, read_npz
 
 __all__ = ["Episode", "load_trajectories", "read_npz"]

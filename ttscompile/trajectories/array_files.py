@@ -4,8 +4,6 @@ The former are a zarr group with ``data/NAME [F, ...]`` and ``meta/episode_ends 
 ``data/DEMO/obs/NAME [F, ...]``, a group for each demonstration.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ order; or, with ``{"frames": true}`` in its ``meta``, frames ``[F, ...]``, from 
 replay buffer of Diffusion Policy, an HDF5 file of robomimic and a LeRobot data set hold frames.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import warnings

@@ -1,7 +1,5 @@
 """Whether recordings fit a policy: names, pictures, ranges and rate; for the doctor, and for who learns from them."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

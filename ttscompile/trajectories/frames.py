@@ -1,7 +1,5 @@
 """Frames of recorded episodes, whatever file they come from, as the observations of a policy."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

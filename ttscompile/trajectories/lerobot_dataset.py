@@ -5,8 +5,6 @@ tables ``meta/episodes/**/*.parquet`` that say where in them an episode begins. 
 LeRobot does it.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

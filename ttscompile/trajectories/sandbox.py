@@ -5,8 +5,6 @@ in C may crash. The reader may take so much memory and time, and writes no file.
 a line of JSON and its bytes, so that its memory does not grow with the arrays.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

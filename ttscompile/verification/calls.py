@@ -1,7 +1,5 @@
 """The rungs of whole calls on the recorded inputs: against the original, between runtimes, and of each plan."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType

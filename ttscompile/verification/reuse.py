@@ -3,8 +3,6 @@
 A cache that never engages gives perfect actions, and saves nothing: so neither is enough alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """What a rung of the ladder found, and all of them together."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any

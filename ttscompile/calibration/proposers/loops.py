@@ -12,8 +12,6 @@ less than the bound does. Loops that are further come last. They may only give `
 that is too far even for that is left out, and so is one whose cheapest call takes longer than the best plan so far.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Mapping
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Which parts compute in the artifact's other precision: all but those that change the actions most."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The proposer of plans that depend on the observation: the plan head, trained as its paper trains it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ Falcon (arXiv 2503.00339) begins calls so. A call of few steps may go on with th
 judge also gives each plan the chunk of another episode, as if the world had changed between two calls.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """When a token of an image encoder is computed anew: the setting that computes the fewest, of those that are near."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 

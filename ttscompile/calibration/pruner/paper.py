@@ -13,8 +13,6 @@ within the budget. A single call may compute more; the notes say how many cells 
 comes with the head is its plans frozen: the cells that it computes most often.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np

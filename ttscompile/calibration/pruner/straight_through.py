@@ -6,8 +6,6 @@ taken from the dense call with the same noise, which is known: it costs nothing,
 is what the sparse call should come to. So an update computes the cells of its plans, and no others.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
