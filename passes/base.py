@@ -1,7 +1,5 @@
 """What a pass is: a rewriting of the program with a contract that is checked every time it runs."""
 
-from __future__ import annotations
-
 import abc
 from dataclasses import dataclass
 from typing import Generic, TypeVar, get_type_hints

@@ -28,9 +28,8 @@ from safetensors.torch import save_file
 import ttscompile
 from ttscompile.core.spec import Noise
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.act import ACT
 from ttscompile.frontends.eager import eager_policy
-from ttscompile.frontends.lerobot_act import as_saved, read_config
+from ttscompile.frontends.lerobot_act import ACT, as_saved, read_config
 from ttscompile.measure.machine import fingerprint, one_line
 
 STATE, IMAGE, SIZE = "observation.state", "observation.images.camera{}", (480, 640)

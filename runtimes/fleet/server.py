@@ -22,8 +22,7 @@ from ttscompile.runtimes.liveness import reading_earlier_calls
 from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock
-from ttscompile.runtimes.server.metrics import Metric
-from ttscompile.runtimes.server.protocol import Request, read_arrays
+from ttscompile.runtimes.server.protocol import Metric, Request, read_arrays
 
 METHODS = {"info": frozenset[str](), "predict": frozenset({"obs", "plan"})}
 

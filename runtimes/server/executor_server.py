@@ -14,8 +14,7 @@ from ttscompile.runtimes.executor.executor import AsyncExecutor
 from .admission import ServerLimits
 from .listener import Listener
 from .lock import Lock
-from .metrics import Metric, of_statistics
-from .protocol import METHODS, Request, read_arrays
+from .protocol import METHODS, Metric, Request, of_statistics, read_arrays
 
 WAITS_PER_CLIENT = 4
 """Threads that may wait for an action, a client: one for it, the others for those before it that vanished waiting."""

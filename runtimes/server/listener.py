@@ -25,8 +25,7 @@ from ttscompile.errors import ExecutorError, TtscompileError, needing
 
 from .admission import Admission, AdmittingSocket, Pace, ServerLimits
 from .lock import Lock
-from .metrics import CONTENT_TYPE, Metric, exposition
-from .protocol import LARGE, Message, Methods, Request, answer, read_request
+from .protocol import CONTENT_TYPE, LARGE, Message, Methods, Metric, Request, answer, exposition, read_request
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

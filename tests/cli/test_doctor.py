@@ -16,7 +16,7 @@ from tests.plans import store_schedules
 from ttscompile.cli import main
 from ttscompile.core.finding import Finding, Level
 from ttscompile.core.lattice import uniform_plan
-from ttscompile.doctor import diagnosis as doctor, machine as doctor_machine, packages as doctor_packages
+from ttscompile.doctor import diagnosis as doctor, machine as doctor_machine
 from ttscompile.doctor.target import artifact_findings
 
 
@@ -105,18 +105,18 @@ def test_it_says_what_is_missing_where_hardly_anything_is_installed(calibrated: 
 
 
 def test_packages_that_are_too_old_or_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = doctor_packages.version
+    real = doctor_machine.version
     versions = {"numpy": "1.26.4", "torch": None, "rich": None}
 
     def version(name: str) -> str:
         if name in versions:
             if versions[name] is None:
-                raise doctor_packages.PackageNotFoundError(name)
+                raise doctor_machine.PackageNotFoundError(name)
             return str(versions[name])
         return real(name)
 
-    monkeypatch.setattr(doctor_packages, "version", version)
-    findings = doctor_packages.package_findings()
+    monkeypatch.setattr(doctor_machine, "version", version)
+    findings = doctor_machine.package_findings()
     assert found("numpy", findings).level is Level.PROBLEM
     assert found("numpy", findings).remedy.startswith("Run: pip install 'numpy>=2.0'")
     assert found("rich", findings).level is Level.WARNING, "the command line's alone"
@@ -127,10 +127,10 @@ def test_packages_that_are_too_old_or_missing(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_requirements_are_read_with_their_extras() -> None:
-    wanted = doctor_packages.requirements()
+    wanted = doctor_machine.requirements()
     assert ("numpy", "2.0", "") in wanted
     assert ("torch", "2.11", "compile") in wanted
-    assert doctor_packages.release("2.13.0+cpu") == (2, 13)
+    assert doctor_machine.release("2.13.0+cpu") == (2, 13)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from ttscompile.frontends.act import ACT, ACTConfig
-from ttscompile.frontends.lerobot_act import as_saved, read_config
+from ttscompile.frontends.lerobot_act import ACT, ACTConfig, as_saved, read_config
 from ttscompile.frontends.lerobot_config import ENVIRONMENT, STATE
 
 from .hybrid import Array, fill

@@ -9,8 +9,6 @@ that they come back bit by bit. A tensor type has the sizes that depend on the b
 What a type does not say stands beside it as a ``core.rules.Rule``.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 import re

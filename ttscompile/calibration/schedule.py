@@ -167,8 +167,8 @@ class Schedule(Proposer):
         self.told = (
             f"{budget.cells} of {steps * blocks} cells may be computed; strategy {request.strategy!r} took {told}"
         )
-        if "steps" in found.notes and (more := task.whole.told_of_episodes(found.notes["steps"])):
-            self.told += f"; {more}"
+        if "steps" in found.notes and (heard := task.whole.told_of_episodes(found.notes["steps"])):
+            self.told += f"; {heard}"
         if found.pruner is not None:
             yield self._of_pruner(plan, found)
         named, self.skipped = named_plans(crowded, task, self._strategy, budget.cells)

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.finding import Finding, Level
-from .machine import machine_findings
-from .packages import package_findings
+from .machine import machine_findings, package_findings
 from .target import target_findings
 
 MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PROBLEM"}

@@ -5,8 +5,6 @@ An attribute's name is that of transformers' weights, but for those that ``lerob
 Sources: Xiao et al., Florence-2 (arXiv 2311.06242); Ding et al., DaViT (arXiv 2204.03645).
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

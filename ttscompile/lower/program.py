@@ -4,8 +4,6 @@ A graph becomes a module whose weights are *inputs*, so that the exporter can ne
 translates its operations, and ``name_model`` turns the weights' inputs into initializers without data.
 """
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Iterable, Iterator

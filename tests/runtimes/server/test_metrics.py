@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ttscompile.runtimes.server.lock import Lock, hashed
-from ttscompile.runtimes.server.metrics import Metric, exposition
+from ttscompile.runtimes.server.protocol import Metric, exposition
 
 from .serving import LIMITS, Broken, ServerError, connected, serving
 from .watching import figures, get
