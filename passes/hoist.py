@@ -1,7 +1,5 @@
 """Partial evaluation of the denoising loop: what does not depend on the noisy sample leaves it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

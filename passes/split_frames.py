@@ -1,7 +1,5 @@
 """Work that depends on one frame alone: one image of one camera, or the instruction."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 

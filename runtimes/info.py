@@ -1,7 +1,5 @@
 """What a compiled policy is, for whoever calls it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ The other positions see them through the network. It is the replacement of RePai
 resampling, and with one draw of noise for all steps, so that a call stays a function of its arguments.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The runtimes that there are, by name, and how each is opened. A new one is a row of ``RUNTIMES``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The object that users hold: observations in, actions out. ``docs/design.md`` section 8."""
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable, Mapping

@@ -7,8 +7,6 @@ The helper is one thread that lives as long as the runtime, and only where a pru
 queue. Everything else runs on the caller's thread. What executes the pieces is a ``Backend``.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import wait

@@ -13,8 +13,6 @@ the last frame that comes early enough, which may be a frame period sooner than 
 other without a gap in the actions if ``frame period + 2 * latency + margin <= predicted`` and ``latency <= play``.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass

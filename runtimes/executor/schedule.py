@@ -1,7 +1,5 @@
 """What a robot did and will do in one episode: actions given out, scheduled, and in reserve. No clock, no threads."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ It knows nothing of the ``AsyncExecutor`` around it, so that an executor which n
 ends it.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import threading

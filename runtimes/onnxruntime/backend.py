@@ -3,8 +3,6 @@
 Its loop (``decode``, ``workspace``) shares nothing with the reference's on purpose: each is the other's test.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

@@ -13,8 +13,6 @@ A session keeps its weights as its products read them, so sessions of single blo
 need, are opened when some plan does.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import warnings

@@ -1,7 +1,5 @@
 """A zipped artifact, unpacked without trusting it: only declared files, only plain names, only declared sizes."""
 
-from __future__ import annotations
-
 import shutil
 import stat
 import tempfile

@@ -3,8 +3,6 @@
 Nothing but numpy is needed to read one.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping

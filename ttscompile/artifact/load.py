@@ -1,7 +1,5 @@
 """Open an artifact: everything is checked before anything of it is used. Needs numpy alone."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

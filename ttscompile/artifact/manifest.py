@@ -3,8 +3,6 @@
 Frozen records; ``codec`` writes and reads them. ``docs/design.md`` section 5.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field

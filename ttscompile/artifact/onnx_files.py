@@ -8,8 +8,6 @@ that ``convert`` never writes are refused: those that loop, which may never end,
 Source: the format of messages, https://protobuf.dev/programming-guides/encoding/, and the field numbers of onnx.proto.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 

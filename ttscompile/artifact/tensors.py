@@ -5,8 +5,6 @@ data); data.
 Source: the format's description, https://github.com/huggingface/safetensors#format.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -4,8 +4,6 @@ A backend computes on a view. It has what an artifact with this loop alone would
 files are the artifact's own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -3,8 +3,6 @@
 It is captured with two batch sizes, and ``batch`` finds the batch among the numbers.
 """
 
-from __future__ import annotations
-
 import logging
 import operator
 import re

@@ -1,7 +1,5 @@
 """``ttscompile convert``: a trained policy becomes an artifact."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Resizing images in numpy as the originals do it: with their proportions, or to a whole shape in steps of bytes."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

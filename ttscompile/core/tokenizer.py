@@ -1,7 +1,5 @@
 """Text to tokens, with the small ``tokenizers`` wheel; imported when it is used."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

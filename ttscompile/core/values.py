@@ -1,7 +1,5 @@
 """What the numbers of an observation may be, wherever they come from: a call, a frame, a recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

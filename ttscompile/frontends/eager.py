@@ -3,8 +3,6 @@
 It shares nothing with the loop of the reference runtime on purpose: what it gives is the record that this is held to.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """What of a checkpoint goes wrong on a robot without an error: cameras, statistics, instruction, chunk."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -6,8 +6,6 @@ embodiment has, there are those of one.
 Sources: Bjorck et al., GR00T N1 (arXiv 2503.14734); ``lerobot.policies.groot`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ An attribute's name is that of transformers' weights, or in a layer of InternViT
 Source: Zhu et al., InternVL3 (arXiv 2504.10479).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -4,8 +4,6 @@ A type of policy is a module beside this one and a row in ``TYPES``. Everything 
 safetensors; neither lerobot nor torchvision is needed.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 

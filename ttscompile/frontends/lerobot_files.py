@@ -5,8 +5,6 @@ With these files beside it, an artifact is a policy of the type ``ttscompile``, 
 make batches, and tokens of the instruction where that is an input.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ Sizes are those of the weights. Neither lerobot nor transformers is needed. Sour
 huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

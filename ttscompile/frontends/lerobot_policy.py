@@ -1,7 +1,5 @@
 """What is around the network of every LeRobot policy: its observations, its sampler, its chunk and its weights."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -3,8 +3,6 @@
 Source: ``lerobot.processor`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -3,8 +3,6 @@
 Sources: ``lerobot.policies.common`` of huggingface/lerobot 0.6, and openpi, where it is from.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Adapters (LoRA, arXiv 2106.09685) that PEFT saved in the directory of a LeRobot policy, merged into their base."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

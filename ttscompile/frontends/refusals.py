@@ -4,8 +4,6 @@ Tables of signs, tried in order, and one error. Nothing here loads anything: a s
 configuration, an entry of a checkpoint, the name of a weight, a file in a directory, or the first bytes of a file.
 """
 
-from __future__ import annotations
-
 import re
 import zipfile
 from collections.abc import Iterable, Mapping

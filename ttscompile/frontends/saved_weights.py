@@ -1,7 +1,5 @@
 """Saved weights: reading them, and whether they are those of a network; said in the same words, whoever saved them."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence

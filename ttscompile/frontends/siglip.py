@@ -5,8 +5,6 @@ Its layers are those of CLIP's encoders. Attribute names are those under which t
 Source: Zhai et al., Sigmoid Loss for Language Image Pre-Training (arXiv 2303.15343).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

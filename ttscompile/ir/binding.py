@@ -1,7 +1,5 @@
 """Binding times: the earliest moment at which each value of a graph is known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ..core.spec import PolicySpec

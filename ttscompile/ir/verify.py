@@ -1,7 +1,5 @@
 """Invariants of graphs and programs, which the driver checks after capture and after every pass."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Mapping
 
 import numpy as np

@@ -8,8 +8,6 @@ Each stream of a batch may follow a plan of its own; those that follow one go th
 outputs are in ``docs/howto/cpp.md``; ``runtimes.single_file.inputs_of`` gives what belongs to a plan of an artifact.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """What an artifact says of itself, as sections of a report."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import groupby

@@ -1,7 +1,5 @@
 """The ladder: every rung stands on those below it."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence

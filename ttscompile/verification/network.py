@@ -5,8 +5,6 @@ inside. It is slow and plain on purpose: where a call goes wrong and this goes r
 runtime that puts them together is not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Parts in another precision: are their integers the weights, rounded, and does a call give what it should?"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

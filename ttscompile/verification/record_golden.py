@@ -3,8 +3,6 @@
 ``ttscompile.artifact.golden`` says what is kept and how; ``ttscompile.verification`` compares with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

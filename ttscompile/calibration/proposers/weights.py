@@ -8,8 +8,6 @@ answer as one of many: progressive distillation (arXiv 2202.00512), here for one
 alone.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping
