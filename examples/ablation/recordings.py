@@ -163,7 +163,7 @@ def main(
         for count in sorted({min(one, most) for one in counts}):
             rows.append(study.row(count, calls, draws, held_out, others, bar.tell))
     if as_json:
-        print_json([asdict(one) for one in rows])
+        print_json({"rows": [asdict(one) for one in rows]})
         return
     show(rows, held_out, others.count)
 

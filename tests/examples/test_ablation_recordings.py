@@ -32,7 +32,7 @@ def test_it_prints_a_row_for_each_number_of_episodes(once: Once, recorded: Path)
     words += ["--calls", "8", "--judged", "8", "--draws", "2"]
     made = CliRunner().invoke(recordings.main, [*words, "--json"])
     assert made.exit_code == 0, made.output
-    few, all_ = json.loads(made.stdout)
+    few, all_ = json.loads(made.stdout)["rows"]
     assert (few["episodes"], all_["episodes"]) == (2, 6), "two of eight are held out"
     for row in (few, all_):
         assert row["calls"] == 8 and np.isfinite(list(row["errors"].values())).all()
