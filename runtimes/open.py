@@ -9,7 +9,7 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import View, require_held
 from ttscompile.core.coercion import integer
 from ttscompile.core.plan import Plan
-from ttscompile.core.spec import BF16, FP16, INT8
+from ttscompile.core.spec import BF16, FP16, INT4, INT8
 from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError
 from ttscompile.ir.pieces import parts_of
 
@@ -70,7 +70,7 @@ def _torch(threads: int, device: str) -> Open:
 
 
 RUNTIMES = {
-    "onnxruntime": Kind(_onnxruntime, install="onnxruntime", held=(INT8,), tokens=True),
+    "onnxruntime": Kind(_onnxruntime, install="onnxruntime", held=(INT8, INT4), tokens=True),
     "torch": Kind(_torch, install="ttscompile[compile]", made=(BF16, FP16), devices=True),
     "reference": Kind(_reference, install="ttscompile[compile]"),
 }

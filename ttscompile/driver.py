@@ -18,7 +18,7 @@ from .capture.export import capture
 from .capture.narrow import narrow, needed, unneeded
 from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
-from .core.spec import FP32, INT8, ORIGINAL, PolicySpec
+from .core.spec import FP32, ORIGINAL, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy
 from .frontends.encoded import own_copy, parts
@@ -105,7 +105,7 @@ def convert(
         base: of a LoRA adapter: directory or ``hf://org/name`` of what it adapts; None for what its configuration says.
         prediction_horizon: predict only the first so many steps of the policy's horizon; see ``compile_denoiser``.
             ``needed``: as many as a robot needs, where no action depends on those after it; all where some does.
-        precision: of the weights: ``fp32`` or ``int8``; see ``compile_denoiser``.
+        precision: of the weights: ``fp32``, ``int8`` or ``int4``; see ``compile_denoiser``.
         keep_fp32: what stays in fp32 beside another precision; see ``compile_denoiser``.
         single_file: where one ONNX file of the whole call goes too, for programs without ttscompile; None for none. It
             is of the loop that is asked for, or else of the policy's own. ``ttscompile.lower.single_file`` describes
@@ -158,7 +158,8 @@ def compile_denoiser(
         prediction_horizon: predict only the first so many steps of the sample: less to compute at every step, with the
             same actions, where attention is causal. Refused where it is not. None predicts all.
         precision: of the weights of residual blocks and of the prologue, image encoders above all: ``fp32``, or
-            ``int8``, which is faster on processors with integer dot products. Plan ``full`` then computes in it; fp32
+            ``int8``, which is faster on processors with integer dot products; or ``int4``, which is smaller: four bits
+            in blocks and prefix, and eight in image encoders. Plan ``full`` then computes in it; fp32
             stays in the artifact too, for plan ``dense``. What it does to the actions is not measured here:
             ``calibrate(..., learn=("precision",))`` does, and leaves out the parts that change them too much.
         keep_fp32: parts that stay in fp32 whatever the precision: ``blocks``; ``prologue``, or a piece of it by name,
@@ -213,7 +214,7 @@ def _compile(
         return program
     models = lower_program(program)
     explain("lower", (f"{len(models)} ONNX models",))
-    lowered = None if precision == FP32 else _lower_pieces(program, models, keep_fp32, explain)
+    lowered = None if precision == FP32 else _lower_pieces(program, models, precision, keep_fp32, explain)
     whole: bytes | None = None
     if single_file is not None:  # made before anything is written: without one there is no artifact either
         own, weights = ({}, {}) if lowered is None else (lowered.models, lowered.weights)
@@ -249,14 +250,16 @@ def _require_apart(single_file: str | os.PathLike[str], directory: str | os.Path
         raise ArtifactError(f"{single_file}: {problem}. {other}")
 
 
-def _lower_pieces(program: Program, models: Models, keep_fp32: Collection[str], explain: Explain) -> LoweredPieces:
-    """Blocks and prologue in eight bits. What that changes is not known here: calibration measures it."""
+def _lower_pieces(
+    program: Program, models: Models, precision: str, keep_fp32: Collection[str], explain: Explain
+) -> LoweredPieces:
+    """Blocks and prologue in eight or four bits. What that changes is not known here: calibration measures it."""
     parts, asked, staying = parts_to_lower(program, keep_fp32)
-    own, weights, notes = lower_precision(models, program.weights, INT8, parts)
+    own, weights, notes = lower_precision(models, program.weights, precision, parts)
     if any(map(is_block, own)):
         own |= lower_all_blocks(program.pieces.blocks, {**models, **own})
     explain("lower_precision", (*notes, *staying))
-    return LoweredPieces(INT8, own, weights, asked)
+    return LoweredPieces(precision, own, weights, asked)
 
 
 def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = lambda stage, notes: None) -> Program:

@@ -139,7 +139,8 @@ def _contents(view: View) -> dict[str, bytes]:
 
     A session copies what it needs of them when it is opened.
     """
-    sizes = {name: record.bytes for name, record in view.manifest.acting.items() if name.endswith(".safetensors")}
+    there = view.artifact.present
+    sizes = {n: record.bytes for n, record in view.manifest.acting.items() if n in there and n.endswith(".safetensors")}
     small = sum(sizes.values()) < MAPPED
     return {name: read_file(view.artifact.files / name, size) for name, size in sizes.items()} if small else {}
 

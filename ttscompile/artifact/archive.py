@@ -109,6 +109,8 @@ def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
             f"{path}: expected at most {allowed} bytes in so small an archive; its manifest declares {total}. {_AGAIN}"
         )
     for name, record in manifest.files.items():
+        if name not in entries and manifest.precision is not None and name == manifest.precision.fp32:
+            continue
         if name not in entries:
             raise ArtifactError(f"{path}: the file {name} is missing; {MANIFEST} lists it. {_AGAIN}")
         _copy(archive, entries[name], record.bytes, path, folder / name)

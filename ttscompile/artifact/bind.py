@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ArtifactError
+from ..ir.pieces import LAYERS
 from . import tensors
 from .files import write_synced
 from .manifest import PieceRecord, PrecisionRecord
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 EMBEDDED_BYTES = 256
 """Tensors up to this size are stored in the model: onnxruntime's shape inference reads shapes and axes, and refuses to
 do so from external data."""
+
+LEAST_APART = 2**25
+"""Bytes that a copy of an artifact has to save by what it leaves out. Push-T would save 30 MB of 50."""
 
 REPORT = "This is an error in ttscompile; please report it."
 
@@ -94,6 +98,19 @@ def interface(model: ModelProto) -> tuple[tuple[str, ...], tuple[str, ...]]:
     initialized = {tensor.name for tensor in model.graph.initializer}
     inputs = tuple(value.name for value in model.graph.input if value.name not in initialized)
     return inputs, tuple(value.name for value in model.graph.output)
+
+
+def read_in_fp32(
+    constants: Mapping[str, npt.NDArray[Any]], models: Mapping[str, ModelProto], lowered: LoweredPieces
+) -> dict[str, npt.NDArray[Any]]:
+    """Those of a program's constants that no call reads in which all parts have the other precision; few are none.
+
+    The piece ``layers`` does not count, which is for ``verify``.
+    """
+    opened = {**{name: model for name, model in models.items() if name != LAYERS}, **lowered.models}
+    read = {tensor.name for model in opened.values() for tensor in _initializers(model.graph)}
+    apart = {name: value for name, value in constants.items() if name not in read}
+    return apart if sum(value.nbytes for value in apart.values()) >= LEAST_APART else {}
 
 
 def store_pieces(

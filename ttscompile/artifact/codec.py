@@ -123,6 +123,8 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     of_model = {name: piece for name, piece in pieces.items() if name != own[0] and not name.startswith(own[1])}
     read = {stores["program"], stores["weights"], *(piece["file"] for piece in of_model.values())}
     hashes = {name: record.sha256 for name, record in sorted(manifest.acting.items())}
+    joined = manifest.precision.joined if manifest.precision is not None else None
+    model_hashes = hashes if joined is None else {**hashes, stores["weights"]: joined}
     model_identity = _checksum(
         {
             "spec": {key: value for key, value in document["spec"].items() if key != "source"},
@@ -130,7 +132,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
             "pieces": of_model,
             **{key: document[key] for key in ("contexts", "features", "tokens")},
             "stores": {key: stores[key] for key in ("program", "weights")},
-            "files": {name: digest for name, digest in hashes.items() if name in read},
+            "files": {name: digest for name, digest in model_hashes.items() if name in read},
         }
     )
     precision = {k: v for k, v in (document["precision"] or {}).items() if k != "asked"}
@@ -251,7 +253,8 @@ def _uses(manifest: Manifest) -> Counter[str]:
     common = {piece.file for piece in manifest.pieces.values()} | set(manifest.loop_pruners.values())
     uses = Counter(common | {name for name in vars(manifest.stores).values() if name})
     if manifest.precision is not None:
-        uses.update((manifest.precision.weights, *manifest.precision.models.values()))
+        own = manifest.precision
+        uses.update((own.weights, *own.models.values(), *([own.fp32] if own.fp32 else ())))
     for one in manifest.weights.values():
         uses.update((one.weights, *one.models.values(), *one.precision_models.values()))
         uses.update([one.precision_weights] if one.precision_weights else [])
@@ -275,7 +278,9 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value, 
         value.fail(f"models called {' and '.join(names.OF_ALL_BLOCKS)} too")
     if not set(record.asked) <= {names.part_of(piece) for piece in known} - {names.part_of(piece) for piece in models}:
         value.fail("parts of the policy that none of its models belongs to, as those that stay fp32")
-    _require_alone(value, (record.weights, *record.models.values()), uses)
+    if (record.fp32 is None) is not (record.joined is None):
+        value.fail("a file of what is read in fp32 alone, and the hash of both files together, or neither")
+    _require_alone(value, record.files, uses)
 
 
 def _check_weights(manifest: Manifest, record: WeightsRecord, value: Value, uses: Mapping[str, int]) -> None:

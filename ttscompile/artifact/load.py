@@ -16,7 +16,7 @@ from ..core.envelope import Envelope
 from ..core.lattice import check_schedule, dense_plan
 from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
-from ..core.spec import BF16, FP16, FP32, INT8
+from ..core.spec import BF16, FP16, FP32, INT4, INT8
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir import pieces as names
 from ..ir.graph import Graph
@@ -33,7 +33,7 @@ from .requires import check_runtime, check_size
 from .strict_json import REMEDY, Value, parse
 
 TABLE_PREFIX = "table/"
-PRECISIONS = (FP32, INT8, BF16, FP16)
+PRECISIONS = (FP32, INT8, INT4, BF16, FP16)
 LOOP_PREFIX = "loop/"
 """Of the tables of loops beside the original's: ``loop/NAME/CONTEXT``."""
 
@@ -72,6 +72,31 @@ class Artifact:
     _derived: dict[str, Plan] = field(default_factory=dict, repr=False)
 
     @property
+    def without(self) -> str | None:
+        """Name of the file of what is read in fp32 alone, where this copy lacks it; None for a whole artifact."""
+        record = self.manifest.precision
+        return None if record is None or record.fp32 in (None, *self._stamps) else record.fp32
+
+    @property
+    def bytes(self) -> int:
+        """Of all files that are there, but the manifest."""
+        return sum(self.manifest.files[name].bytes for name in self.present)
+
+    @property
+    def present(self) -> list[str]:
+        """Names of all files that are there, but the manifest."""
+        return [name for name in self.manifest.files if name in self._stamps]
+
+    def require_whole(self) -> None:
+        """Raise ArtifactError if this copy lacks what is read in fp32 alone."""
+        if self.without is not None:
+            held = f"it has plans in {self.manifest.precision_name} alone: 'NAME@{self.manifest.precision_name}'"
+            raise ArtifactError(
+                f"{self.path}: expected {self.without}, for what is asked is in fp32; this copy lacks it, and {held}."
+                " Take one of these, or copy that file too."
+            )
+
+    @property
     def files(self) -> Path:
         """The folder to read from, within ``reading``: still the one that was checked when another is at ``path``."""
         return self._folder.files
@@ -83,7 +108,7 @@ class Artifact:
         Raises:
             ArtifactChangedError: a file was changed or replaced since it was checked.
         """
-        wanted = given or tuple(self.manifest.files)
+        wanted = given or self.present
         with self._folder.unchanged(wanted) as now:
             for name in wanted:
                 if now[name] == self._stamps.get(name):
@@ -121,7 +146,8 @@ class Artifact:
             return self.plans[own]
         if name not in self._derived:
             record, plan = self.manifest.precision, self.plans[own].exact
-            held = names.parts_of(self.manifest.pieces if precision != INT8 else () if record is None else record.kept)
+            own = () if record is None else record.kept
+            held = names.parts_of(own if precision in (INT8, INT4) else self.manifest.pieces)
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
             self._derived[name] = replace(plan)  # another object than the one in fp32 may be
         return self._derived[name]
@@ -147,6 +173,7 @@ class Artifact:
         for name, value in self._document.keys("graphs", "streams")["graphs"].members().items():
             graphs[name] = graph_from_json(value)
             constants, stored = graphs[name].constants, own.get(name, {**self.pruner, **self.weights})
+            constants = {n: kind for n, kind in constants.items() if n in stored or self.without is None}
             kinds = {n: (kind.dtype, kind.at(1)) for n, kind in constants.items()}
             tensors.check_arrays("constant", {n: stored[n] for n in constants if n in stored}, kinds, value.path)
         return MappingProxyType(graphs)
@@ -242,10 +269,16 @@ def _load_directory(path: Path, shown: Path) -> Artifact:
     with folder.unchanged([MANIFEST]) as first:
         manifest = read_manifest(folder.files)
         check_runtime(manifest.requires, folder.files)
-        with folder.unchanged(manifest.files) as stamps:
-            for name, record in manifest.files.items():
-                check_file(folder.files / name, record)
+        with folder.unchanged(present(manifest, folder.files)) as stamps:
+            for name in stamps:
+                check_file(folder.files / name, manifest.files[name])
             return _open(path, folder, {**first, **stamps}, manifest)
+
+
+def present(manifest: Manifest, directory: Path) -> list[str]:
+    """The files that have to be there: all but what is read in fp32 alone, where it is not."""
+    apart = None if manifest.precision is None else manifest.precision.fp32
+    return [name for name in manifest.files if name != apart or os.path.lexists(directory / name)]
 
 
 def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Manifest) -> Artifact:
@@ -257,15 +290,19 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
         )
     check_size(manifest, directory)
     check_models(directory, manifest.models, manifest.acting)
-    others = sorted(manifest.files.keys() - manifest.models - {manifest.stores.program})
+    others = sorted(stamps.keys() - manifest.models - {manifest.stores.program, MANIFEST})
     tensors.require_few((directory / name for name in others), directory)
     stored = tensors.read(directory / manifest.stores.weights)
+    apart = None if manifest.precision is None else manifest.precision.fp32
+    if apart in stamps:
+        stored = MappingProxyType({**stored, **tensors.read(directory / str(apart))})
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}
     for name, record in manifest.weights.items():
         block_weights[name] = own = tensors.read(directory / record.weights)
         of_weights = {n: (str(stored[n].dtype), stored[n].shape) for n in own if n in stored}
-        tensors.check_arrays(f"{name} weight", own, of_weights, directory)
+        known = own if apart in (None, *stamps) else {n: own[n] for n in of_weights}
+        tensors.check_arrays(f"{name} weight", known, of_weights, directory)
     return Artifact(
         path=path,
         manifest=manifest,

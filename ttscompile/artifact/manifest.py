@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 from ..core.correction import Correction, numbers_of
 from ..core.lattice import PlanArray, plan_flops
 from ..core.plan import ORIGINAL, UNIFORM, TokenReuse
-from ..core.rules import LoopName, Positive, Rule, Sha256, Share
-from ..core.spec import FP32, PolicySpec, SamplerTable
+from ..core.rules import OMITTED, LoopName, Positive, Rule, Sha256, Share
+from ..core.spec import FP32, INT4, INT8, PolicySpec, SamplerTable
 from ..ir.graph import TensorType
 from ..ir.pieces import BLOCKS, PRUNER, is_block, part_of
 from ..ir.program import Binding
@@ -212,17 +212,28 @@ class PrecisionRecord:
     """Parts with weights of another precision than fp32, which the artifact holds beside those in fp32.
 
     Attributes:
-        name: ``int8``.
+        name: ``int8``; or ``int4``, which is of blocks, prefix and step, beside frame pieces in int8.
         weights: name of the file with their weights.
         models: name of the ONNX file by piece, where it is not the file of the piece: of blocks, and with them of the
             pieces that hold all of them; and of pieces of the prologue.
         asked: parts (``ir.pieces.part_of``) that stay fp32 because it was asked for.
+        fp32: name of the file with what is read in fp32 alone. A copy of the artifact may lack it, and computes no plan
+            in fp32 then. None where that would save little.
+        joined: sha256 of the file that the artifact's weights would be with these among them, as in one without this
+            precision; so the model has one identity.
     """
 
-    name: Annotated[str, Rule("one of 'int8'", "int8".__eq__)]
+    name: Annotated[str, Rule("one of 'int8', 'int4'", (INT8, INT4).__contains__)]
     weights: FileName
     models: Mapping[str, FileName]
     asked: tuple[str, ...] = ()
+    fp32: FileName | None = field(default=None, metadata=OMITTED)
+    joined: Sha256 | None = field(default=None, metadata=OMITTED)
+
+    @property
+    def files(self) -> set[str]:
+        """Names of all its files."""
+        return {self.weights, *self.models.values()} | ({self.fp32} if self.fp32 else set())
 
     @property
     def blocks(self) -> int:

@@ -73,7 +73,8 @@ class View:
 
     @property
     def weights(self) -> Arrays:
-        """Constants of all pieces but the pruner's, as blocks have them from step 1 on."""
+        """Constants of all pieces but the pruner's, as blocks have them from step 1 on; see ``require_whole``."""
+        self.artifact.require_whole()
         return {**self.artifact.weights, **self._trained} if self._trained else self.artifact.weights
 
     @property
@@ -170,6 +171,8 @@ def require_held(artifact: Artifact, plan: Plan) -> None:
     """Raise ArtifactError unless the artifact holds models for every precision of a plan."""
     record = artifact.manifest.precision
     held = {} if record is None else dict.fromkeys(record.kept, record.name)
+    if not held.items() <= plan.precision.items():
+        artifact.require_whole()
     for part, precision in plan.precision.items():
         if held.get(part) != precision:
             known = ", ".join(f"{name} in {one}" for name, one in held.items()) or "fp32 alone"

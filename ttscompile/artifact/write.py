@@ -21,7 +21,7 @@ from ..ir.program import Binding, Program
 from ..ir.verify import verify_pieces
 from ..measure.versions import VERSION
 from . import files, records, stores, tensors
-from .bind import LoweredPieces, Place, bind, places_of, store_pieces
+from .bind import LoweredPieces, Place, bind, places_of, read_in_fp32, store_pieces
 from .codec import decode, encode, identities
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 PROGRAM = "program.json"
-WEIGHTS = "weights.safetensors"
+WEIGHTS, WEIGHTS_FP32 = "weights.safetensors", "weights_fp32.safetensors"
 GOLDEN = "golden.safetensors"
 
 _STALE = re.compile(
@@ -250,8 +250,12 @@ def _fill(
     own_rows = [name for name, context in contexts.items() if context.binding is Binding.TABLE]
     loops = {ORIGINAL: program.pieces.tables, **program.pieces.loop_tables}
     tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in own_rows}
-    tensors.write(folder / WEIGHTS, {**stored, **tables})
-    places = places_of(folder / WEIGHTS, stored)
+    apart = {} if lowered is None else read_in_fp32(stored, models, lowered)
+    tensors.write(folder / WEIGHTS, {**{n: value for n, value in stored.items() if n not in apart}, **tables})
+    places = places_of(folder / WEIGHTS, {n: value for n, value in stored.items() if n not in apart})
+    if apart:
+        tensors.write(folder / WEIGHTS_FP32, apart)
+        places |= places_of(folder / WEIGHTS_FP32, apart)
     pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()
     own = {PRUNER: pruner} if PRUNER in graphs else {}
     further = {of_loop(PRUNER, loop): program.loop_weights[loop] for loop in program.pieces.loop_pruners}
@@ -266,6 +270,8 @@ def _fill(
     for name in pieces:
         files.write_synced(folder / onnx_files[name], bind(models[name], places | pruner_places.get(name, {}), name))
     precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
+    if precision is not None and apart:
+        precision = replace(precision, fp32=WEIGHTS_FP32, joined=tensors.digest({**stored, **tables}))
     plans = dict[str, PlanRecord]()
     if precision is not None or loop != ORIGINAL:
         held = {} if precision is None else dict.fromkeys(precision.kept, precision.name)

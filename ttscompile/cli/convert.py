@@ -51,7 +51,8 @@ SECTIONS = (Section("Another denoising loop", ("sampler", "steps")), LEROBOT)
     type=click.Choice(PRECISIONS),
     default=FP32,
     show_default=True,
-    help="Keep the weights of residual blocks and prologue in this precision. int8 is faster on processors with VNNI;"
+    help="Keep the weights of residual blocks and prologue in this precision. int8 is faster on processors with VNNI,"
+    " int4 half as large and slower;"
     " 'ttscompile calibrate --learn precision' measures what it does, and leaves out the parts where that is much.",
 )
 @click.option(

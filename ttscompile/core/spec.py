@@ -19,8 +19,8 @@ from .pictures import in_bytes
 from .rules import LOOP_NAME, OMITTED, DType, LoopName, Positive, Shape
 from .sampler import FloatArray as FloatArray, SamplerTable as SamplerTable
 
-FP32, INT8, BF16, FP16 = "fp32", "int8", "bf16", "fp16"
-PRECISIONS = (FP32, INT8)
+FP32, INT8, INT4, BF16, FP16 = "fp32", "int8", "int4", "bf16", "fp16"
+PRECISIONS = (FP32, INT8, INT4)
 """Names of what an artifact can hold its weights in."""
 
 ORIGINAL = "original"

@@ -1,9 +1,10 @@
-"""Weights in eight bits: each product with constant weights, in blocks and prologue, becomes an integer product.
+"""Weights in eight or four bits: products with constant weights, in blocks and prologue, become integer products.
 
 Blocks of a policy stream their weights from memory once a step, which is what they wait for; a quarter of the bytes,
 and the processor's integer dot product, make them faster. An image encoder waits for arithmetic, of which the integer
-dot product does four times as much. Everything beside these products stays in float32: layer norms, softmax,
-activations, biases, the residual itself, and attention among few tokens (``integer_attention``).
+dot product does four times as much. A large table, such as an embedding, has its rows in eight bits, since it is large.
+Everything beside these stays in float32: layer norms, softmax, activations, biases, the residual itself, and attention
+among few tokens (``integer_attention``).
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from ..core.spec import FP32, INT8, PRECISIONS
+from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, pack
+from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
+from ..ir.pieces import BLOCKS, CONDITION, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, frame_name, is_tokens, part_of
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
 from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, integer_convolution, shapes_of
@@ -49,6 +51,14 @@ LARGEST = 127
 
 MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 """Terms of a sum of products that an int32 holds whatever their values."""
+
+
+LEAST_TABLE = 2**20
+"""Numbers of a table whose rows are read in eight bits: an embedding of words has some 10**8."""
+
+FOUR_BITS = (BLOCKS, CONDITION, STEP)
+"""The parts that precision int4 has in four bits, a language model's prefix among them. Image encoders have eight: they
+wait for arithmetic, which takes longer in four."""
 
 
 Matrices = Mapping[str, tuple[str, Array]]
@@ -92,7 +102,7 @@ def lower_precision(
 
     Args:
         models: from ``lower_program``; those of the parts are taken, but for the models that hold all blocks.
-        precision: ``int8``; the models have ``fp32`` already.
+        precision: ``int8`` or ``int4``; the models have ``fp32`` already.
         parts: from ``parts_to_lower``.
 
     Returns:
@@ -113,7 +123,8 @@ def lower_precision(
             if is_tokens(name):  # as many as rows are kept
                 kept = next(value for value in models[name].graph.input if value.name not in (PIXELS, INDEX))
                 size = int(kept.type.tensor_type.shape.dim[0].dim_value)
-            model, own = quantize_model(models[name], weights, 0 if part == BLOCKS else LEAST_ROWS, size)
+            least, bits = 0 if part == BLOCKS else LEAST_ROWS, precision if part in FOUR_BITS else INT8
+            model, own = quantize_model(models[name], weights, least, size, bits)
             if own:
                 lowered[name] = model
                 new.update(own)
@@ -124,7 +135,7 @@ def lower_precision(
     if not made:
         raise LoweringError(
             f"precision {precision!r}: no piece of {' or '.join(parts)} multiplies by a constant float32 matrix"
-            f" (in the prologue {LEAST_ROWS} rows or more), so there is nothing to store in eight bits. Convert with"
+            f" (in the prologue {LEAST_ROWS} rows or more), so there is nothing to store in {precision}. Convert with"
             " precision 'fp32'."
         )
     return made, constants, tuple(notes)
@@ -137,7 +148,7 @@ def _notes(
     if lowered:
         where = f"{len(lowered)} of {len(pieces)} blocks" if part == BLOCKS else part
         convolved = f", {kinds[INTEGER_PRODUCT]} of convolutions" if kinds[INTEGER_PRODUCT] else ""
-        count = kinds[DYNAMIC_PRODUCT] + kinds[INTEGER_PRODUCT]
+        count = kinds[DYNAMIC_PRODUCT] + kinds[INTEGER_PRODUCT] + kinds[BLOCK_PRODUCT]
         megabytes = sum(value.nbytes for value in constants.values()) / 1e6
         attending = f", and {kinds[HEADS]} attentions" if kinds[HEADS] else ""
         yield f"{precision}: {count} matrices of {where}, {megabytes:.1f} MB{convolved}{attending}"
@@ -160,7 +171,7 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
 
 
 def quantize_model(
-    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0, size: int = 1
+    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0, size: int = 1, precision: str = INT8
 ) -> tuple[ModelProto, dict[str, Array]]:
     """One model with its products by constants in integers; inputs and outputs stay as they are.
 
@@ -169,10 +180,12 @@ def quantize_model(
         weights: values of constants, by name. Only these are quantised.
         least_rows: that a product has to have; a product whose rows are not known has none.
         size: what B is taken to be where rows are counted: one stream, or in a form for some tokens all of them.
+        precision: of matrices; convolutions and tables are in int8 in any.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
-        float32 ``[columns]``. No constants if there was nothing to replace.
+        float32 ``[columns]``; of a table int8 and float32 ``[rows, 1]``; in four bits what ``four_bits.pack`` gives. No
+        constants if there was nothing to replace.
     """
     known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
     matrices, shapes = _matrices(model, known), shapes_of(model, size)
@@ -181,7 +194,8 @@ def quantize_model(
     for node in model.graph.node:
         attributes = _attributes(node)
         if not (
-            _integer_product(w, node, known, matrices, shapes, least_rows, store)
+            _integer_product(w, node, known, matrices, shapes, least_rows, store, precision)
+            or _integer_rows(w, node, attributes, known, store)
             or integer_convolution(w, node, attributes, known, shapes, store)
             or integer_attention(w, node, attributes, shapes, size > 1)
         ):
@@ -237,7 +251,8 @@ def _integer_product(
     matrices: Matrices,
     shapes: Mapping[str, Sequence[int]],
     least_rows: int,
-    store: Callable[[str, Array], tuple[str, str]],
+    store: Callable[..., tuple[str, str]],
+    precision: str,
 ) -> bool:
     """Write a product by a constant matrix with integers, if it has as many rows; whether it is one."""
     attributes, flip, bias = _attributes(node), False, ""
@@ -256,20 +271,47 @@ def _integer_product(
     shape = shapes.get(x, ())
     if (math.prod(shape[:-1]) if shape else 0) < least_rows:
         return False
+    if precision == INT4 and known[constant].ndim == 2:
+        inputs = [x, *store(constant, value, INT4), *(["", "", bias] if bias else [])]
+        sizes = dict(zip("KN", value.shape, strict=True))
+        w.ops(BLOCK_PRODUCT, inputs, node.output, domain=DOMAIN, **sizes, **ATTRIBUTES)
+        return True
     w.ops(DYNAMIC_PRODUCT, [x, *store(constant, value), *(["", bias] if bias else [])], node.output, domain=DOMAIN)
     return True
 
 
-def _integers(constants: dict[str, Array], constant: str, matrix: Array) -> tuple[str, str]:
-    """Names of the integers and the scales of a matrix, which go into ``constants``.
+def _integer_rows(
+    w: GraphWriter,
+    node: NodeProto,
+    attributes: Mapping[str, Any],
+    known: Mapping[str, Array],
+    store: Callable[..., tuple[str, str]],
+) -> bool:
+    """Write the rows that are read of a large constant table, an embedding, with integers; whether it is one."""
+    table = known.get(node.input[0]) if node.op_type == "Gather" else None
+    if table is None or table.dtype != np.float32 or table.ndim != 2 or table.size < LEAST_TABLE:
+        return False
+    if attributes.get("axis", 0):
+        return False
+    rows, scales = (w.op("Gather", name, node.input[1]) for name in store(node.input[0], table.T, by_row=True))
+    w.ops("Mul", [w.op("Cast", rows, to=TensorProto.FLOAT), scales], node.output)
+    return True
+
+
+def _integers(
+    constants: dict[str, Array], constant: str, matrix: Array, precision: str = INT8, by_row: bool = False
+) -> tuple[str, str]:
+    """Names of the integers and the scales of a matrix, which go into ``constants``; ``by_row``: turned, as of a table.
 
     No two products share them: onnxruntime 1.31 cannot load such a model where it has to make the integers unsigned
     ("Attempt to replace the existing tensor"), which is on processors whose sums saturate.
     """
-    name = f"{constant}.{INT8}"
+    name = f"{constant}.{precision}"
     while name in constants:
         name += "_"
-    values, scales = quantize_matrix(matrix)
+    values, scales = quantize_matrix(matrix) if precision == INT8 else pack(matrix)
+    if by_row:
+        values, scales = values.T, scales[:, None]
     constants[name], constants[f"{name}.scale"] = np.ascontiguousarray(values), scales
     return name, f"{name}.scale"
 

@@ -11,7 +11,7 @@ from ..artifact.archive import is_checkpoint
 from ..artifact.codec import is_as_written
 from ..artifact.files import check_file
 from ..artifact.golden import load_golden, load_golden_plans
-from ..artifact.load import Artifact, load_artifact, read_manifest, require_artifact_path
+from ..artifact.load import Artifact, load_artifact, present, read_manifest, require_artifact_path
 from ..artifact.manifest import MANIFEST
 from ..artifact.view import view_of
 from ..core.coercion import integer
@@ -101,8 +101,7 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
         remedy = "Copy the artifact again, or convert the checkpoint again."
         told = f"{len(wrong)} of its files are not as written: " * (len(wrong) > 1) + " ".join(wrong)
         return Rung(INTEGRITY, FAILED, told, len(wrong), 0, "files", remedy, details={"wrong": wrong}), None
-    files = artifact.manifest.files
-    size = sum(record.bytes for record in files.values()) / 1e6
+    files, size = artifact.present, artifact.bytes / 1e6
     other = sorted({p.name for p in path.iterdir()} - {MANIFEST, *files}) if path.is_dir() else []
     lie = f"{len(other)} other file{'s lie' if len(other) > 1 else ' lies'} beside them"
     more = f"; {lie}, which nothing reads: {', '.join(other[:3])}" if other else ""
@@ -116,9 +115,9 @@ def _wrong_files(directory: Path) -> list[str]:
     except ArtifactError as error:
         return [str(error)]
     wrong = []
-    for name, record in manifest.files.items():
+    for name in present(manifest, directory):
         try:
-            check_file(directory / name, record)
+            check_file(directory / name, manifest.files[name])
         except ArtifactError as error:
             wrong.append(str(error))
     return wrong

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from ..artifact import tensors
 from ..artifact.golden import Golden, GoldenPlan
 from ..artifact.load import Artifact
+from ..core.four_bits import BLOCK, further_off
+from ..core.spec import INT4, INT8
 from ..errors import ArtifactError
 from ..runtimes.runtime import Runtime
 from .calls import VALUE, computed, replay
@@ -35,7 +37,7 @@ Push-T in int8: 1.8 to 4.6 times a dense call's, which has a fourteenth of its t
 HALF = 0.501
 """Of a step: by so much a number may be off that was rounded in float32."""
 
-_SUFFIX, _SCALE = ".int8", ".scale"
+_SUFFIX, _FOUR, _SCALE = f".{INT8}", f".{INT4}", ".scale"
 
 
 def check_precision(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung | None:
@@ -107,22 +109,39 @@ def _apart(artifact: Artifact, file: str, weights: Mapping[str, npt.NDArray[Any]
     with artifact.reading(file):
         stored = tensors.read(artifact.files / file)
         for name, integers in stored.items():
-            if integers.dtype != np.int8:
+            if integers.dtype not in (np.int8, np.uint8):
                 continue
-            constant, scale = name[: name.rindex(_SUFFIX)], stored[f"{name}{_SCALE}"]
-            if constant not in weights or weights[constant].size != integers.size:
+            four, scale = integers.dtype == np.uint8, stored[f"{name}{_SCALE}"]
+            constant = name[: name.rindex(_FOUR if four else _SUFFIX)]
+            weight = weights.get(constant, np.zeros(0, np.float32))
+            if weight.size != integers.size if not four else not _packs(integers, weight):
                 found = f"{name!r}, {integers.size} integers that stand for no constant of as many numbers"
                 raise ArtifactError(f"{artifact.path}: {file}: {found}. Convert the checkpoint again.")
-            yield _off(integers, scale, weights[constant]), constant
+            yield (_off_in_four if four else _off)(integers, scale, weight), constant
 
 
-def _off(integers: npt.NDArray[np.int8], scale: npt.NDArray[np.float32], weight: npt.NDArray[Any]) -> float:
+def _packs(integers: npt.NDArray[Any], weight: npt.NDArray[Any]) -> bool:
+    """Whether packed integers may be of a matrix, or of the same turned."""
+    sizes = integers.shape[1], len(integers)
+    shapes = (weight.shape, weight.shape[::-1])
+    return weight.ndim == 2 and any((math.ceil(rows / BLOCK), columns) == sizes for rows, columns in shapes)
+
+
+def _off_in_four(integers: npt.NDArray[Any], scale: npt.NDArray[np.float32], weight: npt.NDArray[Any]) -> float:
+    """The largest difference of a block from a matrix, or the same turned, where half a step is plain rounding's."""
+    turned = [one for one in (weight, weight.T) if one.shape[1] == len(integers)]
+    return min(further_off(integers, scale, one) / 2 for one in turned if math.ceil(len(one) / BLOCK) == len(scale.T))
+
+
+def _off(integers: npt.NDArray[Any], scale: npt.NDArray[np.float32], weight: npt.NDArray[Any]) -> float:
     """The largest difference of integers ``[rows, columns]`` from a constant that they were made of, in steps.
 
     Some axes of the constant are the columns, and the numbers of a column may have another order there: they are
     compared as sets. Sorting brings no two sets further apart than they are element by element, so those that were
     rounded are half a step apart at most.
     """
+    if scale.ndim > 1:  # of a table, by row
+        integers, scale = integers.T, scale[:, 0]
     made, (rows, columns), found = np.sort(integers * scale, 0), integers.shape, [np.inf]
     for i, j in combinations(range(weight.ndim + 1), 2):
         if math.prod(weight.shape[i:j]) == columns:

@@ -331,5 +331,5 @@ def _in_precision(artifact: Artifact, weights: Mapping[str, Any]) -> dict[str, A
     record, known, made = artifact.manifest.precision, {**artifact.weights, **weights}, dict[str, Any]()
     for name in filter(is_block, () if record is None else record.models):
         model = onnx.load(artifact.files / artifact.manifest.pieces[name].file, load_external_data=False)
-        made |= quantize_model(model, known)[1]
+        made |= quantize_model(model, known, precision=artifact.manifest.precision_name)[1]
     return made
