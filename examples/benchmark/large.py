@@ -4,6 +4,7 @@
     python examples/benchmark/large.py --unet 512,1024,2048 --horizon 64        # LeRobot's U-Net
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
+    python examples/benchmark/large.py --smolvla --precision int4 --only convert --output DIR     # what it is made of
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
@@ -34,6 +35,9 @@ STEPS = 4
 
 WHOLE = ("smolvla", "evo1", "xvla")
 """LeRobot's policies that are compiled whole, from what is saved of them."""
+
+MOST_FILES = 3
+"""Whose sizes are printed by name."""
 
 MOST_NOTES = 8
 """Of a stage, that are printed."""
@@ -95,15 +99,26 @@ def convert(folder: Path, network: nn.Module, horizon: int) -> None:
         np.save(folder / "expected.npy", eager().numpy())
 
 
-def convert_whole(folder: Path, name: str) -> None:
+def convert_whole(folder: Path, name: str, precision: str = "int8") -> None:
     """Save a policy of its real size, as lerobot does, and convert it."""
     import ttscompile
 
     directory, task = saved(folder, name)
     print(f"{peak():5.2f} GiB before compiling")
     stages = Stages()
-    ttscompile.convert(directory, folder / "compiled", precision="int8", task=task, explain=stages)
+    ttscompile.convert(directory, folder / "compiled", precision=precision, task=task, explain=stages)
     stages.end()
+    tell_sizes(folder / "compiled")
+
+
+def tell_sizes(directory: Path) -> None:
+    """Print what an artifact is made of: its largest files, and the rest of them; and what a copy without fp32 has."""
+    sizes = {path.name: path.stat().st_size / 1e6 for path in directory.iterdir()}
+    largest = sorted(sizes, key=lambda name: -sizes[name])[:MOST_FILES]
+    rest = sum(sizes.values()) - sum(sizes[name] for name in largest)
+    told = ", ".join(f"{name} {sizes[name]:.1f}" for name in largest)
+    whole, apart = sum(sizes.values()), sizes.get("weights_fp32.safetensors", 0.0)
+    print(f"{whole:.1f} MB: {told}, others {rest:.1f}; a copy without fp32 has {whole - apart:.1f}")
 
 
 def saved(folder: Path, name: str) -> tuple[Path, str | None]:
@@ -210,9 +225,11 @@ def main() -> None:
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
-    parser.add_argument("--only", choices=["convert", "run"], help=argparse.SUPPRESS)
+    parser.add_argument("--precision", default="int8", choices=["int8", "int4"], help="of SmolVLA, evo1 and xvla")
+    parser.add_argument("--only", choices=["convert", "run"], help="one of the two processes")
     options = parser.parse_args()
-    policies = {name: (partial(convert_whole, name=name), partial(run_whole, name=name)) for name in WHOLE}
+    convert_to = partial(convert_whole, precision=options.precision)
+    policies = {name: (partial(convert_to, name=name), partial(run_whole, name=name)) for name in WHOLE}
     policies["clip"] = partial(convert_clip), partial(run_clip)
     asked = next((own for name, own in policies.items() if getattr(options, name)), None)
     if asked is not None and options.only == "convert":
@@ -234,6 +251,7 @@ def main() -> None:
             for part in ("convert", "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
                 own += [f"--{name}" for name in policies if getattr(options, name)] + [f"--rounds={options.rounds}"]
+                own += [f"--precision={options.precision}"]
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

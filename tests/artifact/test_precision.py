@@ -1,5 +1,6 @@
 """Blocks of another precision in an artifact: beside fp32, hashed, chosen by a plan; hostile manifests."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +10,12 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from tests.artifact.folders import contents, flip
+import ttscompile
+from tests.artifact.folders import contents, flip, packed
 from tests.artifact.tiny import HORIZON, WIDTH, tiny_models, tiny_program
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile.artifact import codec
+from ttscompile.artifact import bind, codec, tensors
 from ttscompile.artifact.bind import LoweredPieces
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest
@@ -25,6 +27,7 @@ from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import DENSE_STEP, JOINT
 from ttscompile.lower.joint import lower_all_blocks
 from ttscompile.lower.precision import lower_precision, quantize_model
+from ttscompile.runtimes.random_calls import random_calls
 
 
 def lowered(seed: int = 0) -> LoweredPieces:
@@ -150,7 +153,7 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: p.update(name="int4"), "precision.name: expected one of 'int8'"),
+        (lambda p: p.update(name="int3"), "precision.name: expected one of 'int8', 'int4'"),
         (lambda p: p.update(name=8), "precision.name: expected a string"),
         (lambda p: p.update(weights="../weights"), "precision.weights: expected a plain file name"),
         (lambda p: p.update(weights="weights.safetensors"), "which nothing else uses"),
@@ -173,6 +176,10 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
         (lambda p: p.update(asked=["blocks"]), "parts of the policy that none of its models belongs to"),
         (lambda p: p.update(asked={}), "precision.asked: expected a"),
         (lambda p: p.pop("asked"), "missing: ..asked"),
+        (lambda p: p.update(fp32="weights_fp32.safetensors"), "the hash of both files together, or neither"),
+        (lambda p: p.update(joined="0" * 64), "the hash of both files together, or neither"),
+        (lambda p: p.update(fp32="weights.safetensors", joined="0" * 64), "which nothing else uses"),
+        (lambda p: p.update(fp32="../other", joined="0" * 64), "precision.fp32: expected a plain file name"),
         (lambda p: p.update(more=1), "unknown: ..more"),
     ],
 )
@@ -181,6 +188,46 @@ def test_a_hostile_record_is_refused(int8: Path, change: Change, message: str) -
     assert decoded(manifest, lambda p: None).precision == manifest.precision
     with pytest.raises(ArtifactError, match=message):
         decoded(manifest, change)
+
+
+def test_a_copy_may_lack_what_is_read_in_fp32_alone(
+    int8: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bind, "LEAST_APART", 0)
+    whole, copy = write(tmp_path / "whole", lowered()), tmp_path / "copy"
+    apart = {"block.0.weight", "block.1.weight"}
+    assert set(tensors.read(whole / "weights_fp32.safetensors")) == apart
+    joined, one = read_manifest(whole), read_manifest(int8)
+    assert joined.model_identity == one.model_identity and joined.identity != one.identity
+    for name, value in load_artifact(int8).weights.items():
+        np.testing.assert_array_equal(load_artifact(whole).weights[name], value)
+    shutil.copytree(whole, copy, ignore=shutil.ignore_patterns("weights_fp32.safetensors"))
+    artifact, full = load_artifact(copy), load_artifact(whole)
+    assert (artifact.without, full.without) == ("weights_fp32.safetensors", None)
+    assert artifact.manifest == full.manifest and artifact.bytes < full.bytes
+    assert set(full.weights) - set(artifact.weights) == apart
+    zipped = load_artifact(packed(whole, skip="weights_fp32.safetensors"))
+    assert zipped.without == "weights_fp32.safetensors"
+    flip(copy / "weights.safetensors", (copy / "weights.safetensors").stat().st_size - 1)
+    with pytest.raises(ArtifactError, match="weights.safetensors: expected sha256"):
+        load_artifact(copy)
+
+
+def test_a_copy_without_fp32_computes_what_the_whole_does_and_refuses_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bind, "LEAST_APART", 0)
+    whole, copy = write(tmp_path / "whole", lowered()), tmp_path / "copy"
+    shutil.copytree(whole, copy, ignore=shutil.ignore_patterns("weights_fp32.safetensors"))
+    one, other = ttscompile.load(whole), ttscompile.load(copy)
+    ((obs, noise),) = random_calls(one.artifact.manifest.spec, 1, seed=0)
+    expected = one.predict_action(obs, noise=noise)["action_pred"]
+    np.testing.assert_array_equal(other.predict_action(obs, noise=noise)["action_pred"], expected)
+    for plan in ("dense", "full@fp32"):
+        with pytest.raises(ArtifactError, match=r"expected weights_fp32\.safetensors.*'NAME@int8'"):
+            other.predict_action(obs, noise=noise, plan=plan)
+    with pytest.raises(ArtifactError, match=r"expected weights_fp32\.safetensors"):
+        ttscompile.load(copy, "reference", plan="dense")
 
 
 def test_a_precision_of_null_is_refused(int8: Path) -> None:

@@ -18,9 +18,11 @@ from torch.nn import functional
 from tests.lower.modules import captured, random_values
 from tests.lower.running import session
 from tests.runtimes.toys import B, f32, node
+from ttscompile.core.four_bits import unpack
 from ttscompile.errors import LoweringError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Ref
+from ttscompile.lower import precision as lowering
 from ttscompile.lower.precision import LEAST_ROWS, lower_precision, quantize_matrix, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.measure.machine import has_integer_dot_product
@@ -199,7 +201,7 @@ def test_products_of_few_rows_stay_in_the_prologue_and_not_in_blocks() -> None:
 
 
 def test_a_precision_that_cannot_be_had_is_refused_with_what_can() -> None:
-    for name in ("bf16", "int4"):
+    for name in ("bf16", "int3"):
         with pytest.raises(LoweringError, match=f"'{name}': expected one of 'fp32', 'int8'"):
             lower_precision({}, {}, name)
 
@@ -218,6 +220,64 @@ def test_the_product_that_a_convolution_became_is_found_behind_its_reshape() -> 
     found = session(quantised, {**weights, **constants}).run(None, {"x": x})[0]
     expected = functional.conv1d(torch.from_numpy(x), *map(torch.from_numpy, weights.values()), padding=1).numpy()
     assert 0 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 0.02
+
+
+def test_in_four_bits_a_product_reads_blocks_of_the_matrix() -> None:
+    rng = np.random.default_rng(0)
+    weights = {"w": rng.standard_normal((24, 100)).astype(np.float32), "b": rng.standard_normal(24).astype(np.float32)}
+    nodes = [make_node("Gemm", ["x", "w", "b"], ["h"], transB=1), make_node("MatMul", ["h", "w"], ["y"])]
+    quantised, constants = quantize_model(by_hand(nodes, weights, 100, 100), weights, precision="int4")
+    assert [node.op_type for node in quantised.graph.node] == ["MatMulNBits"] * 2
+    assert {name: value.shape for name, value in constants.items()} == {
+        "w.int4": (24, 2, 32),
+        "w.int4.scale": (24, 2),
+        "w.int4_": (100, 1, 32),
+        "w.int4_.scale": (100, 1),
+    }
+    # Numbers that eight bits hold: every block of a row has 127, so that one step of the activations is 1.
+    x = rng.integers(-127, 128, (5, 100)).astype(np.float32)
+    x[:, ::50] = 127
+    first = by_hand(nodes[:1], weights, 100, 24)
+    first.graph.output[0].name = "h"
+    quantised, constants = quantize_model(first, weights, precision="int4")
+    found = session(quantised, {**weights, **constants}).run(None, {"x": x})[0]
+    expected = x @ unpack(constants["w.int4"], constants["w.int4.scale"], 100) + weights["b"]
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-5 * np.abs(expected).max())
+
+
+def test_four_bits_are_of_blocks_and_prefix_and_eight_of_frames() -> None:
+    weights = {"w": np.ones((4, 4), np.float32)}
+    kind = f32(B, 16, 4)
+    product = node("y", "linear.default", kind, Ref("x"), Ref("w"))
+    graph = Graph({"x": kind}, {"w": f32(4, 4)}, (product,), ("y",))
+    names = {"condition": "int4", "step": "int4", "block_00": "int4", "frame_00": "int8"}
+    for name, expected in names.items():
+        part = "blocks" if name == "block_00" else name
+        _, constants, notes = lower_precision({name: lower_graph(graph, name)}, weights, "int4", (part,))
+        assert set(constants) == {f"w.{expected}", f"w.{expected}.scale"}
+        assert notes[0].startswith("int4: 1 matrices")
+
+
+@pytest.mark.parametrize("precision", ["int8", "int4"])
+def test_rows_of_a_large_table_are_read_in_eight_bits(precision: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    weights = {"t": (rng.standard_normal((50, 8)) * 10.0 ** rng.uniform(-2, 2, (50, 1))).astype(np.float32)}
+    kinds = (("i", TensorProto.INT64, ["N"]), ("y", TensorProto.FLOAT, ["N", 8]))
+    ends = [make_tensor_value_info(*kind) for kind in kinds]
+    empty = [TensorProto(name="t", dims=(50, 8), data_type=TensorProto.FLOAT)]
+
+    def model(**attributes: int) -> ModelProto:
+        graph = make_graph([make_node("Gather", ["t", "i"], ["y"], **attributes)], "g", ends[:1], ends[1:], empty)
+        return make_model(graph, opset_imports=[make_opsetid("", 23)], ir_version=10)
+
+    assert quantize_model(model(), weights, precision=precision)[1] == {}, "a small table stays as it is"
+    monkeypatch.setattr(lowering, "LEAST_TABLE", 400)
+    assert quantize_model(model(axis=1), weights, precision=precision)[1] == {}
+    quantised, constants = quantize_model(model(), weights, precision=precision)
+    assert {name: value.shape for name, value in constants.items()} == {"t.int8": (50, 8), "t.int8.scale": (50, 1)}
+    rows = np.array([3, 49, 3, 0])
+    found = session(quantised, constants).run(None, {"i": rows})[0]
+    assert (np.abs(found - weights["t"][rows]) <= 0.501 * constants["t.int8.scale"][rows]).all()
 
 
 def test_convolutions_that_stay_are_counted() -> None:

@@ -164,7 +164,7 @@ def test_a_frame_piece_counts_with_all_of_its_rows(monkeypatch: pytest.MonkeyPat
     [
         ({"precision": "int8", "keep_fp32": "prologue"}, "expected names of parts"),
         ({"keep_fp32": ("prologue",)}, "as does everything in precision 'fp32'"),
-        ({"precision": "int4"}, "expected one of 'fp32', 'int8'."),
+        ({"precision": "int3"}, "expected one of 'fp32', 'int8', 'int4'."),
     ],
 )
 def test_what_cannot_be_is_refused_before_any_work(tmp_path: Path, options: dict[str, object], message: str) -> None:

@@ -22,7 +22,7 @@ from ttscompile.artifact.write import finished
 from ttscompile.core.lattice import Source
 from ttscompile.lower.precision import quantize_matrix
 from ttscompile.runtimes import open_runtime
-from ttscompile.verification.precision import EIGHT_BITS, HALF, _off, check_plans_precision, check_precision
+from ttscompile.verification.precision import EIGHT_BITS, FOUR_BITS, HALF, _off, check_plans_precision, check_precision
 from ttscompile.verification.record_golden import record_plans
 from ttscompile.verification.rung import FAILED, PASSED, Rung
 
@@ -152,6 +152,24 @@ def test_rounding_is_half_a_step_wherever_the_columns_are(seed: int) -> None:
     assert all(_off(integers, scale, weight) <= HALF for weight in ways)
     integers[:, rng.integers(6)] //= 2
     assert all(_off(integers, scale, weight) > HALF for weight in ways)
+
+
+@pytest.mark.slow
+def test_four_bits_have_a_tolerance_of_their_own(tmp_path: Path) -> None:
+    """A scale that is a twentieth too large is further off than plain rounding."""
+    directory = tmp_path / "int4"
+    ttscompile.compile_denoiser(policy.Network().eval(), policy.spec(), directory, precision="int4")
+    rung = ttscompile.verify(directory).rung("precision")
+    assert (rung.status, rung.tolerance) == (PASSED, FOUR_BITS)
+    assert rung.figure is not None and EIGHT_BITS / 10 < rung.figure < FOUR_BITS
+    assert rung.told.startswith("a dense call with int4 in blocks")
+
+    def larger(arrays: dict[str, Any]) -> None:
+        name = next(name for name in arrays if name.endswith(".int4.scale"))
+        arrays[name] *= np.float32(1.2)
+
+    rung = changed(Path(shutil.copytree(directory, tmp_path / "larger")), larger)
+    assert rung.status == FAILED and rung.unit == "of a step"
 
 
 def test_a_constant_without_such_columns_is_far_off() -> None:

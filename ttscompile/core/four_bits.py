@@ -23,6 +23,9 @@ _ZERO, _MOST = 8, 15
 _SHARES = np.float32([0.8, 0.87, 0.94, 1, -0.83, -0.9, -0.97, -1.04])
 """Of the scale that rounds the largest number of a block to the end of the range: those that are tried."""
 
+_LEAST = 1e-12
+"""Squared error of a block, in units of its largest number, that is rounding of float32."""
+
 _PART = 2**22
 """Numbers that are rounded at once: a matrix may be a tenth of the memory."""
 
@@ -52,16 +55,23 @@ def unpack(packed: npt.NDArray[np.uint8], scales: Array, rows: int) -> Array:
 
 def further_off(packed: npt.NDArray[np.uint8], scales: Array, matrix: Array) -> float:
     """How far a packed matrix is from this one: of its worst block, as a share of what plain rounding is off."""
-    blocks, made = _blocks(matrix), _blocks(unpack(packed, scales, len(matrix)))
-    plain = _rounded(blocks, _plain(blocks))[1]
-    least = (1e-6 * np.abs(blocks).max(axis=2)) ** 2 + np.finfo(np.float32).tiny
-    return float(np.sqrt((np.square(made - blocks).sum(axis=2) / (plain + least)).max()))
+    blocks, largest = _of_largest(_blocks(matrix))
+    made = _blocks(unpack(packed, scales, len(matrix))) / largest[:, :, None]
+    plain = _rounded(blocks, _plain(blocks))[1] + np.float32(_LEAST)
+    return float(np.sqrt((np.square(made - blocks).sum(axis=2) / plain).max()))
 
 
 def _blocks(matrix: Array) -> Array:
     """``[columns, blocks, BLOCK]``."""
     filled = np.pad(matrix, ((0, -len(matrix) % BLOCK), (0, 0)))
     return np.ascontiguousarray(filled.T).reshape(matrix.shape[1], -1, BLOCK)
+
+
+def _of_largest(blocks: Array) -> tuple[Array, Array]:
+    """Blocks as shares of their largest numbers, whose squares neither overflow nor vanish; and these numbers."""
+    largest = np.abs(blocks).max(axis=2)
+    largest = np.where(largest < 1 / np.finfo(np.float32).max, np.float32(1), largest)
+    return blocks / largest[:, :, None], largest
 
 
 def _plain(blocks: Array) -> Array:
@@ -78,6 +88,7 @@ def _rounded(blocks: Array, scales: Array) -> tuple[Array, Array]:
 
 
 def _pack(blocks: Array) -> tuple[npt.NDArray[np.uint8], Array]:
+    blocks, largest = _of_largest(blocks)
     best = _plain(blocks)
     integers, error = _rounded(blocks, best)
     for share in _SHARES:
@@ -90,4 +101,4 @@ def _pack(blocks: Array) -> tuple[npt.NDArray[np.uint8], Array]:
         best, error = np.where(better, scale, best), np.where(better, off, error)
         np.copyto(integers, tried, where=better[:, :, None])
     codes = (integers + _ZERO).astype(np.uint8)
-    return codes[..., 0::2] | codes[..., 1::2] << 4, best.astype(np.float32)
+    return codes[..., 0::2] | codes[..., 1::2] << 4, (best * largest).astype(np.float32)

@@ -32,10 +32,7 @@ def provenance(artifact: Artifact) -> Section:
         ("made from", source or "a module of the user's own (compile_denoiser)"),
         ("made by", f"ttscompile {manifest.ttscompile_version}, artifact schema {manifest.schema_version}"),
         ("needs", f"onnxruntime {manifest.requires.onnxruntime} or later (opset {manifest.requires.opset}), numpy"),
-        (
-            "files",
-            f"{len(artifact.present) + 1}, {artifact.bytes / 1e6:.1f} MB; sizes and hashes of all were checked",
-        ),
+        ("files", f"{len(artifact.present) + 1}, {artifact.bytes / 1e6:.1f} MB; sizes and hashes of all were checked"),
     )
     text = "The identity is a hash over weights, normaliser, sampler, plans and preprocessing: whatever prints the same"
     return Section("Identity", (f"{text} one computes the same.",), (Table(("", ""), rows, prose=True),))
