@@ -3,8 +3,8 @@
     python examples/benchmark/four_bits.py [--rounds 9]
 
 The matrices are those of SmolVLA's and pi0's language models and experts, with random weights. All contestants run in
-turn on one thread; times are the processor's, since the machine may be busy, as medians of
-their ratios to fp32 in the same round.
+turn on one thread. Times are the processor's, since the machine may be busy: medians of their ratios to fp32 in the
+same round.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ def session(kind: str, constants: dict[str, Array], sizes: tuple[int, int], **at
 def contestants(matrix: Array) -> dict[str, Any]:
     """Sessions by name."""
     rows, columns = matrix.shape
-    eight, four = (dict(zip(("w", "scale"), made(matrix), strict=True)) for made in (quantize_matrix, pack))
+    names = ("w", "scale")
+    eight: dict[str, Array] = dict(zip(names, quantize_matrix(matrix), strict=True))
+    four: dict[str, Array] = dict(zip(names, pack(matrix), strict=True))
     exact = {**ATTRIBUTES, "accuracy_level": 0}
     return {
         "fp32": session("MatMul", {"w": matrix}, matrix.shape),

@@ -17,6 +17,7 @@ from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.artifact import bind, codec, tensors
 from ttscompile.artifact.bind import LoweredPieces
+from ttscompile.artifact.codec import identities
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.manifest import Manifest
 from ttscompile.artifact.strict_json import Value
@@ -176,10 +177,9 @@ def decoded(manifest: Manifest, change: Change) -> Manifest:
         (lambda p: p.update(asked=["blocks"]), "parts of the policy that none of its models belongs to"),
         (lambda p: p.update(asked={}), "precision.asked: expected a"),
         (lambda p: p.pop("asked"), "missing: ..asked"),
-        (lambda p: p.update(fp32="weights_fp32.safetensors"), "the hash of both files together, or neither"),
-        (lambda p: p.update(joined="0" * 64), "the hash of both files together, or neither"),
-        (lambda p: p.update(fp32="weights.safetensors", joined="0" * 64), "which nothing else uses"),
-        (lambda p: p.update(fp32="../other", joined="0" * 64), "precision.fp32: expected a plain file name"),
+        (lambda p: p.update(fp32="weights_fp32.safetensors"), "files: expected exactly the files"),
+        (lambda p: p.update(fp32="weights.safetensors"), "which nothing else uses"),
+        (lambda p: p.update(fp32="../other"), "precision.fp32: expected a plain file name"),
         (lambda p: p.update(more=1), "unknown: ..more"),
     ],
 )
@@ -197,14 +197,16 @@ def test_a_copy_may_lack_what_is_read_in_fp32_alone(
     whole, copy = write(tmp_path / "whole", lowered()), tmp_path / "copy"
     apart = {"block.0.weight", "block.1.weight"}
     assert set(tensors.read(whole / "weights_fp32.safetensors")) == apart
-    joined, one = read_manifest(whole), read_manifest(int8)
-    assert joined.model_identity == one.model_identity and joined.identity != one.identity
+    two, one = read_manifest(whole), read_manifest(int8)
+    assert two.model_identity != one.model_identity, "its models name another file"
+    other = replace(two, files={**two.files, "weights_fp32.safetensors": two.files["weights.safetensors"]})
+    assert identities(other)[0] != two.identity and identities(other)[1] != two.model_identity
     for name, value in load_artifact(int8).weights.items():
         np.testing.assert_array_equal(load_artifact(whole).weights[name], value)
     shutil.copytree(whole, copy, ignore=shutil.ignore_patterns("weights_fp32.safetensors"))
     artifact, full = load_artifact(copy), load_artifact(whole)
     assert (artifact.without, full.without) == ("weights_fp32.safetensors", None)
-    assert artifact.manifest == full.manifest and artifact.bytes < full.bytes
+    assert artifact.manifest.identity == full.manifest.identity and artifact.bytes < full.bytes
     assert set(full.weights) - set(artifact.weights) == apart
     zipped = load_artifact(packed(whole, skip="weights_fp32.safetensors"))
     assert zipped.without == "weights_fp32.safetensors"
@@ -220,7 +222,7 @@ def test_a_copy_without_fp32_computes_what_the_whole_does_and_refuses_the_rest(
     whole, copy = write(tmp_path / "whole", lowered()), tmp_path / "copy"
     shutil.copytree(whole, copy, ignore=shutil.ignore_patterns("weights_fp32.safetensors"))
     one, other = ttscompile.load(whole), ttscompile.load(copy)
-    ((obs, noise),) = random_calls(one.artifact.manifest.spec, 1, seed=0)
+    ((obs, noise),) = random_calls(read_manifest(whole).spec, 1, seed=0)
     expected = one.predict_action(obs, noise=noise)["action_pred"]
     np.testing.assert_array_equal(other.predict_action(obs, noise=noise)["action_pred"], expected)
     for plan in ("dense", "full@fp32"):

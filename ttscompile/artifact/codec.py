@@ -121,10 +121,9 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     document, own = to_json(manifest), (names.PRUNER, names.of_loop(names.PRUNER, ""))
     pieces, stores = document["pieces"], {k: v for k, v in document["stores"].items() if k not in _GOLDEN}
     of_model = {name: piece for name, piece in pieces.items() if name != own[0] and not name.startswith(own[1])}
-    read = {stores["program"], stores["weights"], *(piece["file"] for piece in of_model.values())}
+    apart = [] if manifest.precision is None or manifest.precision.fp32 is None else [manifest.precision.fp32]
+    read = {stores["program"], stores["weights"], *apart, *(piece["file"] for piece in of_model.values())}
     hashes = {name: record.sha256 for name, record in sorted(manifest.acting.items())}
-    joined = manifest.precision.joined if manifest.precision is not None else None
-    model_hashes = hashes if joined is None else {**hashes, stores["weights"]: joined}
     model_identity = _checksum(
         {
             "spec": {key: value for key, value in document["spec"].items() if key != "source"},
@@ -132,7 +131,7 @@ def identities(manifest: Manifest) -> tuple[str, str]:
             "pieces": of_model,
             **{key: document[key] for key in ("contexts", "features", "tokens")},
             "stores": {key: stores[key] for key in ("program", "weights")},
-            "files": {name: digest for name, digest in model_hashes.items() if name in read},
+            "files": {name: digest for name, digest in hashes.items() if name in read},
         }
     )
     precision = {k: v for k, v in (document["precision"] or {}).items() if k != "asked"}
@@ -278,8 +277,6 @@ def _check_precision(manifest: Manifest, record: PrecisionRecord, value: Value, 
         value.fail(f"models called {' and '.join(names.OF_ALL_BLOCKS)} too")
     if not set(record.asked) <= {names.part_of(piece) for piece in known} - {names.part_of(piece) for piece in models}:
         value.fail("parts of the policy that none of its models belongs to, as those that stay fp32")
-    if (record.fp32 is None) is not (record.joined is None):
-        value.fail("a file of what is read in fp32 alone, and the hash of both files together, or neither")
     _require_alone(value, record.files, uses)
 
 

@@ -146,8 +146,8 @@ class Artifact:
             return self.plans[own]
         if name not in self._derived:
             record, plan = self.manifest.precision, self.plans[own].exact
-            own = () if record is None else record.kept
-            held = names.parts_of(own if precision in (INT8, INT4) else self.manifest.pieces)
+            having = () if record is None else record.kept
+            held = names.parts_of(having if precision in (INT8, INT4) else self.manifest.pieces)
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
             self._derived[name] = replace(plan)  # another object than the one in fp32 may be
         return self._derived[name]

@@ -219,8 +219,6 @@ class PrecisionRecord:
         asked: parts (``ir.pieces.part_of``) that stay fp32 because it was asked for.
         fp32: name of the file with what is read in fp32 alone. A copy of the artifact may lack it, and computes no plan
             in fp32 then. None where that would save little.
-        joined: sha256 of the file that the artifact's weights would be with these among them, as in one without this
-            precision; so the model has one identity.
     """
 
     name: Annotated[str, Rule("one of 'int8', 'int4'", (INT8, INT4).__contains__)]
@@ -228,7 +226,6 @@ class PrecisionRecord:
     models: Mapping[str, FileName]
     asked: tuple[str, ...] = ()
     fp32: FileName | None = field(default=None, metadata=OMITTED)
-    joined: Sha256 | None = field(default=None, metadata=OMITTED)
 
     @property
     def files(self) -> set[str]:

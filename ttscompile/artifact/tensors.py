@@ -5,7 +5,6 @@ data); data.
 Source: the format's description, https://github.com/huggingface/safetensors#format.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -177,14 +176,6 @@ def serialize(arrays: Mapping[str, Array]) -> bytes:
 def write(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write a new safetensors file, one array after the other: all of them together may be half of the memory."""
     write_synced(path, _chunks(arrays))
-
-
-def digest(arrays: Mapping[str, Array]) -> str:
-    """The sha256 of what ``write`` writes."""
-    content = hashlib.sha256()
-    for chunk in _chunks(arrays):
-        content.update(chunk)
-    return content.hexdigest()
 
 
 def _chunks(arrays: Mapping[str, Array]) -> Iterator[bytes | memoryview]:

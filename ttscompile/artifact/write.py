@@ -271,7 +271,7 @@ def _fill(
         files.write_synced(folder / onnx_files[name], bind(models[name], places | pruner_places.get(name, {}), name))
     precision = None if lowered is None else store_pieces(folder, lowered, pieces, places)
     if precision is not None and apart:
-        precision = replace(precision, fp32=WEIGHTS_FP32, joined=tensors.digest({**stored, **tables}))
+        precision = replace(precision, fp32=WEIGHTS_FP32)
     plans = dict[str, PlanRecord]()
     if precision is not None or loop != ORIGINAL:
         held = {} if precision is None else dict.fromkeys(precision.kept, precision.name)

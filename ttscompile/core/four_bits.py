@@ -20,7 +20,7 @@ ATTRIBUTES = {"bits": 4, "block_size": BLOCK, "accuracy_level": 4}
 """Accuracy level 4: sums of eight-bit integers."""
 
 _ZERO, _MOST = 8, 15
-_SHARES = np.float32([0.8, 0.87, 0.94, 1, -0.83, -0.9, -0.97, -1.04])
+_SHARES = np.array([0.8, 0.87, 0.94, 1, -0.83, -0.9, -0.97, -1.04], np.float32)
 """Of the scale that rounds the largest number of a block to the end of the range: those that are tried."""
 
 _LEAST = 1e-12
@@ -70,8 +70,8 @@ def _blocks(matrix: Array) -> Array:
 def _of_largest(blocks: Array) -> tuple[Array, Array]:
     """Blocks as shares of their largest numbers, whose squares neither overflow nor vanish; and these numbers."""
     largest = np.abs(blocks).max(axis=2)
-    largest = np.where(largest < 1 / np.finfo(np.float32).max, np.float32(1), largest)
-    return blocks / largest[:, :, None], largest
+    largest = np.asarray(np.where(largest < 1 / np.finfo(np.float32).max, 1, largest), np.float32)
+    return np.asarray(blocks / largest[:, :, None], np.float32), largest
 
 
 def _plain(blocks: Array) -> Array:
@@ -100,5 +100,5 @@ def _pack(blocks: Array) -> tuple[npt.NDArray[np.uint8], Array]:
         better = off < error
         best, error = np.where(better, scale, best), np.where(better, off, error)
         np.copyto(integers, tried, where=better[:, :, None])
-    codes = (integers + _ZERO).astype(np.uint8)
-    return codes[..., 0::2] | codes[..., 1::2] << 4, (best * largest).astype(np.float32)
+    codes: npt.NDArray[np.uint8] = (integers + _ZERO).astype(np.uint8)
+    return codes[..., 0::2] | (codes[..., 1::2] << np.uint8(4)), (best * largest).astype(np.float32)
