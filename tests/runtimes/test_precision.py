@@ -116,7 +116,7 @@ def test_where_sums_saturate_they_are_made_exact_and_a_warning_says_that_it_is_s
 
 def test_nothing_to_lower_and_unknown_precisions_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     module, spec = policies.Mixer(0).eval(), policies.spec()
-    for name in ("bf16", "int4", "FP32", "auto"):
+    for name in ("bf16", "int3", "FP32", "auto"):
         with pytest.raises(TtscompileError, match=f"precision '{name}'"):
             ttscompile.compile_denoiser(module, spec, tmp_path / "compiled", precision=name)
     assert list(tmp_path.iterdir()) == []
