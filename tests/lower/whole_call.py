@@ -17,6 +17,7 @@ from ttscompile.artifact.write import write_artifact
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.lower.single_file import lower_single_file
+from ttscompile.runtimes.onnxruntime.sessions import EXACT_INTEGERS
 from ttscompile.runtimes.policy import CompiledPolicy
 
 Arrays = dict[str, np.ndarray]
@@ -27,6 +28,7 @@ def opened(model: str | bytes) -> onnxruntime.InferenceSession:
     """A session, which keeps nothing from call to call: the episodes of a test share it."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
+    options.add_session_config_entry(EXACT_INTEGERS, "1")  # or int8 saturates on processors without VNNI
     options.log_severity_level = 3  # optional inputs have values in the model, which is worth a warning to it
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
