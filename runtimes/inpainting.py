@@ -100,6 +100,8 @@ def _levels(sampler: SamplerTable) -> Levels | None:
 
 def prefix_refusal(spec: PolicySpec) -> str | None:
     """Why a policy takes no prefix; None if it does."""
+    if spec.chunk.switches:
+        return "an action holds a number that has two values alone (a gripper's), and does not say which it came from."
     if noise_levels(spec.sampler) is None:
         return (
             f"the table of its sampler {spec.sampler.name!r} does not give the noise level of each step. Prefixes need"

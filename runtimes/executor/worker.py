@@ -160,10 +160,9 @@ class Worker:
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self.feasibility = {name: settings.feasibility(max(measured[name])) for name in settings.tiers}
         tiers = fast_enough(self.feasibility, settings.refuse_infeasible)
-        action = self._policy.info.action
-        normalizer = action.normalizer if action.ranged else None
+        usual = self._policy.info.action.usual
         with self.lock:
-            self._state = ExecutorState(settings, normalizer, tiers, latencies)
+            self._state = ExecutorState(settings, usual, tiers, latencies)
         self._ready.set()
 
     def _next(self) -> Callable[[], object] | None:

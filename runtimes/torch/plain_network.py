@@ -253,9 +253,14 @@ class CallModule(nn.Module):
         """The actions of a denoised sample ``[B, T, D]``, in their own units."""
         if self._bound is not None:
             sample = sample.clamp(-self._bound, self._bound)
-        actions = sample[..., : self.spec.chunk.action_dim]
-        normalizer = self.kept("actions")
-        return (actions - normalizer["offset"]) / normalizer["scale"] if normalizer else actions.clone()
+        chunk, normalizer = self.spec.chunk, self.kept("actions")
+        own = sample[..., : chunk.action_dim]
+        actions = (own - normalizer["offset"]) / normalizer["scale"] if normalizer else own.clone()
+        for one in chunk.switches:
+            value = torch.where(own[..., [one.channel]] >= one.threshold, one.above, one.below)
+            at = torch.arange(chunk.action_dim, device=own.device) == one.channel
+            actions = torch.where(at, value, actions)
+        return actions
 
     def _keep(self, kind: str, arrays: Mapping[str, object]) -> None:
         for name, value in arrays.items():

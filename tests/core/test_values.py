@@ -60,6 +60,14 @@ def test_stretched_it_is_torchs_cubic_of_bytes(size: tuple[int, int]) -> None:
     np.testing.assert_array_equal(fitted(found, spec), found)
 
 
+@pytest.mark.parametrize("size", [(30, 50), (96, 17), (20, 24), (3, 40), (61, 5)])
+def test_averaged_it_is_torchs_area(size: tuple[int, int]) -> None:
+    spec = ObservationSpec((1, 3, 20, 24), bounds=(0.0, 1.0), fit="average")
+    image = np.random.RandomState(0).uniform(0, 1, (2, 1, 3, *size)).astype(np.float32)
+    expected = functional.interpolate(torch.from_numpy(image[:, 0]), (20, 24), mode="area")[:, None]
+    np.testing.assert_allclose(fitted(image, spec), expected.numpy(), atol=1e-6)
+
+
 def test_random_images_of_a_policy_that_rounds_them_are_rounded() -> None:
     spec = ObservationSpec((1, 3, 8, 8), bounds=(0.0, 1.0), fit="stretch")
     drawn = spec.draw(np.random.default_rng(0))

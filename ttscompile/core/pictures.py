@@ -1,4 +1,4 @@
-"""Resizing images in numpy as the originals do it: with their proportions, or to a whole shape in steps of bytes."""
+"""Resizing images in numpy as the originals do it: with their proportions, or to a whole shape."""
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +49,19 @@ def stretched(array: FloatArray, height: int, width: int) -> FloatArray:
         pixels = _cubic(_cubic(pixels, width, -1), height, -2)
         pixels = np.rint(np.clip(pixels, 0, 255))
     return np.asarray(pixels / np.float32(255), np.float32)
+
+
+def averaged(array: FloatArray, height: int, width: int) -> FloatArray:
+    """Images ``[..., h, w]`` that fill the shape: each pixel the mean of all that it touches, as PyTorch's ``area``."""
+    rows, columns = (_means(*each) for each in zip(array.shape[-2:], (height, width), strict=True))
+    return np.asarray(rows @ array @ columns.T, np.float32)
+
+
+def _means(before: int, count: int) -> FloatArray:
+    """``[count, before]``: the share that each old entry has in each new one."""
+    new, old = np.arange(count)[:, None], np.arange(before)
+    touched = (old >= new * before // count) & (old < -(-(new + 1) * before // count))
+    return np.asarray(touched / touched.sum(1, keepdims=True), np.float32)
 
 
 def _bilinear(array: FloatArray, count: int, axis: int) -> FloatArray:

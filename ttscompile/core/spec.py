@@ -87,7 +87,8 @@ class ObservationSpec:
             embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
         fit: of an image: one of another size is resized to this shape (``core.values``). With ``start`` and ``centre``
             it keeps its proportions, and the rest is black: after it, or on both sides. With ``stretch`` it fills the
-            shape, and is rounded to 256 steps, whatever its size. None: no other size is taken.
+            shape, and is rounded to 256 steps, whatever its size. With ``average`` it fills the shape, too, each pixel
+            the mean of those that it touches. None: no other size is taken.
         fill: of an image that keeps its proportions: what is beside it in place of black, a number for each channel.
     """
 
@@ -96,7 +97,7 @@ class ObservationSpec:
     dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
-    fit: Literal["start", "centre", "stretch"] | None = None
+    fit: Literal["start", "centre", "stretch", "average"] | None = None
     fill: tuple[float, ...] = field(default=(), metadata=OMITTED)
 
     def __post_init__(self) -> None:
@@ -174,7 +175,8 @@ class Instruction:
         tokens: key of the tokens, int64 ``[B, L]``, padded at the end.
         mask: key of what says which of them count, bool ``[B, L]``.
         new_line: whether the text ends with a new line before it is tokenized.
-        before: lines before the text, of a policy that has some. The text is then stripped.
+        before: lines before the text, of a policy that has some. The text is then stripped, unless it is in a line with
+            others.
         skipped: the first so many tokens of all together are no part of the observation.
         around: what is in the same line before and after the text, of a policy that has such.
         plain: whether the text is in lower case, and of its signs only letters, digits, spaces and ``_`` are left.
@@ -195,9 +197,33 @@ class Instruction:
         text = text or self.otherwise
         if self.plain:
             text = "".join(c for c in text.lower() if c.isalnum() or c.isspace() or c == "_") or self.otherwise
-        text = text.join(self.around) if self.around else text
-        text = "\n".join([*self.before, text.strip()]) if self.before else text
+        if self.around:
+            text = text.join(self.around)
+        elif self.before:
+            text = text.strip()
+        text = "\n".join([*self.before, text])
         return f"{text}\n" if self.new_line and not text.endswith("\n") else text
+
+
+@dataclass(frozen=True)
+class Switch:
+    """A number of the actions that has two values alone, as a gripper's may.
+
+    Attributes:
+        channel: which number it is.
+        threshold: of the denoised sample: from there on the value is ``above``, else ``below``.
+        below: in the actions' own units, like ``above``.
+    """
+
+    channel: int
+    threshold: float
+    below: float
+    above: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channel", integer(self.channel, "a switch's channel", SpecError))
+        if not np.isfinite([self.threshold, self.below, self.above]).all():
+            raise SpecError(f"a switch's threshold and values must be finite; found {self}.")
 
 
 @dataclass(frozen=True)
@@ -211,6 +237,7 @@ class ChunkSpec:
         normalizer: its inverse is applied to the actions; None to return them as they are.
         ranged: whether the normaliser maps the range of the actions in training to -1..1, so that no action should be
             far outside; not one by mean and deviation, or by quantiles.
+        switches: numbers of the actions that the normaliser is not for.
     """
 
     action_dim: int
@@ -218,17 +245,39 @@ class ChunkSpec:
     stop: int
     normalizer: Affine | None = None
     ranged: bool = True
+    switches: tuple[Switch, ...] = field(default=(), metadata=OMITTED)
 
     def __post_init__(self) -> None:
         for name in ("action_dim", "start", "stop"):
             object.__setattr__(self, name, integer(getattr(self, name), f"a chunk's {name}", SpecError))
         if not self.start < self.stop or self.action_dim < 1:
             raise SpecError(f"chunk [{self.start}:{self.stop}] of {self.action_dim} channels is empty.")
+        channels = [one.channel for one in self.switches]
+        if len(set(channels)) < len(channels) or max(channels, default=0) >= self.action_dim:
+            raise SpecError(
+                f"switches are of the channels {channels}; expected different ones below {self.action_dim}."
+            )
+
+    @property
+    def usual(self) -> Affine | None:
+        """What maps the range in which actions usually are to -1..1; None where it is not known."""
+        if self.normalizer is None or not self.ranged:
+            return None
+        scale, offset = self.normalizer.scale.copy(), self.normalizer.offset.copy()
+        for one in self.switches:
+            width = abs(one.above - one.below) or 2.0
+            scale[one.channel], offset[one.channel] = 2 / width, -(one.above + one.below) / width
+        return Affine(scale, offset)
 
     def unnormalized(self, sample: FloatArray) -> FloatArray:
         """The actions ``[..., Da]`` of denoised samples ``[..., D]``, in their own units."""
-        actions = sample[..., : self.action_dim]
-        return actions if self.normalizer is None else self.normalizer.unnormalize(actions)
+        own = sample[..., : self.action_dim]
+        actions = own if self.normalizer is None else self.normalizer.unnormalize(own)
+        for one in self.switches:
+            beyond = own[..., [one.channel]] >= np.float32(one.threshold)
+            at = np.arange(self.action_dim) == one.channel
+            actions = np.where(at, np.where(beyond, np.float32(one.above), np.float32(one.below)), actions)
+        return actions
 
 
 @dataclass(frozen=True)

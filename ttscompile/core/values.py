@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import ObservationError
 from .coercion import Array, Errors
-from .pictures import proportional, stretched
+from .pictures import averaged, proportional, stretched
 from .spec import LARGEST, Affine, ObservationSpec
 
 
@@ -87,4 +87,6 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
     check_values(array, replace(spec, normalizer=None), what, error)  # what is resized is clipped, and looks right
     if spec.fit == "stretch":
         return stretched(array, height, width)
+    if spec.fit == "average":
+        return averaged(array, height, width)
     return proportional(array, height, width, spec.fit == "centre", spec.fill)

@@ -169,10 +169,15 @@ def _zeros(main: GraphWriter, spec: PolicySpec, streams: str, count: int) -> str
 
 def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
     chunk = spec.chunk
-    predicted = main.op("Slice", sample, *(main.constant([n]) for n in (0, chunk.action_dim, 2)))
+    own = predicted = main.op("Slice", sample, *(main.constant([n]) for n in (0, chunk.action_dim, 2)))
     if chunk.normalizer is not None:
         predicted = main.op("Sub", predicted, main.constant(chunk.normalizer.offset, np.float32))
         predicted = main.op("Div", predicted, main.constant(chunk.normalizer.scale, np.float32))
+    for one in chunk.switches:
+        low, high, least = (main.constant([n], np.float32) for n in (one.below, one.above, one.threshold))
+        value = main.op("Where", main.op("GreaterOrEqual", own, least), high, low)
+        at = main.constant(np.arange(chunk.action_dim) == one.channel, np.bool_)
+        predicted = main.op("Where", at, value, predicted)
     main.rename(predicted, "action_pred")
     main.rename(main.op("Slice", predicted, *(main.constant([n]) for n in (chunk.start, chunk.stop, 1))), "action")
 
