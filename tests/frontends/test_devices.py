@@ -11,7 +11,7 @@ import torch
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import evaluation
 
-from . import acts, evo1s, groots, pis, xvlas
+from . import acts, evo1s, groots, pis, vla_jepas, xvlas
 
 TRAINED = Path(__file__).parents[2] / "examples" / "policies" / "vla" / "trained"
 
@@ -21,6 +21,7 @@ SAVED: dict[str, Callable[[Path], Path]] = {
     "groot": lambda folder: groots.save("words", folder),
     "pi0": lambda folder: pis.save("pi0", folder),
     "pi05": lambda folder: pis.save("pi05", folder),
+    "vla_jepa": lambda folder: vla_jepas.save("libero", folder),
     "xvla": lambda folder: xvlas.save("ee6d", folder),
     "multi_task_dit": lambda _: TRAINED / "multi_task_dit" / "policy",
     "smolvla": lambda _: TRAINED / "smolvla" / "policy",

@@ -81,7 +81,7 @@ def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], 
         load_checkpoint_policy(save(built))
 
 
-LEROBOT_TYPES = ["vqbet", "pi0_fast", "tdmpc", "sac", "vla_jepa", "wall_x"]
+LEROBOT_TYPES = ["vqbet", "pi0_fast", "tdmpc", "sac", "wall_x"]
 LEROBOT_TYPES += ["molmoact2", "fastwam", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [

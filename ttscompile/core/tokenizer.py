@@ -64,6 +64,14 @@ class Tokenizer:
         """How many tokens there are, added ones counted."""
         return int(self._tokenizer.get_vocab_size())
 
+    def with_words(self, words: Sequence[str]) -> list[int]:
+        """The token of each of these words; those that are none yet become one, as transformers adds them."""
+        known = self._tokenizer
+        for word in words:
+            if known.token_to_id(word) is None:
+                known.add_special_tokens([word])
+        return [known.token_to_id(word) for word in words]
+
     def __call__(self, text: str, most: int | None = None) -> list[int]:
         """The tokens of a text, with those that the tokenizer adds; ``most`` of them, cut before an added end."""
         try:

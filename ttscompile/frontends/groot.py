@@ -1,9 +1,10 @@
 """GR00T N1.7's action head: actions and state look at what the language model made of cameras and words, by turns.
 
-An attribute's name is that of lerobot's weights, but for those that ``lerobot_groot`` renames. Of weights that each
-embodiment has, there are those of one.
+VLA-JEPA's is built like it. An attribute's name is that of lerobot's weights, but for those that ``lerobot_groot`` or
+``lerobot_vla_jepa`` renames. Of weights that each embodiment has, there are those of one.
 
-Sources: Bjorck et al., GR00T N1 (arXiv 2503.14734); ``lerobot.policies.groot`` of huggingface/lerobot 0.6.
+Sources: Bjorck et al., GR00T N1 (arXiv 2503.14734); ``lerobot.policies.groot`` and ``.vla_jepa`` of huggingface/lerobot
+0.6.
 """
 
 from dataclasses import dataclass
@@ -32,12 +33,14 @@ class GrootConfig:
         normed: whether these features are normalised first.
         layers: of the head: width, heads, and width inside the feed-forward layers.
         out: width of what gives the actions.
-        state: numbers of the state, padded.
+        state: numbers of the state, padded; 0 without one.
         actions: numbers of an action, padded.
         horizon: actions that are denoised.
         places: rows of the embedding of an action's place in the chunk; None without one.
         looks: what each layer looks at: ``itself``, state and actions alone, or features of ``words`` or ``images``.
         apart: whether those of words are without those of images.
+        read: of the features, the last so many are looked at, and no others; 0 for all.
+        queries: tokens of the head's own, between state and actions.
     """
 
     language: Qwen3VLConfig
@@ -51,6 +54,8 @@ class GrootConfig:
     places: int | None
     looks: tuple[str, ...]
     apart: bool
+    read: int = 0
+    queries: int = 0
 
 
 class _ActionEncoder(nn.Module):
@@ -102,12 +107,13 @@ class _Head(nn.Module):
     def __init__(self, config: GrootConfig) -> None:
         super().__init__()
         width, source, inside = config.layers.hidden_size, config.language.text.width, config.out
-        self.state_encoder = Perceptron(config.state, inside, width)
+        self.state_encoder = Perceptron(config.state, inside, width) if config.state else None
         self.action_encoder = _ActionEncoder(config.actions, width)
         self.action_decoder = Perceptron(inside, inside, config.actions)
         self.vlln = nn.LayerNorm(source) if config.normed else nn.Identity()
         self.vl_self_attention = Layers(config.mixing) if config.mixing else None
         self.position_embedding = nn.Embedding(config.places, width) if config.places else None
+        self.future_tokens = nn.Embedding(config.queries, width) if config.queries else None
         self.model = _DiT(config)
 
 
@@ -121,32 +127,36 @@ class Groot(nn.Module):
 
 
 class Prefix(nn.Module):
-    """What the network reads once a call; ``seen`` makes of an image what the backbone sees of it."""
+    """What the network reads once a call; ``seen`` makes of all images what the backbone sees of them."""
 
     def __init__(self, network: Groot, seen: nn.Module) -> None:
         super().__init__()
         head, self.seen = network.action_head, seen
         self.backbone, self.norm, self.mixing = network.backbone, head.vlln, head.vl_self_attention
-        self.state_encoder, self.apart = head.state_encoder, network.config.apart
+        self.state_encoder, self.config = head.state_encoder, network.config
 
-    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor | None) -> tuple[Tensor, ...]:
         """The state's token ``[B, 1, E]``; what is added to scores, ``[B, 1, 1, W]``; and the features it is of.
 
-        These are of words ``[B, W, width]`` and then those of images, where they are looked at by turns. ``state`` is
-        padded, ``[B, Ds]``; the others are those of ``Qwen3VL``.
+        These are of words ``[B, W, width]`` and then those of images, where they are looked at by turns. Without a
+        state there is no token of it, and nothing is added where the last features alone are read. ``state`` is padded,
+        ``[B, Ds]``; the others are those of ``Qwen3VL``.
         """
-        features, valid = self.backbone([self.seen(image) for image in images], tokens, mask)
-        features, own = self.norm(features), self.state_encoder(state)[:, None]
+        features, valid = self.backbone(self.seen(images), tokens, mask)
+        features, read = self.norm(features), self.config.read
+        own = () if self.state_encoder is None else (self.state_encoder(state)[:, None],)
         if self.mixing is not None:
             features = self.mixing(features, added(valid[:, None, None, :]))
-        if not self.apart:
-            return own, added(valid)[:, None, None], features
+        if read:
+            return *own, features[:, -read:]
+        if not self.config.apart:
+            return *own, added(valid)[:, None, None], features
         pictured = self.backbone.pictured + [False] * tokens.shape[1]
         words, pictures = (
             torch.tensor([i for i, each in enumerate(pictured) if each is of], device=mask.device)
             for of in (False, True)
         )
-        return own, added(valid[:, words])[:, None, None], features[:, words], features[:, pictures]
+        return *own, added(valid[:, words])[:, None, None], features[:, words], features[:, pictures]
 
 
 class Denoiser(nn.Module):
@@ -158,7 +168,10 @@ class Denoiser(nn.Module):
 
     def forward(self, sample: Tensor, timestep: Tensor, encoded: tuple[Tensor, ...]) -> Tensor:
         """``[B, T, D]``, timesteps int64 ``[B]`` and what ``Prefix`` gives -> velocity ``[B, T, D]``."""
-        head, (state, hidden, words, *pictures) = self.head, encoded
+        head, left = self.head, list(encoded)
+        own = [left.pop(0)] if self.config.state else []
+        hidden = None if self.config.read else left.pop(0)
+        words, *pictures = left
         clock, count = timestep.to(torch.float32), sample.shape[1]
         angle = angles(clock, _WAVES // 2, _WAVES // 2 - 1)
         made, model = torch.cat([angle.cos(), angle.sin()], -1), head.model
@@ -166,7 +179,9 @@ class Denoiser(nn.Module):
         x = head.action_encoder(sample, clock)
         if head.position_embedding is not None:
             x = x + head.position_embedding.weight[:count]
-        x = torch.cat([state, x], 1)
+        if head.future_tokens is not None:
+            own.append(head.future_tokens.weight.expand(len(x), -1, -1))
+        x = torch.cat([*own, x], 1)
         seen: Any = {"itself": (None, None), "words": (words, hidden), "images": (*pictures, None)}
         for look, layer in zip(self.config.looks, model.transformer_blocks, strict=True):
             x = layer(x, *seen[look], time)

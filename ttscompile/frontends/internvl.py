@@ -47,10 +47,12 @@ class Prompt:
     Attributes:
         between: before each image, the first one first; of images that the robot has none of, too.
         images: that there are; the first so many.
+        later: after the words of the instruction.
     """
 
     between: tuple[tuple[int, ...], ...]
     images: int
+    later: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

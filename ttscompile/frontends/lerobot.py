@@ -15,7 +15,7 @@ from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
 from .settings import read_json
 
-TYPES = {name: f"lerobot_{name}" for name in "act diffusion evo1 groot multi_task_dit smolvla xvla".split()}
+TYPES = {name: f"lerobot_{name}" for name in "act diffusion evo1 groot multi_task_dit smolvla vla_jepa xvla".split()}
 TYPES |= dict.fromkeys(("pi0", "pi05"), "lerobot_pi")
 """The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 

@@ -31,11 +31,11 @@ def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
 
     None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
     normalises with, and without that step tokens would be wrong. None of one that has words before the instruction
-    (evo1, groot), which no step writes, unless that is compiled in.
+    (evo1, groot, vla_jepa), which no step writes, unless that is compiled in.
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]
-    worded = spec.instruction is not None and spec.instruction.before
+    worded = spec.instruction is not None and (spec.instruction.before or spec.instruction.around)
     if worded or entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps):
         return {}
     renamed = {

@@ -6,7 +6,6 @@ lerobot needs, too. Source: ``GrootPolicy.predict_action_chunk`` of huggingface/
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,14 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ..core.spec import Instruction, PolicySpec, SamplerTable
-from ..errors import CheckpointError, SpecError
-from . import lerobot_vla as vla
-from .clip import ACTIVATIONS, TowerConfig
+from ..errors import CheckpointError
+from . import lerobot_qwen3_vl as qwen, lerobot_vla as vla
+from .clip import TowerConfig
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .groot import Denoiser, Groot, GrootConfig, Prefix
@@ -30,30 +28,22 @@ from .internvl import Prompt
 from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
 from .lerobot_policy import MASK, TOKENS, read_weights
-from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _BASE, _BACKBONE = "nvidia/GR00T-N1.7-3B", "nvidia/Cosmos-Reason2-2B"
-_MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS, _MOST_PATCHES = 512, 2**20, 400, 2**22
+_MOST_LETTERS = 400
 _LENGTH = 64
 """Tokens of an instruction with what is after it, of a policy that none is compiled into; lerobot has no limit."""
-_TURN, _IMAGE, _END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
-"""What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""
 _EMPTY = "Perform the task."
 _DEFAULTS = {"backbone_embedding_dim": 2048, "input_embedding_dim": 1536, "hidden_size": 1024}
 _DEFAULTS |= dict.fromkeys(("max_state_dim", "max_action_dim"), 132)
 """What lerobot takes for a width that a base model leaves out."""
-_INNER, _EMBEDDING = "_groot_model.backbone.model.", "backbone.language_model.embed_tokens.weight"
+_INNER = "_groot_model.backbone.model."
 _RENAMED = (
     (r"^_groot_model\.", ""),
     (r"\.layer([12])\.([Wb])$", r".fc\1.\2"),
-    (r"\.timestep_embedder\.", "."),
-    (r"\.attn1\.to_([qkv])\.", r".attn1.\1_proj."),
-    (r"\.attn1\.to_out\.0\.", ".attn1.out_proj."),
-    (r"\.ff\.net\.0\.proj\.", ".ff.fc1."),
-    (r"\.ff\.net\.2\.", ".ff.fc2."),
-    (r"\.norm1\.linear\.", ".scale."),
+    *qwen.DIT_LAYERS,
     (r"\.vl_self_attention\.transformer_blocks\.", ".vl_self_attention.layers."),
     (r"(\.vl_self_attention\.layers\.\d+)\.norm1\.", r"\1.layer_norm1."),
     (r"(\.vl_self_attention\.layers\.\d+)\.norm3\.", r"\1.layer_norm2."),
@@ -72,15 +62,14 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     folder = language_model_folder(name, folders, "Gr00tN1d7", "base model")
     base = Settings(_DEFAULTS | read_json(folder / CONFIG), f"{folder / CONFIG}: ")
     name = base.text("model_name", _BACKBONE, _MOST_LETTERS)
-    folder = language_model_folder(name, folders, "qwen3_vl", "backbone")
-    model = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")
-    _require_files(folder, processors, model)
-    config = read_config(base, model, processors)
+    backbone = qwen.find_backbone(name, folders)
+    _require_whole(backbone, processors.geometry.target)
+    config = read_config(base, backbone.model, processors)
     shared = _narrowed(shared, processors, config)
-    prompt, told = _prompt(processors, name, folder, model, config.language.vocabulary)
+    prompt, told = _prompt(processors, name, backbone, config.language.vocabulary)
     sizes, task = {"actions": config.actions, "tokens": _LENGTH, "vocabulary": config.language.vocabulary}, None
     if options.task is not None:
-        tokens = task_tokens(told.line(options.task), name, folder, None, sizes["vocabulary"], "")
+        tokens = task_tokens(told.line(options.task), name, backbone.folder, None, sizes["vocabulary"], "")
         task = torch.tensor([tokens[told.skipped :]])
     weights = _weights(shared, options, config, processors.embodiment)
     network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
@@ -102,31 +91,24 @@ def _require_version(settings: Settings) -> None:
         raise settings.refusal("action_decode_transform", rule)
 
 
-def _require_files(folder: Path, processors: GrootProcessors, model: Settings) -> None:
-    """Raise unless images and words come to the backbone as is rebuilt here."""
-    settings = Settings(read_json(folder / (name := "preprocessor_config.json")), f"{folder / name}: ")
-    vision, half = vla.part_of(model, "vision_config"), [0.5] * 3
-    patch, merge = vision.number("patch_size", 16, MOST), vision.number("spatial_merge_size", 2, MOST)
-    own = Settings({"patch_size": None, "merge_size": None, **settings.values}, settings.where)
-    own.require(patch_size=patch, merge_size=merge, image_mean=half, image_std=half, do_normalize=True, do_rescale=True)
-    side, size = processors.geometry.target, vla.part_of(settings, "size")
-    least, most = (size.number(f"{entry}_edge", most=2**31) for entry in ("shortest", "longest"))
-    if side % (patch * merge) or not least <= side**2 <= most:
+def _require_whole(backbone: qwen.Backbone, side: int) -> None:
+    """Raise unless the backbone takes images of this side as they are."""
+    resizing = qwen.read_resizing(backbone)
+    if resizing(side, side) != (side, side):
         raise CheckpointError(
-            f"{folder}: images reach the backbone as {side} by {side} pixels (image_target_size); expected a multiple"
-            f" of {patch * merge} along a side, and {least} to {most} in all: otherwise it resizes them again."
+            f"{backbone.folder}: images reach the backbone as {side} by {side} pixels (image_target_size); expected a"
+            f" multiple of {resizing.multiple} along a side, and {resizing.least} to {resizing.most} in all: otherwise"
+            " it resizes them again."
         )
-    path, entry = folder / "chat_template.jinja", read_json(folder / "tokenizer_config.json").get("chat_template")
-    template = path.read_text("utf-8", "replace")[:_MOST_VOCABULARY] if path.is_file() else entry
-    wanted, found = ("<|im_start|>", _IMAGE, "<|im_end|>"), str(template)
-    if template is not None and (not all(word in found for word in wanted) or "helpful assist" in found):
-        expected = f"Qwen3-VL's: {' '.join(wanted)}, and no words of its own"
-        raise CheckpointError(f"{folder}: its chat template is another one than is rebuilt here; expected {expected}.")
 
 
 def read_config(base: Settings, model: Settings, processors: GrootProcessors) -> GrootConfig:
     """Sizes and variant, of the entries of the base model and of its backbone."""
-    language, dit = _read_language(base, model, processors.geometry.target), vla.part_of(base, "diffusion_model_cfg")
+    images, dit = (
+        [(processors.geometry.target,) * 2] * len(processors.cameras),
+        vla.part_of(base, "diffusion_model_cfg"),
+    )
+    language = qwen.read_language(model, base.number("select_layer", 16), images)
     layers, width = _tower(dit), language.text.width
     mixing = vla.part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
     mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None
@@ -139,7 +121,7 @@ def read_config(base: Settings, model: Settings, processors: GrootProcessors) ->
     every = 2 * base.number("attend_text_every_n_blocks", 2, MOST) if apart else 1
     if apart and not itself:
         raise dit.refusal("interleave_self_attention", "true, with use_alternate_vl_dit")
-    looks = ("itself" if itself and i % 2 else "images" if i % every else "words" for i in range(_MOST_LAYERS))
+    looks = ("itself" if itself and i % 2 else "images" if i % every else "words" for i in range(qwen.MOST_LAYERS))
     horizon = base.number("action_horizon", 40, MOST)
     places = base.number("max_seq_len", 1024, MOST) if base.flag("add_pos_embed", True) else None
     if places is not None and places < horizon:
@@ -169,48 +151,11 @@ def _tower(own: Settings) -> TowerConfig:
     return TowerConfig(
         hidden_size=width,
         intermediate_size=4 * width,
-        num_hidden_layers=own.number("num_layers", 12, _MOST_LAYERS),
+        num_hidden_layers=own.number("num_layers", 12, qwen.MOST_LAYERS),
         num_attention_heads=heads,
         hidden_act="gelu_pytorch_tanh",
         layer_norm_eps=vla.positive_number(own, "norm_eps", 1e-5),
     )
-
-
-def _read_language(base: Settings, model: Settings, side: int) -> Qwen3VLConfig:
-    """Of the backbone's entries; defaults are those of transformers."""
-    image, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
-    rope = vla.rope_of(text, 5e5)
-    image.require(in_channels=3, out_hidden_size=text.values.get("hidden_size"))
-    text.require(hidden_act="silu", attention_bias=False)
-    rope.require(rope_type="default", mrope_interleaved=True)
-    depth, table = image.number("depth", 27, _MOST_LAYERS), image.number("num_position_embeddings", 2304, _MOST_PATCHES)
-    stacked, sections = image.values.get("deepstack_visual_indexes", [8, 16, 24]), rope.values.get("mrope_section")
-    if not isinstance(stacked, list) or len(set(map(str, stacked)) & set(map(str, range(depth)))) < len(stacked):
-        raise image.refusal("deepstack_visual_indexes", f"different layers, from 0 to {depth - 1}")
-    sections = [24, 20, 20] if sections is None else sections
-    if not isinstance(sections, list) or [type(one) for one in sections] != [int] * 3 or min(sections) < 0:
-        raise rope.refusal("mrope_section", "three whole numbers")
-    if math.isqrt(table) ** 2 != table:
-        raise image.refusal("num_position_embeddings", "a square")
-    vision = QwenVisionConfig(
-        hidden_size=image.number("hidden_size", 1152),
-        intermediate_size=image.number("intermediate_size", 4304),
-        num_hidden_layers=depth,
-        num_attention_heads=image.number("num_heads", 16),
-        hidden_act=image.choice("hidden_act", "gelu_pytorch_tanh", *ACTIVATIONS),
-        image_size=side,
-        patch_size=image.number("patch_size", 16),
-        merge=image.number("spatial_merge_size", 2, MOST),
-        table=math.isqrt(table),
-        stacked=tuple(stacked),
-    )
-    if vision.hidden_size // vision.num_attention_heads % 4:
-        raise image.refusal("num_heads", "heads of a multiple of 4 channels")
-    layers = min(text.number("num_hidden_layers", 32, _MOST_LAYERS), base.number("select_layer", 16))
-    language = replace(vla.read_language(text, layers, 128), normed=True)
-    vocabulary = text.number("vocab_size", 151936, _MOST_VOCABULARY)
-    angle = vla.positive_number(rope, "rope_theta", 5e5)
-    return Qwen3VLConfig(vision, language, vocabulary, (sections[1], sections[2]), angle)
 
 
 def _narrowed(shared: LeRobotConfig, processors: GrootProcessors, config: GrootConfig) -> LeRobotConfig:
@@ -224,44 +169,33 @@ def _narrowed(shared: LeRobotConfig, processors: GrootProcessors, config: GrootC
 
 
 def _prompt(
-    processors: GrootProcessors, name: str, folder: Path, model: Settings, vocabulary: int
+    processors: GrootProcessors, name: str, backbone: qwen.Backbone, vocabulary: int
 ) -> tuple[Prompt, Instruction]:
     """What is before each image, and how a task is told."""
     shown = len(processors.cameras) * processors.frames
-    around = (_IMAGE * shown, _END)
-    told = Instruction(TOKENS, MASK, True, (_TURN,), around=around, plain=processors.plain, otherwise=_EMPTY)
-    image = model.number("image_token_id", 151655, _MOST_VOCABULARY)
-    between, told = told_after(told, name, folder, vocabulary, image, shown)
+    around = (qwen.IMAGE * shown, qwen.END)
+    told = Instruction(TOKENS, MASK, True, (qwen.TURN,), around=around, plain=processors.plain, otherwise=_EMPTY)
+    between, told = told_after(told, name, backbone.folder, vocabulary, backbone.image, shown)
     return Prompt(between, len(processors.cameras)), told
 
 
 def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
     """From noise to actions, which may be clipped at the end."""
     table = vla.in_buckets(settings, 4, settings.number("num_timestep_buckets", 1000, 2**20), options)
-    if not bounded:
-        return table
-    if table.name != "euler":
-        raise SpecError(f"sampler {table.name}: the actions of this policy are clipped at the end; expected euler.")
-    last = np.arange(table.steps) == table.steps - 1
-    share = {"x0_to_next": last, "sample_to_next": ~last, "out_to_next": np.where(last, 0, table.out_to_next)}
-    return replace(table, clip=1.0, **{name: each.astype(np.float32) for name, each in share.items()})
+    return vla.clipped_at_the_end(table) if bounded else table
 
 
 def _weights(shared: LeRobotConfig, options: LoadOptions, config: GrootConfig, kind: int) -> Mapping[str, Tensor]:
     """The weights under the names of ``Groot``; of those that each embodiment has, those of its own."""
-    found, inner = dict[str, Tensor](), dict[str, Tensor]()
-    for saved, value in read_weights(shared, options, ".language_model.norm.weight").items():
-        if saved == f"{_INNER}lm_head.weight":  # the same numbers as the embedding, of which a file may have either
-            found.setdefault(_EMBEDDING, value)
-            continue
-        if saved.startswith(_INNER):
-            inner[saved.removeprefix(f"{_INNER}model.")] = value
-            continue
-        name = renamed(saved, _RENAMED)
+    found = dict[str, Tensor]()
+    saved = read_weights(shared, options, ".language_model.norm.weight")
+    others, backbone = qwen.of_backbone(saved, _INNER, config.language)
+    for own, value in others.items():
+        name = renamed(own, _RENAMED)
         if name.endswith((".W", ".b")):
-            own, axes = (".weight", 3) if name.endswith(".W") else (".bias", 2)
+            end, axes = (".weight", 3) if name.endswith(".W") else (".bias", 2)
             if value.ndim != axes or len(value) <= kind:
-                raise CheckpointError(f"{shared.directory}: weight {saved} has no part {kind}, of the embodiment.")
-            name, value = name[:-2] + own, value[kind].T.contiguous() if axes == 3 else value[kind].clone()
+                raise CheckpointError(f"{shared.directory}: weight {own} has no part {kind}, of the embodiment.")
+            name, value = name[:-2] + end, value[kind].T.contiguous() if axes == 3 else value[kind].clone()
         found[name] = value
-    return found | {f"backbone.{name}": value for name, value in rebuilt_weights(inner, config.language).items()}
+    return found | backbone

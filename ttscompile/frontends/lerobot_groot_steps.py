@@ -66,21 +66,21 @@ class Geometry(NamedTuple):
 
 
 class Seen(nn.Module):
-    """Images in -1..1 ``[B, 3, edge, edge]`` as the backbone sees them, in steps of bytes."""
+    """Images in -1..1 ``[B, 3, edge, edge]``, of each camera, as the backbone sees them, in steps of bytes."""
 
     def __init__(self, geometry: Geometry) -> None:
         super().__init__()
         self.geometry, seen = geometry, (geometry.target, geometry.target)
         self.zoom = ResizeCrop(geometry.crop, geometry.crop, seen, mode="bicubic")
 
-    def forward(self, image: Tensor) -> Tensor:
+    def forward(self, images: list[Tensor]) -> list[Tensor]:
         """See the class."""
         edge, crop, target = self.geometry
         if edge == crop == target:
-            return image
-        start = (edge - crop) // 2
-        pixels = ((image[:, :, start : start + crop, start : start + crop] + 1) * 127.5).round()
-        return self.zoom(pixels).clamp(0, 255).round() / 127.5 - 1  # type: ignore[no-any-return]
+            return images
+        start = slice((edge - crop) // 2, (edge - crop) // 2 + crop)
+        pixels = (((image[:, :, start, start] + 1) * 127.5).round() for image in images)
+        return [self.zoom(each).clamp(0, 255).round() / 127.5 - 1 for each in pixels]
 
 
 def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootProcessors:

@@ -13,7 +13,7 @@ from .lerobot_config import ACTION, CONFIG, WEIGHTS, LeRobotConfig
 from .lerobot_processors import Normalizer, Processors
 from .loops import Loops
 from .lora import find_base, merged, read_adapter
-from .saved_weights import as_float32, read_tensors, require_memory
+from .saved_weights import as_float32, left_out, read_tensors, require_memory
 from .scheduler import MOST_STEPS, configured_loops
 from .settings import Settings
 
@@ -118,12 +118,12 @@ def integration_steps(settings: Settings, options: LoadOptions, name: str, defau
 
 
 def read_weights(config: LeRobotConfig, options: LoadOptions, *without: str) -> dict[str, torch.Tensor]:
-    """The weights of a policy as float32, an adapter merged into its base; without those whose names end so."""
+    """The weights of a policy as float32, an adapter merged into its base; without those ``left_out``."""
     adapter, directory = read_adapter(config.directory, config.settings), config.directory
     if adapter is None and options.base is not None:
         raise CheckpointError(f"{directory}: the option base is for an adapter; found a whole policy. Leave it out.")
     path = (directory if adapter is None else find_base(adapter, options.base)) / WEIGHTS
     require_memory(path, without)
-    saved = {name: value for name, value in read_tensors(path).items() if not name.endswith(without)}
+    saved = {name: value for name, value in read_tensors(path).items() if not left_out(name, without)}
     weights = as_float32(saved, f"{path}: ")
     return weights if adapter is None else merged(directory, adapter, weights, without)

@@ -32,8 +32,12 @@ _COMMON = {PREPROCESSOR: (_RENAME, _BATCH, _DEVICE, _RELATIVE), POSTPROCESSOR: (
 _BEFORE, _AFTER = (_TOKENIZE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT), (_UNNORMALIZE, _CROP)
 """Beside them, those before and after a policy."""
 IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
-OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN)}
+PREPARE, CLIP = "vla_jepa_image_prep", "vla_jepa_clip_actions"
+SNAP, BINARIZE = "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
+OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN), "vla_jepa": (PREPARE,)}
 """By type of policy, steps before it that no other has, in the order that lerobot saves."""
+_OWN_LATER: Mapping[str, tuple[str, ...]] = {"vla_jepa": (CLIP, SNAP, _UNNORMALIZE, BINARIZE)}
+"""By type of policy, steps after it of which no other has all, in the only order that is known."""
 _OFTEN = frozenset({_BATCH, _DEVICE})
 """Steps that may be anywhere, more than once."""
 
@@ -90,6 +94,13 @@ class Statistics:
         low, high = torch.minimum(low, high), torch.maximum(low, high)
         return tuple(low.tolist()), tuple(high.tolist())
 
+    def unnormalized(self, x: torch.Tensor, channel: int) -> torch.Tensor:
+        """Numbers of one channel of a vector in their own units, as lerobot computes them."""
+        first = self.first[channel]
+        return (
+            x * self.second[channel] + first if self.mode == "MEAN_STD" else (x + 1) / 2 * self.width[channel] + first
+        )
+
     def inverse(self) -> Affine:
         """The inverse as an ``Affine``, for vectors. MEAN_STD inverts with the bare standard deviation."""
         first = self.first.double().numpy()
@@ -144,7 +155,7 @@ class Processors:
         tokenizer: settings of the tokenizer; none without one.
         new_line: whether an instruction ends with a new line before it is tokenized.
         state_in_prompt: whether it holds the state too, as numbers in words.
-        own: settings of the steps before the policy that its type alone has, by name, in their order.
+        own: settings of the steps around the policy that its type alone has, by name, in their order.
     """
 
     normalizers: Mapping[str, Statistics]
@@ -158,9 +169,12 @@ class Processors:
 
 def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:
     """The pipelines of a policy of this type that LeRobot saved, with these features."""
-    own = OWN_STEPS.get(kind, ())
+    own, later = OWN_STEPS.get(kind, ()), _OWN_LATER.get(kind, ())
     before = read_steps(directory, PREPROCESSOR, (*_BEFORE, *own))
-    after = read_steps(directory, POSTPROCESSOR, _AFTER)
+    after = read_steps(directory, POSTPROCESSOR, (*_AFTER, *later))
+    order = [step["registry_name"] for step in after if step["registry_name"] in later]
+    if order != [name for name in later if name in order]:
+        raise CheckpointError(f"{directory / POSTPROCESSOR}: found {', '.join(order)}; expected {', '.join(later)}.")
     padded = any(step["registry_name"] in _PAD for step in before)
     return Processors(
         renamed=renamed_observations(directory, before, features),
@@ -169,7 +183,11 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
         state_in_prompt=any(step["registry_name"] == PROMPT for step in before),
-        own={step["registry_name"]: step["config"] for step in before if step["registry_name"] in own},
+        own={
+            step["registry_name"]: step["config"]
+            for step in (*before, *after)
+            if step["registry_name"] in (*own, *later)
+        },
     )
 
 

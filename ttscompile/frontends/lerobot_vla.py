@@ -75,7 +75,7 @@ def vla_spec(
     config: LeRobotConfig,
     processors: Processors,
     image: tuple[int, int] | None,
-    fit: Literal["start", "centre", "stretch"],
+    fit: Literal["start", "centre", "stretch", "average"],
     sizes: Mapping[str, int],
     options: LoadOptions,
     table: Make | None = None,
@@ -122,6 +122,15 @@ def in_buckets(settings: Settings, steps: int, last: int, options: LoadOptions) 
     table = flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
     return replace(table, timesteps=(times * last).astype(np.int64))
+
+
+def clipped_at_the_end(table: SamplerTable) -> SamplerTable:
+    """The same loop, whose actions are clipped to -1..1 after the last step."""
+    if table.name != "euler":
+        raise SpecError(f"sampler {table.name}: the actions of this policy are clipped at the end; expected euler.")
+    last = np.arange(table.steps) == table.steps - 1
+    share = {"x0_to_next": last, "sample_to_next": ~last, "out_to_next": np.where(last, 0, table.out_to_next)}
+    return replace(table, clip=1.0, **{name: each.astype(np.float32) for name, each in share.items()})
 
 
 def flow_matching(count: int, options: LoadOptions, start: float, end: float) -> SamplerTable:

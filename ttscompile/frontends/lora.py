@@ -13,7 +13,7 @@ from ..errors import CheckpointError, HubError
 from ..hub import fetch_checkpoint
 from .lerobot_config import WEIGHTS
 from .refusals import MERGE
-from .saved_weights import as_float32, read_tensors
+from .saved_weights import as_float32, left_out, read_tensors
 from .settings import Settings, read_json
 
 Tensors = dict[str, torch.Tensor]
@@ -66,7 +66,7 @@ def merged(directory: Path, settings: Settings, base: Tensors, without: tuple[st
     where, changes = Settings({}, f"{directory / CHANGES}: ", MERGE), dict[str, Tensors]()
     kept = dict.fromkeys(settings.values.get("modules_to_save") or (), False)
     biases = settings.choice("bias", "none", "all", "lora_only") != "none"
-    saved = {key: value for key, value in read_tensors(directory / CHANGES).items() if not key.endswith(without)}
+    saved = {key: value for key, value in read_tensors(directory / CHANGES).items() if not left_out(key, without)}
     for key, value in as_float32(saved, where.where).items():
         part = _LAYER.fullmatch(key)
         name = f"{part[1]}.weight" if part else key.removeprefix("base_model.model.").replace(".base_layer.", ".")
@@ -79,7 +79,7 @@ def merged(directory: Path, settings: Settings, base: Tensors, without: tuple[st
         raise where.error(f"found {len(changes)} changes and of modules_to_save {kept}; expected weights of each")
     done = set[str]()
     for name, parts in changes.items():
-        if not name.endswith(without):  # which the policy does not compute
+        if not left_out(name, without):  # which the policy does not compute
             own = [name] if name in base else [each for each in base if _LEVELS.sub("", each) == _LEVELS.sub("", name)]
             if len(own) != 1 or own[0] in done:
                 raise where.error(f"{name:.300} is no weight of the base, or twice; expected the adapter of this base")

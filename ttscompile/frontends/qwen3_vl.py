@@ -7,6 +7,7 @@ Sources: Bai et al., Qwen3-VL (arXiv 2511.21631); Meng et al., DeepStack (arXiv 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -34,7 +35,7 @@ _RENAMED = (
 
 @dataclass(frozen=True)
 class QwenVisionConfig(ImageTowerConfig):
-    """The vision transformer, for square images of ``image_size``.
+    """The vision transformer, for images of any size in whole squares of patches.
 
     Attributes:
         merge: patches along each axis that become one token.
@@ -57,6 +58,7 @@ class Qwen3VLConfig:
         text: of the language model, whose first ``text.layers`` are used.
         sections: pairs of channels whose angle is of the row, and of the column.
         base: of the rotary embedding.
+        grids: rows and columns of patches of each camera's images.
     """
 
     vision: QwenVisionConfig
@@ -64,17 +66,26 @@ class Qwen3VLConfig:
     vocabulary: int
     sections: tuple[int, int]
     base: float
+    grids: tuple[tuple[int, int], ...]
+
+
+def _named(rows: int, columns: int) -> str:
+    return f"{rows}x{columns}"
 
 
 class _Embeddings(nn.Module):
-    def __init__(self, config: QwenVisionConfig) -> None:
+    def __init__(self, config: Qwen3VLConfig) -> None:
         super().__init__()
-        width, patch = config.hidden_size, config.patch_size
+        width, patch = config.vision.hidden_size, config.vision.patch_size
         self.patch_embedding = nn.Conv2d(3, width, patch, stride=patch)
-        self.positions = nn.Parameter(torch.zeros(config.side**2, width))
+        grids = dict.fromkeys(config.grids)
+        made = {_named(*each): nn.Parameter(torch.zeros(math.prod(each), width)) for each in grids}
+        self.positions = nn.ParameterDict(made)
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        return self.patch_embedding(pixels).flatten(2).transpose(1, 2) + self.positions  # type: ignore[no-any-return]
+    def forward(self, pixels: Tensor) -> tuple[Tensor, int, int]:
+        patches = self.patch_embedding(pixels)
+        rows, columns = patches.shape[2:]
+        return patches.flatten(2).transpose(1, 2) + self.positions[_named(rows, columns)], rows, columns
 
 
 class _Merger(nn.Module):
@@ -85,55 +96,58 @@ class _Merger(nn.Module):
         whole = config.hidden_size * config.merge**2
         self.norm = nn.LayerNorm(whole if together else config.hidden_size, eps=1e-6)
         self.linear_fc1, self.linear_fc2 = nn.Linear(whole, whole), nn.Linear(whole, width)
-        self.config, self.together = config, together
+        self.merge, self.together = config.merge, together
 
-    def forward(self, patches: Tensor) -> Tensor:
-        shape = self.config.side, self.config.merge
+    def forward(self, patches: Tensor, rows: int) -> Tensor:
+        shape = rows, self.merge
         read = self.norm(squares(patches, *shape)) if self.together else squares(self.norm(patches), *shape)
         return self.linear_fc2(functional.gelu(self.linear_fc1(read)))  # type: ignore[no-any-return]
 
 
 class _Vision(nn.Module):
-    """Pixels in -1..1 ``[N, 3, size, size]`` to tokens; after them those of each stacked layer, as more channels."""
+    """Pixels in -1..1 ``[N, 3, H, W]`` to tokens; after them those of each stacked layer, as more channels."""
 
-    def __init__(self, config: QwenVisionConfig, width: int) -> None:
+    def __init__(self, whole: Qwen3VLConfig) -> None:
         super().__init__()
+        config, width = whole.vision, whole.text.width
         self.config = config
-        self.embeddings, self.encoder = _Embeddings(config), Layers(config)
+        self.embeddings, self.encoder = _Embeddings(whole), Layers(config)
         self.merger = _Merger(config, width, together=False)
         self.deepstack_merger_list = nn.ModuleList(_Merger(config, width, together=True) for _ in config.stacked)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        x, channels = self.embeddings(pixels), self.config.hidden_size // self.config.num_attention_heads
-        both = torch.cartesian_prod(*(torch.arange(self.config.side, device=x.device),) * 2)[None].unbind(-1)
+        channels = self.config.hidden_size // self.config.num_attention_heads
+        x, *grid = self.embeddings(pixels)
+        both = torch.cartesian_prod(*(torch.arange(side, device=x.device) for side in grid))[None].unbind(-1)
         row, column = (rotation(each, channels // 2) for each in both)
         turns, stacked = Rotation(*(torch.cat(pair, -1) for pair in zip(row, column, strict=True))), []
         for number, layer in enumerate(self.encoder.layers):
             x = layer(x, None, x.shape[1], turns)
             if number in self.config.stacked:
-                stacked.append(self.deepstack_merger_list[self.config.stacked.index(number)](x))
-        return torch.cat([self.merger(x), *stacked], -1)
+                stacked.append(self.deepstack_merger_list[self.config.stacked.index(number)](x, grid[0]))
+        return torch.cat([self.merger(x, grid[0]), *stacked], -1)
 
 
 class Qwen3VL(nn.Module):
     """Images and words to a feature of each token, as the last layer leaves it, not normalised.
 
-    A prompt with more places than there are images shows them again from the first one on.
+    Those of the prompt's ``later`` are the last. A prompt with more places than there are images shows them again from
+    the first one on.
     """
 
     def __init__(self, config: Qwen3VLConfig, prompt: Prompt) -> None:
         super().__init__()
         self.config, self.prompt = config, prompt
-        self.visual = _Vision(config.vision, config.text.width)
+        self.visual = _Vision(config)
         self.language_model = Words(config.vocabulary, config.text)
-        side, at = config.vision.side // config.vision.merge, 0
-        places, pictured = list[tuple[int, int, int]](), list[bool]()
-        for words in prompt.between:
+        at, places, pictured = 0, list[tuple[int, int, int]](), list[bool]()
+        for place, words in enumerate(prompt.between):
+            rows, columns = (side // config.vision.merge for side in config.grids[place % len(config.grids)])
             places += [(at + i,) * 3 for i in range(len(words))]
             at += len(words)
-            places += [(at, at + row, at + column) for row in range(side) for column in range(side)]
-            at += side
-            pictured += [False] * len(words) + [True] * side**2
+            places += [(at, at + row, at + column) for row in range(rows) for column in range(columns)]
+            at += max(rows, columns)
+            pictured += [False] * len(words) + [True] * (rows * columns)
         self.places, self.pictured, self.after = places, pictured, at
 
     def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,22 +158,32 @@ class Qwen3VL(nn.Module):
             tokens: what is after the last image, int64 ``[B, L]``.
             mask: bool ``[B, L]``; padding is at the end.
         """
-        text, language = self.config.text, self.language_model
-        seen = self.visual(torch.stack(images, 1).flatten(0, 1)).unflatten(0, (-1, len(images)))
-        shown = [seen[:, place % len(images)] for place in range(len(self.prompt.between))]
-        levels = list(zip(*(each.split(text.width, -1) for each in shown), strict=True))
-        valid = functional.pad(mask, (len(self.places), 0), value=True)
-        count = len(self.places) + tokens.shape[1]
+        config, language, later = self.config, self.language_model, self.prompt.later
+        seen, channels = dict[int, Tensor](), config.text.channels // 2
+        for grid in dict.fromkeys(config.grids):  # images of one size go through their transformer together
+            own = [camera for camera, each in enumerate(config.grids) if each == grid]
+            made = self.visual(torch.stack([images[camera] for camera in own], 1).flatten(0, 1))
+            seen |= dict(zip(own, made.unflatten(0, (-1, len(own))).unbind(1), strict=True))
+        shown = [seen[place % len(images)] for place in range(len(self.prompt.between))]
+        levels = list(zip(*(each.chunk(1 + len(config.vision.stacked), -1) for each in shown), strict=True))
+        valid = functional.pad(mask, (len(self.places), len(later)), value=True)
+        count = valid.shape[1]
         hidden = added(valid[:, None, None, :] & torch.ones(count, count, dtype=torch.bool, device=mask.device).tril())
         after = [(self.after + i,) * 3 for i in range(tokens.shape[1])]
         places = torch.tensor(self.places + after, device=mask.device)
-        axis = torch.zeros(text.channels // 2, dtype=torch.int64)  # time, row or column, of each pair of channels
-        for own, section in enumerate(self.config.sections, 1):
-            axis[own : 3 * section : 3] = own
-        turns = rotation(places[:, axis][None], text.channels, self.config.base)
+        axis = torch.zeros(channels, dtype=torch.int64)  # time, row or column, of each pair of channels
+        for own_axis, section in enumerate(config.sections, 1):
+            axis[own_axis : 3 * section : 3] = own_axis
+        placed, last = places[:, axis][None], language.embed_tokens(tokens)
+        if later:  # they come right after what counts of the words
+            own_places = self.after + mask.sum(1, keepdim=True) + torch.arange(len(later), device=mask.device)
+            placed = torch.cat([placed.expand(len(mask), -1, -1), own_places[..., None].expand(-1, -1, channels)], 1)
+            told = language.embed_tokens(torch.tensor([later], device=mask.device))
+            last = torch.cat([last, told.expand(len(mask), -1, -1)], 1)
+        turns = rotation(placed, config.text.channels, config.base)
         words = [language.embed_tokens(torch.tensor([each], device=mask.device)) for each in self.prompt.between]
-        x = laid(levels[0], words, language.embed_tokens(tokens))
-        blank, none = [torch.zeros_like(each) for each in words], x.new_zeros(1, tokens.shape[1], text.width)
+        x = laid(levels[0], words, last)
+        blank, none = [torch.zeros_like(each) for each in words], x.new_zeros(1, last.shape[1], config.text.width)
         for number, layer in enumerate(language.layers):
             if 0 < number < len(levels):
                 x = x + laid(levels[number], blank, none.expand(len(x), -1, -1))
@@ -182,21 +206,21 @@ def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[
         if name == "visual.embeddings.patch_embedding.weight" and value.ndim == 5:
             value = value.sum(2)
         elif name == "visual.embeddings.positions":
-            value = _between_positions(value, config.vision)
+            grids = dict.fromkeys(config.grids)
+            found |= {f"{name}.{_named(*each)}": _between_positions(value, config.vision.table, each) for each in grids}
+            continue
         found |= separated(name, value) if ".qkv." in name else {name: value}
     return found
 
 
-def _between_positions(table: Tensor, config: QwenVisionConfig) -> Tensor:
+def _between_positions(table: Tensor, side: int, grid: tuple[int, int]) -> Tensor:
     """Of a square of trained positions ``[N, width]`` those of an image, bilinear; corners stay corners."""
-    if len(table) != config.table**2:
-        raise CheckpointError(
-            f"there are {len(table)} positions of patches; expected {config.table} by {config.table}."
-        )
-    at = torch.linspace(0, config.table - 1, config.side)
-    low = at.int()
-    share, high = (at - low)[:, None, None], (low + 1).clamp(max=config.table - 1)
-    grid = table.reshape(config.table, config.table, -1)
-    for _ in range(2):  # rows, then columns
-        grid = (grid[low] * (1 - share) + grid[high] * share).transpose(0, 1)
-    return grid.flatten(0, 1)
+    if len(table) != side**2:
+        raise CheckpointError(f"there are {len(table)} positions of patches; expected {side} by {side}.")
+    made = table.reshape(side, side, -1)
+    for count in grid:  # rows, then columns
+        at = torch.linspace(0, side - 1, count)
+        low = at.int()
+        share, high = (at - low)[:, None, None], (low + 1).clamp(max=side - 1)
+        made = (made[low] * (1 - share) + made[high] * share).transpose(0, 1)
+    return made.flatten(0, 1)

@@ -35,13 +35,18 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     return tensors
 
 
+def left_out(name: str, without: tuple[str, ...]) -> bool:
+    """Whether a weight is one of those whose names end so, or hold a part that ends with a dot."""
+    return name.endswith(without) or any(part in name for part in without if part.endswith("."))
+
+
 def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
     """Raise unless the machine has the memory that compiling these weights takes; before anything is read."""
     if not path.is_file():
         return
     try:
         with safe_open(path, "np") as file:
-            names = [name for name in file.keys() if not name.endswith(without)]  # noqa: SIM118
+            names = [name for name in file.keys() if not left_out(name, without)]  # noqa: SIM118
             numbers = sum(math.prod(file.get_slice(name).get_shape()) for name in names)
     except Exception:  # a damaged file, which its reader describes
         return

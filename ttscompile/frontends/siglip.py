@@ -59,11 +59,11 @@ def squares(patches: torch.Tensor, side: int, scale: int) -> torch.Tensor:
     """Squares of ``scale`` by ``scale`` patches as one row each.
 
     Args:
-        patches: ``[N, side ** 2, C]``; of them come ``[N, squares, scale ** 2 * C]``.
-        side: patches along a side of the image.
+        patches: ``[N, P, C]``; of them come ``[N, squares, scale ** 2 * C]``.
+        side: patches along the height of the image.
     """
-    count = side // scale
-    grid = patches.reshape(-1, count, scale, count, scale, patches.shape[-1])
+    rows, columns = side // scale, patches.shape[1] // side // scale
+    grid = patches.reshape(-1, rows, scale, columns, scale, patches.shape[-1])
     # Rows and columns of a square stand beside each other, and its features one patch after the other.
     return grid.transpose(2, 3).flatten(3).flatten(1, 2)
 
