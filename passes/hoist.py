@@ -18,7 +18,7 @@ from ttscompile.ir.rows import crossing_inputs, unfold
 
 from .base import Pass, PassResult
 
-_CAT = "aten.cat.default"
+_MOVES = ("aten.cat.default", "aten.where.self")
 
 
 class Hoist(Pass[Cut, Program]):
@@ -54,7 +54,7 @@ class Hoist(Pass[Cut, Program]):
         evaluated = _evaluate_tables(prologue, tables, program)
         pieces = Pieces(
             **vars(loop),
-            condition=replace(condition, inputs={k: types[k] for k in spec.observations}),
+            condition=replace(condition, inputs={k: types[k] for k in spec.inputs}),
             step=step,
             tables=evaluated.pop(ORIGINAL),
             bindings={
@@ -69,22 +69,23 @@ class Hoist(Pass[Cut, Program]):
 
     def ensures(self, program: Program) -> None:
         """No loop piece reads timestep or observation."""
-        raw = {program.spec.timestep_argument, *program.spec.observations}
+        raw = {program.spec.timestep_argument, *program.spec.inputs}
         if read := sorted(raw.intersection(program.pieces.contexts)):
             raise self.fail(f"a loop piece still reads %{read[0]}.")
 
 
 def _sink(piece: Graph, prologue: Graph, known: Mapping[str, Binding]) -> Graph:
-    """Move concatenations of different binding times into a loop piece: they cost a copy, not arithmetic.
+    """Move what puts values of different binding times together into a loop piece: it costs a copy, not arithmetic.
 
-    Hoisted they would be a copy for each of the K steps, computed or not, and their rows would fill the cache.
+    That is concatenation, and choice by a mask. Hoisted they would be a copy for each of the K steps, computed or not,
+    and their rows would fill the cache: a mask of tokens, and rows that all tokens share, make a row for each token.
     """
     producers, types = prologue.producers(), prologue.types()
     moved = []
     inputs: dict[str, TensorType] = {}
     for name, type_ in piece.inputs.items():
         node = producers.get(name)
-        whole = known.get(name) is Binding.STEP and node is not None and node.op == _CAT
+        whole = known.get(name) is Binding.STEP and node is not None and node.op in _MOVES
         if node is not None and whole and any(known[part] is not Binding.STEP for part in node.refs()):
             moved.append(node)
             for part in node.refs():

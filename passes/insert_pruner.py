@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ttscompile.core.spec import ORIGINAL
-from ttscompile.ir.dataflow import dominators, reaching
+from ttscompile.core.spec import COMMITTED, ORIGINAL
+from ttscompile.ir.dataflow import dominators, reachable_from, reaching
 from ttscompile.ir.flops import graph_flops, node_flops
 from ttscompile.ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from ttscompile.ir.plan_head import SOURCES, Parameters, first_numbers
@@ -153,7 +153,9 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     graph = pieces.condition
     types, producers = graph.types(), graph.producers()
     arithmetic = {n.name for n in graph.nodes if node_flops(n, types)}
-    for name in reversed(dominators(graph, graph.inputs, graph.outputs)):
+    observed = [key for key in graph.inputs if key != COMMITTED]  # a plan does not depend on a prefix
+    told = reachable_from(graph, [COMMITTED])
+    for name in reversed(dominators(graph, observed, [name for name in graph.outputs if name not in told])):
         node = producers.get(name)
         worked = not arithmetic.isdisjoint(reaching(graph, [name]))
         readable = types[name].batch_axis is not None and types[name].dtype == "float32"
@@ -162,7 +164,8 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
             return replace(graph, outputs=outputs), (name,)
     nodes = list(graph.nodes)
     features: list[str] = []
-    for key, type_ in graph.inputs.items():
+    for key in observed:
+        type_ = graph.inputs[key]
         name, read = f"{key}.feature", replace(type_, dtype="float32")
         feature = Node(name, "aten.clone.default", (Ref(key),), (), (read,), "feature of the plan head")
         if type_ != read:  # tokens, say

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile.core.spec import ObservationSpec
+from ttscompile.core.spec import COMMITTED, ObservationSpec
 from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import node_flops
@@ -231,7 +231,8 @@ def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
                 parts, (_, *row) = tuple(Ref(tower.entries[place]) for tower in group), types[entry].shape
                 type_ = replace(types[entry], shape=(Batch(len(group) * group[0].rows), *row))
                 nodes.append(Node(name, "aten.cat.default", (parts, 0), (), (type_,)))
-    return Graph(graph.inputs, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
+    observed = {name: kind for name, kind in graph.inputs.items() if name != COMMITTED}
+    return Graph(observed, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
 
 
 def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:

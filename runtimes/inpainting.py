@@ -8,6 +8,9 @@ made with the call's own initial noise; after the last step it is the actions th
 
 The other positions see them through the network. It is the replacement of RePaint (arXiv 2201.09865) without its
 resampling, and with one draw of noise for all steps, so that a call stays a function of its arguments.
+
+A policy that was trained to go on from a prefix (arXiv 2512.05964; ``PolicySpec.trained_prefix``) has the actions
+themselves there before every step, with zeros in the channels that are no actions, and is told how many they are.
 """
 
 from dataclasses import dataclass
@@ -18,7 +21,7 @@ import numpy.typing as npt
 
 from ttscompile.core.coercion import plain
 from ttscompile.core.correction import groups_of
-from ttscompile.core.spec import ChunkSpec, FloatArray, PolicySpec, SamplerTable
+from ttscompile.core.spec import FloatArray, PolicySpec, SamplerTable
 from ttscompile.core.values import check_numbers
 from ttscompile.errors import ObservationError
 
@@ -35,7 +38,7 @@ class Known:
     Attributes:
         positions: of the T time steps.
         channels: of the D dimensions.
-        values: float32 ``[K + 1, B, N, Da]``, there, before each step and after the last.
+        values: float32 ``[K + 1, B, N, channels]``, there, before each step and after the last.
     """
 
     positions: slice
@@ -50,23 +53,22 @@ class MaskedUpdates:
 
     Args:
         updates: float32 ``[K, G, R, (1 + S) T]``, as they are without a prefix; G is 1 or D.
-        chunk: of the policy.
 
     Attributes:
         updates: the same for the prefix of the moment.
     """
 
-    def __init__(self, updates: FloatArray, chunk: ChunkSpec) -> None:
+    def __init__(self, updates: FloatArray) -> None:
         self.updates, self._plain = updates.copy(), updates
-        self._chunk, self._length = chunk, 0
+        self._length = 0
 
-    def mask(self, length: int) -> bool:
-        """Set the length of the prefix; whether it was another."""
+    def mask(self, known: Known) -> bool:
+        """Set the prefix; whether it has another length than the one before."""
+        start, length = known.positions.start, known.values.shape[2]
         if length == self._length:
             return False
         first, last = sorted((self._length, length))
-        positions, groups = slice(self._chunk.start + first, self._chunk.start + last), slice(self._chunk.action_dim)
-        changed = (slice(None), groups, slice(None), positions)  # with G = 1, the one
+        changed = (slice(None), known.channels, slice(None), slice(start + first, start + last))  # with G = 1, the one
         self.updates[changed] = 0 if length > self._length else self._plain[changed]
         self._length = length
         return True
@@ -102,6 +104,8 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
     """Why a policy takes no prefix; None if it does."""
     if spec.chunk.switches:
         return "an action holds a number that has two values alone (a gripper's), and does not say which it came from."
+    if spec.trained_prefix:
+        return None  # whatever the table says, the sample holds the actions themselves, in all channels
     if noise_levels(spec.sampler) is None:
         return (
             f"the table of its sampler {spec.sampler.name!r} does not give the noise level of each step. Prefixes need"
@@ -114,6 +118,11 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
             " steps all channels share the matrices of the sampler's steps, of which a prefix would take columns."
         )
     return None
+
+
+def longest_prefix(spec: PolicySpec) -> int:
+    """How many actions a prefix may hold, of a policy that takes one."""
+    return spec.trained_prefix or spec.sample[0] - spec.chunk.start
 
 
 def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
@@ -132,6 +141,9 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
     if shape[1] > room:
         rest = f"{room}, from its first executed one to the end of the prediction"
         raise ObservationError(f"prefix holds {shape[1]} actions; the chunk has {rest}. Give at most {room}.")
+    if shape[1] > longest_prefix(spec):
+        told = f"prefix holds {shape[1]} actions; the policy was trained to go on from at most {spec.trained_prefix}"
+        raise ObservationError(f"{told}. Give no more, or call earlier, so that fewer are executed meanwhile.")
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
     own: FloatArray = array.copy()
@@ -149,10 +161,14 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
     """
     if not prefix.size:
         return None
-    levels = noise_levels(spec.sampler)
-    assert levels is not None
     channels = slice(spec.chunk.action_dim)
     positions = slice(spec.chunk.start, spec.chunk.start + prefix.shape[1])
+    if spec.trained_prefix:
+        others = ((0, 0), (0, 0), (0, spec.sample[1] - spec.chunk.action_dim))
+        clean = np.pad(prefix, others)
+        return Known(positions, slice(None), np.stack([clean] * (spec.sampler.steps + 1)))
+    levels = noise_levels(spec.sampler)
+    assert levels is not None
     signal, deviation = (each.astype(np.float32)[:, None, None, None] for each in levels)
     noisy = signal * prefix + deviation * initial[:, positions, channels]
     return Known(positions, channels, np.concatenate([noisy, prefix[None]]))

@@ -18,7 +18,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 from .arrays import Array, check_observation, check_seed, like, read_observation
 from .frames import FrameWork
 from .info import BlockInfo, PolicyInfo
-from .inpainting import check_prefix, prefix_refusal
+from .inpainting import check_prefix, longest_prefix, prefix_refusal
 from .instruct import Instruct
 from .liveness import rollout_needs
 from .queues import Queues, is_window
@@ -80,6 +80,7 @@ class CompiledPolicy:
     def info(self) -> PolicyInfo:
         """What this policy is: with the plan that it was loaded with."""
         view, default = self._runtime.view(self._default), self._default
+        refusal, spec = self._prefix_refusal(default), self._spec
         manifest, blocks = view.manifest, []
         begun = self._runtime.noise_spec(default).sampler
         for block in manifest.blocks:
@@ -101,12 +102,14 @@ class CompiledPolicy:
             default_plan=self._artifact.told(default) or GIVEN,
             precision=" and ".join(dict.fromkeys(default.precision.values())) or FP32,
             rollout=rollout_needs(view),
-            prefix_refusal=self._prefix_refusal(default),
+            prefix_refusal=refusal,
             frames=len(self._runtime.frames),
             reuses_tokens=self._runtime.frames.reuses_tokens,
             follows=default.otherwise is not None,
             noise=manifest.spec.noise,
             other_noise=(self._artifact.manifest.calibration or {}).get("other_noise") or None,
+            longest_prefix=longest_prefix(spec) if refusal is None else 0,
+            trained_prefix=spec.trained_prefix > 0,
         )
 
     @property
@@ -154,7 +157,7 @@ class CompiledPolicy:
                 the cells of a plan with the loop, precision and tokens of the plan of ``load``, without its correction
                 and with the original's weights, executed as they are or refused.
             prefix: experimental: the actions that are committed already, float32 ``[B, N, Da]``, not normalised, from
-                the first executed one on. They are kept, and the rest of the chunk is inpainted to them
+                the first executed one on. They are kept, and the rest of the chunk goes on from them
                 (``runtimes.inpainting``). None or N = 0: none are.
 
         Returns:

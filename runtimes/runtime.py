@@ -199,6 +199,7 @@ class Runtime:
         if view.start is not None and self._chunk is not None:
             noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
+        obs = {**obs, **spec.committed(streams, 0 if known is None else known.values.shape[2])}
         cells = (streams, manifest.steps, len(manifest.groups))
         same = opened is self._used  # else what earlier calls kept is of another variant
         written = self._written if same and self._written is not None else np.zeros(cells, dtype=np.bool_)

@@ -234,14 +234,14 @@ class Workspace:
         if made is None:
             masked = None
             if known is not None:
-                masked = MaskedUpdates(self.advances_with(correction).updates, self._manifest.spec.chunk)
+                masked = MaskedUpdates(self.advances_with(correction).updates)
             used = correction or self._no_correction
             updates = matrices(self._sampler, used) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
             made = _Advances(used, used.anchors.tolist(), updates, steps, masked)
             self._advances[id(correction), known is not None] = made
         if made.masked is not None and known is not None:
-            made.masked.mask(known.values.shape[2])
+            made.masked.mask(known)
         return made
 
     def _bind_advance(self, k: int, update: Array) -> Bound:

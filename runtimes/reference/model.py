@@ -93,6 +93,7 @@ class ReferenceModel:
     ) -> None:
         self.device = torch.device("cpu") if device is None else device
         self._pieces, self._types, self.sampler = pieces, tuple(types), TorchSampler(spec.sampler)
+        self._committed = spec.committed
         self.weights = {name: _tensor(value).to(self.device) for name, value in weights.items()}
         self._tables = {name: _tensor(value).to(self.device) for name, value in self._pieces.tables.items()}
         evaluator = partial(Evaluator, weights=self.weights, device=self.device)
@@ -124,16 +125,16 @@ class ReferenceModel:
         """Everything that the observation decides before the loop starts.
 
         Args:
-            obs: normalised observations by key, ``[B, ...]`` each.
+            obs: normalised observations by key, ``[B, ...]`` each; nothing is committed unless they say so.
 
         Returns:
             Tensors of the device.
         """
-        graph = self._pieces.condition
-        there = {key: value.to(self.device) for key, value in obs.items()}
+        graph, streams = self._pieces.condition, len(next(iter(obs.values())))
+        uncommitted = {key: _tensor(count) for key, count in self._committed(streams).items()}
+        there = {key: value.to(self.device) for key, value in (uncommitted | dict(obs)).items()}
         there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
         condition = dict(zip(graph.outputs, self._once[CONDITION](there), strict=True))
-        streams = len(next(iter(obs.values())))
         contexts = Contexts(streams, condition, ({},) * self.steps)
         if self._pieces.step is None or self._step is None:
             return contexts

@@ -153,10 +153,10 @@ class TorchBackend:
             spec, masked = self._manifest.spec, None
             advance = Advance(spec, call.correction, self.device)
             if call.known is not None:
-                masked = MaskedUpdates(np.array(advance.updates.cpu().numpy()), spec.chunk)
+                masked = MaskedUpdates(np.array(advance.updates.cpu().numpy()))
             self._advances[key] = advance, masked
         advance, masked = self._advances[key]
-        if masked is not None and call.known is not None and masked.mask(call.known.values.shape[2]):
+        if masked is not None and call.known is not None and masked.mask(call.known):
             advance.updates.copy_(torch.from_numpy(masked.updates))
         return advance
 

@@ -201,7 +201,8 @@ class CallModule(nn.Module):
         if initial.ndim != 3 or tuple(initial.shape[1:]) != spec.sample or initial.dtype != torch.float32:
             found = f"{initial.dtype} {list(initial.shape)}"
             raise ObservationError(f"initial must be float32 [B, T, D] = [B, {horizon}, {dimensions}]; found {found}.")
-        given = {}
+        count = torch.zeros((len(initial), 1), dtype=torch.int64, device=initial.device)
+        given = dict.fromkeys(spec.committed(0), count)  # nothing is: the module takes no prefix
         for key, one in spec.observations.items():
             value = obs.get(key)
             shape = None if value is None else tuple(value.shape)

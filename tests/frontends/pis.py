@@ -20,6 +20,8 @@ from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 
 KINDS = ("pi0", "pi05")
 STATE_DIM, ACTION_DIM, PADDED, HORIZON, LENGTH, VOCABULARY, STEPS = 4, 5, 7, 6, 8, 50, 4
+TRAINED = 3
+"""The longest prefix that a pi0.5 that was trained with prefixes takes."""
 SIZES = ((28, 28), (40, 24))
 """Height and width of the images of each call; the first is what the encoder sees."""
 
@@ -82,3 +84,8 @@ def observation(call: int) -> dict[str, Array]:
 def noise() -> Array:
     """``[1, T, D]``."""
     return np.random.RandomState(11).standard_normal((1, HORIZON, PADDED)).astype(np.float32)
+
+
+def left_over() -> Array:
+    """What is left of a chunk as the network gives it, ``[1, N, Da]``; executed at the end are fewer than N."""
+    return np.random.RandomState(5).uniform(-1, 1, (1, TRAINED + 1, ACTION_DIM)).astype(np.float32)

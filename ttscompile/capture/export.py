@@ -74,7 +74,7 @@ def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, we
     """
     run = evaluator(graph, weights)
     rng, both, made = np.random.default_rng(0), _examples(spec, 2), list[torch.Tensor]()
-    for key, one in spec.observations.items():
+    for key, one in spec.inputs.items():
         both[key] = torch.from_numpy(one.draw_normalized(rng, 2))
     for streams in (1, 2):
         inputs = {name: value[2 - streams :] for name, value in both.items()}
@@ -160,7 +160,7 @@ def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
     sample = torch.randn(streams, *spec.sample, generator=generator)
     timestep = torch.from_numpy(spec.sampler.timesteps)[:1].repeat(streams)
     examples = {spec.sample_argument: sample, spec.timestep_argument: timestep}
-    for key, observation in spec.observations.items():
+    for key, observation in spec.inputs.items():
         value = torch.randn(streams, *observation.shape, generator=generator)
         examples[key] = value.to(getattr(torch, observation.dtype))
     return examples

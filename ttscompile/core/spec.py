@@ -26,6 +26,9 @@ PRECISIONS = (FP32, INT8, INT4)
 ORIGINAL = "original"
 """The loop that a policy was trained to run in: ``PolicySpec.sampler``."""
 
+COMMITTED = "committed"
+"""Argument of a network that was trained to go on from a prefix: how many actions of the chunk are committed."""
+
 WITHOUT = "without"
 """In ``PolicySpec.source``: the cameras of the checkpoint that were left out, with commas between."""
 
@@ -298,6 +301,9 @@ class PolicySpec:
         loops: further denoising loops of the same network, by name: lower-case letters, digits, ``+ . -``. Sample,
             observations and chunk are common to all.
         noise: what a loop begins with: numbers of the ``normal`` distribution, or ``uniform`` ones of -1..1.
+        trained_prefix: how many committed actions the network was trained to go on from, at most. It is told of them as
+            ``committed``, int64 ``[B, 1]``, and finds them in the sample as they are, at every step. 0: it knows of no
+            prefix, and one is inpainted.
     """
 
     sample: tuple[Positive, Positive]
@@ -311,6 +317,7 @@ class PolicySpec:
     instruction: Instruction | None = None
     loops: Mapping[LoopName, SamplerTable] = field(default_factory=dict)
     noise: Literal["normal", "uniform"] = field(default="normal", metadata=OMITTED)
+    trained_prefix: int = field(default=0, metadata=OMITTED)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)
@@ -334,6 +341,11 @@ class PolicySpec:
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
             told = f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"
             raise SpecError(f"{told} sample of {horizon} steps and {channels} channels.")
+        longest = horizon + self.left_out - self.chunk.start - 1  # one action is left free
+        count = integer(self.trained_prefix, "trained_prefix", SpecError, most=longest)
+        object.__setattr__(self, "trained_prefix", count)
+        if self.trained_prefix and COMMITTED in self.observations:
+            raise SpecError(f"an observation is called {COMMITTED!r}, as what a trained prefix is told by. Rename it.")
         words = self.instruction
         if words is not None and not {words.tokens, words.mask} <= self.observations.keys():
             raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
@@ -351,9 +363,19 @@ class PolicySpec:
                 raise SpecError(f"loop {name!r}: {told}: one network takes one kind. Convert them.")
 
     @property
+    def inputs(self) -> Mapping[str, ObservationSpec]:
+        """What the network reads beside sample and timestep: the observations, and maybe how much is committed."""
+        count = ObservationSpec((1,), dtype="int64", window=False, bounds=(0, self.trained_prefix))
+        return {**self.observations, COMMITTED: count} if self.trained_prefix else self.observations
+
+    def committed(self, streams: int, count: int = 0) -> dict[str, npt.NDArray[np.int64]]:
+        """What a network that was trained with prefixes reads of one of so many actions, ``[B, 1]``; nothing of another's."""
+        return {COMMITTED: np.full((streams, 1), count)} if self.trained_prefix else {}
+
+    @property
     def arguments(self) -> Mapping[str, str]:
         """By observation key: the name of the module's argument that it is given as."""
-        return {key: key.replace(".", "_") for key in self.observations}
+        return {key: key.replace(".", "_") for key in self.inputs}
 
     @property
     def whole_horizon(self) -> PolicySpec:

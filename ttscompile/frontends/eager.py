@@ -63,7 +63,9 @@ def evaluation(
     module: nn.Module, spec: PolicySpec, observations: Mapping[str, torch.Tensor]
 ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
     """One evaluation of the denoiser, a function of sample and timesteps, for these observations."""
-    named = {spec.arguments[key]: value for key, value in observations.items()}
+    one = next(iter(observations.values()))
+    uncommitted = {key: torch.from_numpy(count).to(one.device) for key, count in spec.committed(len(one)).items()}
+    named = {spec.arguments[key]: value for key, value in (uncommitted | dict(observations)).items()}
     encoder, denoiser = parts(module)
     if encoder is not None:
         encoded = encoder(named)

@@ -58,13 +58,13 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
         text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
         task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
-    encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task)
+    encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task, config.trained_prefix > 0)
     side = config.vision.image_size
     spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options)
     if adaptive:  # the instruction holds it
         own = processors.renamed.get(STATE, STATE)
         others = {key: each for key, each in spec.observations.items() if key != own}
-        spec = replace(spec, observations=others, instruction=None)
+        spec = replace(spec, observations=others, instruction=None, trained_prefix=config.trained_prefix)
     return EncodedDenoiser(encoder, Expert(network)).eval(), spec
 
 
@@ -86,6 +86,7 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
     text, expert = _language(weights, _TEXT), _language(weights, _EXPERT)
     if (text.layers, text.heads, text.channels) != (expert.layers, expert.heads, expert.channels):
         raise CheckpointError("the language model and the expert differ in layers, heads or channels.")
+    delay = settings.number("rtc_training_max_delay", 0, shared.horizon - 1, least=0)
     return PiConfig(
         vision=vision,
         text=text,
@@ -94,6 +95,7 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
         state=None if adaptive else vla.padded_size(settings, "max_state_dim", shared.state_dim),
         actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
         periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
+        trained_prefix=delay,
     )
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.spec import WITHOUT, Instruction, ObservationSpec, PolicySpec, SamplerTable
+from ..core.spec import COMMITTED, WITHOUT, Instruction, ObservationSpec, PolicySpec, SamplerTable
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS, flow_matching_table
 from .families import LoadOptions
@@ -42,10 +42,15 @@ def read_vla_config(
             "adapt_to_pi_aloha or use_relative_actions is set: joints are turned into others, or actions are relative"
             " to the state, around the policy, which is not compiled; expected false"
         )
-    if config.settings.values.get("rtc_training_max_delay", 0) != 0:
+    if entries["type"] != "pi05" and config.settings.values.get("rtc_training_max_delay", 0) != 0:
         raise config.settings.error(
-            "rtc_training_max_delay is set: the policy was trained to go on from a clean prefix, by a timestep for each"
-            " action, which is not compiled; with 0 it is compiled as a policy that knows no prefix"
+            "rtc_training_max_delay is set: the policy was trained to go on from a clean prefix, which is compiled of"
+            " pi05 alone; with 0 it is compiled as a policy that knows no prefix"
+        )
+    if config.settings.flag("use_visual_memory", False) or config.settings.flag("use_proprioceptive_memory", False):
+        raise config.settings.error(
+            "use_visual_memory or use_proprioceptive_memory is set: the policy reads frames of the seconds before, which"
+            " is not compiled; expected false"
         )
     without = set(options.without_cameras or ())
     unknown = sorted(without - set(config.cameras))
@@ -163,18 +168,26 @@ class Gathered(nn.Module):
         prefix: takes images, tokens, their mask and the state.
         state: numbers of the state, padded or cut; None where the instruction holds it, or nothing reads it.
         task: tokens int64 ``[1, L]`` of the one instruction that is compiled in; None where it is an input.
+        committed: whether the network also reads how many actions are committed, and that first.
     """
 
     task: Tensor | None
 
     def __init__(
-        self, config: LeRobotConfig, processors: Processors, prefix: nn.Module, state: int | None, task: Tensor | None
+        self,
+        config: LeRobotConfig,
+        processors: Processors,
+        prefix: nn.Module,
+        state: int | None,
+        task: Tensor | None,
+        committed: bool = False,
     ) -> None:
         super().__init__()
         names = {key: processors.renamed.get(key, key).replace(".", "_") for key in config.features}
         self.images, self.state = [names[key] for key in config.cameras], names.get(STATE, "")
         self.normalizer = Normalizer(processors.normalizers.get(STATE))
         self.prefix, self.missing = prefix, None if state is None else state - config.state_dim
+        self.committed = committed
         self.register_buffer("task", task, persistent=False)
 
     def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
@@ -189,7 +202,8 @@ class Gathered(nn.Module):
         else:
             tokens = self.task.expand(len(images[0]), -1)
             mask = torch.ones_like(tokens, dtype=torch.bool)
-        return self.prefix(images, tokens, mask, state)  # type: ignore[no-any-return]
+        read: tuple[Tensor, ...] = self.prefix(images, tokens, mask, state)
+        return (observations[COMMITTED], *read) if self.committed else read
 
 
 def seen_size(config: LeRobotConfig, resize: tuple[int, int] | None) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +26,7 @@ class PiConfig:
         state: numbers of the state, padded; None in pi0.5, whose instruction holds the state.
         actions: numbers of an action, padded.
         periods: shortest and longest of the timestep's waves.
+        trained_prefix: see ``PolicySpec``; pi0.5 alone may have one.
     """
 
     vision: SiglipConfig
@@ -35,11 +36,22 @@ class PiConfig:
     state: int | None
     actions: int
     periods: tuple[float, float]
+    trained_prefix: int = 0
 
     @property
     def adaptive(self) -> bool:
         """Whether the timestep modulates the expert's norms, as in pi0.5."""
         return self.state is None
+
+
+class _Times(NamedTuple):
+    """What modulates the norms of pi0.5: the step's time ``[B, width]``; that of clean actions ``[1, width]``, and
+    which are clean, bool ``[B, T, 1]``, where the policy was trained to go on from a prefix.
+    """
+
+    step: Tensor
+    clean: Tensor | None = None
+    committed: Tensor | None = None
 
 
 class _AdaptiveNorm(nn.Module):
@@ -50,11 +62,19 @@ class _AdaptiveNorm(nn.Module):
         self.dense = nn.Linear(config.width, 3 * config.width)
         self.epsilon = config.epsilon
 
-    def forward(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """``[B, T, width]`` and ``[B, width]`` -> what is normalised, and the gate ``[B, 1, width]``."""
-        scale, shift, gate = self.dense(condition)[:, None].chunk(3, -1)
+    def forward(self, x: Tensor, times: _Times) -> tuple[Tensor, Tensor]:
+        """``[B, T, width]`` -> what is normalised, and the gate ``[B, 1, width]``, or ``[B, T, width]``."""
+        scale, shift, gate = self._modulation(times.step)
+        if times.clean is not None and times.committed is not None:
+            # All of a step or of clean actions is made before it is chosen: the choice alone is left in the loop.
+            both = zip(self._modulation(times.clean), (scale, shift, gate), strict=True)
+            scale, shift, gate = (torch.where(times.committed, clean, own) for clean, own in both)
         normed = x * torch.rsqrt(x.pow(2).mean(-1, keepdim=True) + self.epsilon)
-        return normed * (1 + scale) + shift, gate
+        return normed * scale + shift, gate
+
+    def _modulation(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        scale, shift, gate = self.dense(time)[:, None].chunk(3, -1)
+        return 1 + scale, shift, gate
 
 
 class _ExpertLayer(nn.Module):
@@ -68,22 +88,22 @@ class _ExpertLayer(nn.Module):
         self.self_attn, self.mlp = layers.Attention(config.expert), layers.FeedForward(config.expert)
 
     def forward(
-        self, x: Tensor, prefix: layers.Seen, turns: layers.Rotation, mask: Tensor, condition: Tensor
+        self, x: Tensor, prefix: layers.Seen, turns: layers.Rotation, mask: Tensor, times: _Times
     ) -> Tensor:
         attention = self.self_attn
-        normed, gate = self._normed(self.input_layernorm, x, condition)
+        normed, gate = self._normed(self.input_layernorm, x, times)
         queries = layers.rotate(attention.split(attention.q_proj(normed)), turns)
         keys = layers.rotate(attention.split(attention.k_proj(normed)), turns)
         pairs = ((prefix.keys, keys), (prefix.values, attention.split(attention.v_proj(normed))))
         seen = layers.Seen(*(torch.cat([attention.for_all_heads(each) for each in pair], 2) for pair in pairs))
         made = attention.attend(queries, seen, mask)
         x = x + (made if gate is None else made * gate)
-        normed, gate = self._normed(self.post_attention_layernorm, x, condition)
+        normed, gate = self._normed(self.post_attention_layernorm, x, times)
         made = self.mlp(normed)
         return x + (made if gate is None else made * gate)  # type: ignore[no-any-return]
 
-    def _normed(self, norm: nn.Module, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor | None]:
-        return norm(x, condition) if self.adaptive else (norm(x), None)
+    def _normed(self, norm: nn.Module, x: Tensor, times: _Times) -> tuple[Tensor, Tensor | None]:
+        return norm(x, times) if self.adaptive else (norm(x), None)
 
 
 class Pi(nn.Module):
@@ -159,13 +179,22 @@ class Expert(nn.Module):
         self.mlp_out = network.time_mlp_out if adaptive else network.action_time_mlp_out
 
     def forward(self, sample: Tensor, timestep: Tensor, encoded: tuple[Tensor, ...]) -> Tensor:
-        """``[B, T, D]``, times ``[B]`` from 1 to 0 and what ``Prefix`` gives -> the velocity ``[B, T, D]``."""
+        """``[B, T, D]``, times ``[B]`` from 1 to 0 and what ``Prefix`` gives -> the velocity ``[B, T, D]``.
+
+        Where the policy was trained to go on from a prefix, what ``Prefix`` gives begins with how many actions are
+        committed, int64 ``[B, 1]``: theirs is the time 0.
+        """
         valid, *cache = encoded
         x = self.action_in_proj(sample)
-        time = layers.waves(timestep, self.config.expert.width, *self.config.periods)
-        own = torch.zeros(1, 1, device=x.device)
-        if self.config.adaptive:
-            time = functional.silu(self.mlp_out(functional.silu(self.mlp_in(time))))
+        time = self._waves(timestep)
+        times, own = _Times(time), torch.zeros(1, 1, device=x.device)
+        if self.config.trained_prefix:
+            count, valid, *cache = encoded
+            committed = torch.arange(x.shape[1], device=x.device) < count
+            clean = self._mixed(self._waves(torch.zeros(1, dtype=timestep.dtype, device=x.device)))
+            times = _Times(self._mixed(time), clean, committed[..., None])
+        elif self.config.adaptive:
+            times = _Times(self._mixed(time))
         else:
             state, *cache = cache
             x = torch.cat([x, time[:, None].expand_as(x)], 2)
@@ -179,7 +208,13 @@ class Expert(nn.Module):
         before = layers.added(valid[:, None, None, :]).expand(-1, -1, count, -1)
         mask = torch.cat([before, own.expand(len(sample), 1, count, count)], 3)
         for i, layer in enumerate(self.layers):
-            x = layer(x, layers.Seen(cache[2 * i], cache[2 * i + 1]), turns, mask, time)
+            x = layer(x, layers.Seen(cache[2 * i], cache[2 * i + 1]), turns, mask, times)
         actions = x[:, -sample.shape[1] :]
-        normed = self.norm(actions, time)[0] if self.config.adaptive else self.norm(actions)
+        normed = self.norm(actions, times)[0] if self.config.adaptive else self.norm(actions)
         return self.action_out_proj(normed)  # type: ignore[no-any-return]
+
+    def _waves(self, time: Tensor) -> Tensor:
+        return layers.waves(time, self.config.expert.width, *self.config.periods)
+
+    def _mixed(self, waves: Tensor) -> Tensor:
+        return functional.silu(self.mlp_out(functional.silu(self.mlp_in(waves))))

@@ -18,7 +18,7 @@ def join(left: Binding, right: Binding) -> Binding:
 
 def input_bindings(spec: PolicySpec) -> dict[str, Binding]:
     """Binding of what the prologue reads: timestep and observations."""
-    return {spec.timestep_argument: Binding.TABLE, **dict.fromkeys(spec.observations, Binding.CONDITION)}
+    return {spec.timestep_argument: Binding.TABLE, **dict.fromkeys(spec.inputs, Binding.CONDITION)}
 
 
 def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:

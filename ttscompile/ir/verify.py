@@ -34,7 +34,7 @@ def verify_graph(graph: Graph, what: str) -> None:
 def verify(program: Phase) -> None:
     """Check a whole program: every graph, every weight, and how the pieces fit together."""
     spec, denoiser = program.spec, program.denoiser
-    expected = [spec.sample_argument, spec.timestep_argument, *spec.observations]
+    expected = [spec.sample_argument, spec.timestep_argument, *spec.inputs]
     if list(denoiser.inputs) != expected:
         raise PassError(f"denoiser: inputs {list(denoiser.inputs)}; expected {expected}.")
     _verify_graphs({DENOISER: denoiser} if isinstance(program, Program) else program.graphs(), program)

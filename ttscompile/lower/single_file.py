@@ -57,6 +57,9 @@ def lower_single_file(
     inputs, outputs = write_interface(main, program, weights)
     streams = main.op("Shape", "initial_noise", start=0, end=1)
     observations = {key: _normalized(main, key, spec) for key in spec.observations}
+    for key in spec.inputs.keys() - spec.observations:  # nothing is committed: the file takes no prefix
+        sizes = main.op("Concat", streams, main.constant([1]), axis=0)
+        observations[key] = main.op("Expand", main.constant([[0]]), sizes)
     contexts = Contexts(main, program.pieces, models, weights, observations, streams, spec.sampler.steps)
     lattice, pruner = (spec.sampler.steps, len(program.blocks)), None
     if program.pieces.pruner is not None:

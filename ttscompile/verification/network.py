@@ -41,7 +41,8 @@ class Probe:
         self._sessions = self._pool.of(view)
         self.streams = len(next(iter(obs.values())))
         pieces, arguments = self._manifest.pieces, self._manifest.spec.arguments
-        named = {**obs, **{arguments[key]: value for key, value in obs.items()}}
+        named = self._manifest.spec.committed(self.streams)
+        named |= {**obs, **{arguments[key]: value for key, value in obs.items()}}
         named |= FramePieces(pieces, partial(run_piece, self._sessions, pieces)).values(named)
         self._contexts = ContextValues(self._manifest, self.streams, np, np.zeros, view.tables)
         run_prologue(self._sessions, {CONDITION: pieces[CONDITION]}, named, self._contexts)

@@ -84,7 +84,8 @@ class _Recorder:
             self._tensors[key] = torch.from_numpy(normalized)
         self._initial = spec.draw_initial(self._draw, (streams, *spec.whole_horizon.sample))
         self._program, self._module = program, sharing_copy(module)
-        self._inside = _Inside(program, self._tensors, streams)
+        uncommitted = {key: torch.from_numpy(count) for key, count in spec.committed(streams).items()}
+        self._inside = _Inside(program, self._tensors | uncommitted, streams)
 
     def record(self, loop: str, scales: FloatArray | None = None) -> Golden:
         """The record of a loop; ``scales`` are taken from its middle if they are not given."""

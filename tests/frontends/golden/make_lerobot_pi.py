@@ -44,15 +44,19 @@ def main() -> None:
     print(path, path.stat().st_size, "bytes")
 
 
-def chunk(policy: Any, directory: Path, given: dict[str, Any]) -> Any:
-    """The actions of a whole chunk in robot units; tokens are given, so that no tokenizer is needed."""
+def chunk(policy: Any, directory: Path, given: dict[str, Any], left_over: Any = None, delay: int = 0) -> Any:
+    """The actions of a whole chunk in robot units; tokens are given, so that no tokenizer is needed.
+
+    What is left over of the chunk before is as the network gives it, of which so many actions are executed meanwhile.
+    """
     tensors = {key: torch.from_numpy(value) for key, value in given.items()}
     raw = {key: value[0] for key, value in tensors.items() if key not in (TOKENS, MASK)}
     batch, after = processed(str(directory), raw, "go")
     batch = {key: value if value.ndim > raw[key].ndim else value[None] for key, value in batch.items()}
     batch |= {key: tensors[key] for key in (TOKENS, MASK)}
     assert STATE in batch
-    return after(policy.predict_action_chunk(batch, noise=torch.from_numpy(pis.noise()))).numpy()
+    before = {} if left_over is None else {"prev_chunk_left_over": left_over, "inference_delay": delay}
+    return after(policy.predict_action_chunk(batch, noise=torch.from_numpy(pis.noise()), **before)).numpy()
 
 
 def tiny(kind: str, directory: Path) -> Any:
