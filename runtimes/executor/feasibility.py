@@ -16,6 +16,7 @@ other without a gap in the actions if ``frame period + 2 * latency + margin <= p
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from math import inf
 from statistics import median
 from typing import Any
 
@@ -40,6 +41,8 @@ class Feasibility:
         horizon_steps: actions of a chunk that the policy executes: ``play``.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
         reserve_steps: actions after these that may be played.
+        prefix_steps: actions that may be committed while a call computes, of a policy that was trained with prefixes;
+            None: any number.
     """
 
     latency: float
@@ -48,6 +51,7 @@ class Feasibility:
     horizon_steps: int
     margin_ticks: int
     reserve_steps: int = 0
+    prefix_steps: int | None = None
 
     @property
     def frame_period(self) -> float:
@@ -70,6 +74,11 @@ class Feasibility:
         return (self.horizon_steps + self.reserve_steps) / self.policy_hz
 
     @property
+    def committed(self) -> float:
+        """How long a call may take for no more than ``prefix_steps`` to be committed, the first at its beginning."""
+        return inf if self.prefix_steps is None else self.prefix_steps / self.policy_hz - 1 / self.control_hz
+
+    @property
     def needed(self) -> float:
         """How long they have to last."""
         return self.frame_period + 2 * self.latency + self.margin
@@ -77,7 +86,7 @@ class Feasibility:
     @property
     def max_latency(self) -> float:
         """The longest call with which this would be feasible; not positive if none would be."""
-        return min(self.play, (self.predicted - self.frame_period - self.margin) / 2)
+        return min(self.play, self.committed, (self.predicted - self.frame_period - self.margin) / 2)
 
     @property
     def max_policy_hz(self) -> float:
@@ -89,11 +98,14 @@ class Feasibility:
     @property
     def feasible(self) -> bool:
         """Whether the calls keep up."""
-        return self.needed <= self.predicted + 1e-12 and self.latency <= self.play
+        return self.needed <= self.predicted + 1e-12 and self.latency <= min(self.play, self.committed + 1e-12)
 
     def explain(self) -> str:
         """The arithmetic on one line, in milliseconds."""
         covered = self.needed <= self.predicted + 1e-12
+        if covered and self.latency <= self.play and not self.feasible:
+            lasts = f"{_ms(self.committed)} ms, of a prefix of {self.prefix_steps} actions at {self.policy_hz:g} Hz"
+            return f"latency {_ms(self.latency)} ms > {lasts}, the longest that the policy was trained with"
         if covered and not self.feasible:
             lasts = f"{_ms(self.play)} ms = {self.horizon_steps} actions"
             return f"latency {_ms(self.latency)} ms > {lasts} at {self.policy_hz:g} Hz, to the next call"

@@ -166,12 +166,13 @@ class Schedule:
         return end if end > now else None
 
     def committed(self, observed: float, until: float) -> FloatArray:
-        """Actions given out and scheduled between two times, one a step of the policy, ``[N, Da]``."""
+        """Actions given out and scheduled between two times, one a step of the policy, no more than it takes."""
+        most = min(self._settings.horizon, self._settings.longest_prefix or self._settings.horizon)
         tick, last = self.grid.tick(observed), self.grid.tick(until)
         played, timeline, rows = dict(self._played), self.timeline, list[FloatArray]()
         if timeline is not None and not played:  # it begins with the first action, and so does the next chunk
             timeline = replace(timeline, start=tick)
-        while tick <= last and len(rows) < self._settings.horizon:
+        while tick <= last and len(rows) < most:
             row = played.get(tick)
             if row is None and timeline is not None:
                 row = timeline.at(tick)

@@ -184,6 +184,7 @@ class Resolved(ExecutorSettings):
         channels: Da.
         frames: what one frame holds.
         stall: when the policy has stopped moving; None if nobody looks.
+        longest_prefix: of a policy that was trained with prefixes, where the seam is ``prefix``; None: any.
     """
 
     policy_hz: float
@@ -197,6 +198,7 @@ class Resolved(ExecutorSettings):
     channels: int
     frames: FrameSpec
     stall: StallRule | None
+    longest_prefix: int | None
 
     @property
     def plans(self) -> tuple[str, ...]:
@@ -205,7 +207,8 @@ class Resolved(ExecutorSettings):
 
     def feasibility(self, latency: float) -> Feasibility:
         """The arithmetic of calls of so many seconds."""
-        return Feasibility(latency, self.control_hz, self.policy_hz, self.horizon, self.margin_ticks, self.reserve)
+        own = latency, self.control_hz, self.policy_hz, self.horizon, self.margin_ticks, self.reserve
+        return Feasibility(*own, self.longest_prefix)
 
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
@@ -245,6 +248,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         raise ExecutorError(
             f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
         )
+    trained = settings.seam == "prefix" and getattr(info, "trained_prefix", False)
     found = {
         "policy_hz": policy_hz,
         "horizon": horizon,
@@ -257,5 +261,6 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         "channels": chunk.action_dim,
         "frames": FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
         "stall": stall,
+        "longest_prefix": info.longest_prefix if trained else None,
     }
     return Resolved(**{**vars(settings), **found})

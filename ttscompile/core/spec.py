@@ -329,8 +329,9 @@ class PolicySpec:
             raise SpecError(f"noise is {self.noise!r:.80}; expected normal or uniform.")
         if not self.observations:
             raise SpecError("a policy needs at least one observation: a condition input of the denoiser.")
-        taken = {self.sample_argument, self.timestep_argument}
-        for key, argument in self.arguments.items():
+        taken = {self.sample_argument, self.timestep_argument, *[COMMITTED] * bool(self.trained_prefix)}
+        for key in self.observations:
+            argument = self.arguments[key]
             if argument in taken or not all(part.isidentifier() for part in key.split(".")):
                 raise SpecError(
                     f"observation key {key!r} must be an identifier, or several with dots between them, and its"
@@ -344,8 +345,6 @@ class PolicySpec:
         longest = horizon + self.left_out - self.chunk.start - 1  # one action is left free
         count = integer(self.trained_prefix, "trained_prefix", SpecError, most=longest)
         object.__setattr__(self, "trained_prefix", count)
-        if self.trained_prefix and COMMITTED in self.observations:
-            raise SpecError(f"an observation is called {COMMITTED!r}, as what a trained prefix is told by. Rename it.")
         words = self.instruction
         if words is not None and not {words.tokens, words.mask} <= self.observations.keys():
             raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
@@ -369,7 +368,7 @@ class PolicySpec:
         return {**self.observations, COMMITTED: count} if self.trained_prefix else self.observations
 
     def committed(self, streams: int, count: int = 0) -> dict[str, npt.NDArray[np.int64]]:
-        """What a network that was trained with prefixes reads of one of so many actions, ``[B, 1]``; nothing of another's."""
+        """What a network that was trained with prefixes reads of one of so many actions; of all others nothing."""
         return {COMMITTED: np.full((streams, 1), count)} if self.trained_prefix else {}
 
     @property

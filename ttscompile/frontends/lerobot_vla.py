@@ -49,7 +49,7 @@ def read_vla_config(
         )
     if config.settings.flag("use_visual_memory", False) or config.settings.flag("use_proprioceptive_memory", False):
         raise config.settings.error(
-            "use_visual_memory or use_proprioceptive_memory is set: the policy reads frames of the seconds before, which"
+            "use_visual_memory or use_proprioceptive_memory is set: the policy reads frames of seconds before, which"
             " is not compiled; expected false"
         )
     without = set(options.without_cameras or ())

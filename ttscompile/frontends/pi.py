@@ -45,8 +45,10 @@ class PiConfig:
 
 
 class _Times(NamedTuple):
-    """What modulates the norms of pi0.5: the step's time ``[B, width]``; that of clean actions ``[1, width]``, and
-    which are clean, bool ``[B, T, 1]``, where the policy was trained to go on from a prefix.
+    """What modulates the norms of pi0.5: the time of the step ``[B, width]``.
+
+    Where it was trained to go on from a prefix also that of clean actions ``[1, width]``, and which of them are, bool
+    ``[B, T, 1]``.
     """
 
     step: Tensor
@@ -87,9 +89,7 @@ class _ExpertLayer(nn.Module):
         self.input_layernorm, self.post_attention_layernorm = norm(config.expert), norm(config.expert)
         self.self_attn, self.mlp = layers.Attention(config.expert), layers.FeedForward(config.expert)
 
-    def forward(
-        self, x: Tensor, prefix: layers.Seen, turns: layers.Rotation, mask: Tensor, times: _Times
-    ) -> Tensor:
+    def forward(self, x: Tensor, prefix: layers.Seen, turns: layers.Rotation, mask: Tensor, times: _Times) -> Tensor:
         attention = self.self_attn
         normed, gate = self._normed(self.input_layernorm, x, times)
         queries = layers.rotate(attention.split(attention.q_proj(normed)), turns)

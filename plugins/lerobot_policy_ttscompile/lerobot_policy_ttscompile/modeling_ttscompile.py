@@ -146,12 +146,18 @@ class TtscompilePolicy(PreTrainedPolicy):
             noise: ``[B, T, D]`` that the chunk starts from; None draws it.
             inference_delay: actions that the robot executes while this call computes.
             prev_chunk_left_over: what is left of the chunk before, ``[N, Da]`` or ``[B, N, Da]``, padded with zeros.
-                Its first ``inference_delay`` actions are kept in the new chunk, and the rest of that is inpainted to
-                them (``predict_action(prefix=)``). Those after them have no influence: this is not LeRobot's guidance.
+                Its first ``inference_delay`` actions are kept in the new chunk, and the rest of that goes on from them
+                (``predict_action(prefix=)``). Those after them have no influence: this is not LeRobot's guidance. Of a
+                policy that was trained with shorter prefixes only so many are kept, and the log says so, as LeRobot's
+                own loop does it.
         """
         if self._shadow is not None:
             return self._shadow.predict_action_chunk(batch)
-        prefix = _committed(inference_delay, prev_chunk_left_over)
+        prefix, most = _committed(inference_delay, prev_chunk_left_over), self._policy.info.longest_prefix
+        if prefix is not None and self._policy.info.trained_prefix and prefix.shape[1] > most:
+            told = "%d actions are executed meanwhile; the policy was trained to go on from %d, and is told of no more"
+            logger.warning(told, prefix.shape[1], most)
+            prefix = prefix[:, :most]
         return self._policy.predict_action_chunk(batch, self._noise(batch, noise), prefix=prefix)
 
     def supports_rtc(self) -> bool:

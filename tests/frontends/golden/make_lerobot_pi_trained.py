@@ -1,4 +1,4 @@
-"""Run lerobot's pi05 that was trained to go on from a prefix, at tiny size on seeded weights: ``lerobot_pi_trained.npz``.
+"""Run lerobot's pi05 that was trained to go on from a prefix, at tiny size: ``lerobot_pi_trained.npz``.
 
 Not run by the tests. No release of lerobot has this yet: needs the sources of huggingface/lerobot at 7427f31, and what
 lerobot 0.6.1 needs. This repository has to be importable::
