@@ -20,6 +20,8 @@ import torch
 
 import ttscompile
 
+from ..runtimes import committed
+from ..runtimes.committed import LONGEST
 from .lerobot_saved import DA, DS, ENVIRONMENT, PIXELS, SETTINGS, STATE, save
 
 pytestmark = [
@@ -306,6 +308,31 @@ def test_in_shadow_mode_the_original_acts_and_the_log_says_how_far_the_compiled_
     assert "shadow: 20 of 20 calls compared, 0 dropped, 0 failed, " in caplog.text
     worst = float(caplog.text.split("worst call ")[-1].split(": ")[1].split()[0])
     assert worst < 1e-4 * np.abs(expected).max()
+
+
+def test_of_a_longer_prefix_than_a_policy_was_trained_with_it_is_told_of_as_much_and_the_log_of_the_rest(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As lerobot's own loop does it with ``--inference.rtc.mode=trained``, which its releases do not know yet."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot_policy_ttscompile.configuration_ttscompile import TtscompileConfig
+    from lerobot_policy_ttscompile.modeling_ttscompile import TtscompilePolicy
+
+    committed.compiled("rk4", tmp_path / "compiled")
+    observed = {"obs": PolicyFeature(FeatureType.STATE, (4,))}
+    policy = TtscompilePolicy(TtscompileConfig(input_features=observed, device="cpu"), tmp_path / "compiled")
+    assert policy.supports_rtc()
+    batch, noise = {"obs": torch.ones(1, 4)}, torch.randn(1, committed.HORIZON, committed.CHANNELS)
+    left_over = torch.rand(1, LONGEST + 1, committed.ACTIONS)
+    chunks = []
+    for delay in (LONGEST - 1, LONGEST, LONGEST + 1):
+        chunks.append(policy.predict_action_chunk(batch, noise, delay, left_over))
+        policy.reset()
+        assert ("4 actions are executed meanwhile; the policy was trained to go on from 3" in caplog.text) == (
+            delay == 4
+        )
+    assert torch.equal(chunks[2], chunks[1]) and not torch.equal(chunks[1], chunks[0])
+    torch.testing.assert_close(chunks[2][:, :LONGEST], left_over[:, :LONGEST])
 
 
 def test_lerobots_of_other_series_are_refused_in_one_sentence(caplog: pytest.LogCaptureFixture) -> None:

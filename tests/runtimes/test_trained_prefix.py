@@ -135,7 +135,9 @@ def test_a_policy_says_how_long_a_prefix_it_takes_and_refuses_a_longer_one(once:
     assert (info.prefix_refusal, info.longest_prefix, info.trained_prefix) == (None, LONGEST, True)
     assert set(info.observation) == {"obs"}
     obs, prefix = {"obs": np.zeros((1, 4), np.float32)}, np.zeros((1, LONGEST + 1, ACTIONS), np.float32)
-    with pytest.raises(ObservationError, match=r"prefix holds 4 actions; the policy was trained to go on from at most 3"):
+    with pytest.raises(
+        ObservationError, match=r"prefix holds 4 actions; the policy was trained to go on from at most 3"
+    ):
         policy.predict_action(obs, prefix=prefix)
     kept = policy.predict_action(obs, prefix=prefix[:, 1:])["action"][:, :LONGEST]
     assert_equal_but_for_rounding(kept, prefix[:, 1:], terms=4)

@@ -367,7 +367,7 @@ class PolicySpec:
         count = ObservationSpec((1,), dtype="int64", window=False, bounds=(0, self.trained_prefix))
         return {**self.observations, COMMITTED: count} if self.trained_prefix else self.observations
 
-    def committed(self, streams: int, count: int = 0) -> dict[str, npt.NDArray[np.int64]]:
+    def committed(self, streams: int, count: int = 0) -> dict[str, npt.NDArray[Any]]:
         """What a network that was trained with prefixes reads of one of so many actions; of all others nothing."""
         return {COMMITTED: np.full((streams, 1), count)} if self.trained_prefix else {}
 
