@@ -27,6 +27,19 @@ def test_the_arithmetic_of_push_t() -> None:
     assert at_50.to_json()["feasible"] is True
 
 
+def test_calls_last_no_longer_than_the_prefix_that_a_policy_was_trained_with() -> None:
+    """The action of a call's first tick is the first of its prefix: three last two ticks, up to the third."""
+    at_50 = Feasibility(0.04, 50, 50, 8, 1, reserve_steps=7, prefix_steps=3)
+    assert at_50.feasible
+    assert at_50.max_latency == pytest.approx(0.04)
+    slow = Feasibility(0.041, 50, 50, 8, 1, reserve_steps=7, prefix_steps=3)
+    assert not slow.feasible
+    assert slow.explain() == (
+        "latency 41 ms > 40 ms, of a prefix of 3 actions at 50 Hz, the longest that the policy was trained with"
+    )
+    assert Feasibility(0.041, 50, 50, 8, 1, reserve_steps=7).feasible
+
+
 def test_what_is_predicted_beyond_what_is_executed_lets_calls_take_longer() -> None:
     """Push-T predicts 15 actions from the observation on, and executes 8."""
     at_50 = Feasibility(0.04, 50, 50, 8, 1, reserve_steps=7)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from itertools import pairwise
 from math import inf
 from pathlib import Path
@@ -200,7 +201,10 @@ def test_the_prefix_seam_is_refused_for_a_policy_that_cannot_inpaint() -> None:
         World(settings=ExecutorSettings(seam="prefix"))
 
 
-def test_the_prefix_seam_gives_the_policy_what_is_committed() -> None:
+@pytest.mark.parametrize("trained", [0, 2])
+def test_the_prefix_seam_gives_the_policy_what_is_committed(trained: int) -> None:
+    """Of a policy that was trained with a prefix no longer one, in a loop that knowingly asks for it."""
+
     class Inpainting(ScriptedPolicy):
         prefixes: list[np.ndarray] = []  # noqa: RUF012
 
@@ -210,15 +214,22 @@ def test_the_prefix_seam_gives_the_policy_what_is_committed() -> None:
 
     clock = FakeClock()
     policy = Inpainting(clock, {"dense": 0.2})
-    with World(settings=ExecutorSettings(seam="prefix"), policy=policy) as world:
+    settings = ExecutorSettings(seam="prefix")
+    if trained:
+        vars(policy.info).update(trained_prefix=True, longest_prefix=trained)
+        with pytest.raises(InfeasibleError, match=r"latency 200 ms > 100 ms, of a prefix of 2 actions at 10 Hz"):
+            World(settings=settings, policy=policy)
+        policy.prefixes.clear()
+        settings = replace(settings, refuse_infeasible=False)
+    with World(settings=settings, policy=policy) as world:
         world.begin()
         played = {round(world.hz * world.time): world.tick() for _ in range(20)}
     assert policy.prefixes[0].shape == (1, 0, 3)
     for (start, _, _), prefix in list(zip(policy.calls, policy.prefixes, strict=True))[1:3]:
         tick = round(world.hz * (start - world.start))
-        assert prefix.shape == (1, 3, 3)  # now, and the two ticks that the call will take
+        assert prefix.shape == (1, trained or 3, 3)  # now, and the two ticks that the call will take
         np.testing.assert_array_equal(prefix[0, :2], [played[tick], played[tick + 1]])
-        assert prefix[0, 2, 2] == prefix[0, 1, 2] + 1
+        assert trained or prefix[0, 2, 2] == prefix[0, 1, 2] + 1
 
 
 def test_what_is_infeasible_is_refused_with_the_arithmetic() -> None:

@@ -12,10 +12,13 @@ import pytest
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 import ttscompile
+from tests.once import Once
 from tests.rounding import allowed, assert_equal_but_for_rounding
+from tests.runtimes import committed
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import AsyncExecutor, ExecutorSettings
 from ttscompile.errors import ExecutorError
+from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.table import sampler_table
 
@@ -50,17 +53,19 @@ class Recorded:
         return predicted
 
 
-def drive(path: Path, ticks: int) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Actions of a loop at the policy's rate whose calls are said to take two ticks, and the calls."""
+def drive(
+    path: Path, ticks: int, latency: float = LATENCY, numbers: int = 2
+) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """Actions of a loop at the policy's rate whose calls are said to take so long, and the calls."""
     clock, policy = FakeClock(), Recorded(ttscompile.load(path, seed=0))
     settings = ExecutorSettings(seam="prefix", n_obs_steps=1)
-    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies={"dense": LATENCY})
+    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies={"dense": latency})
     clock.settle()
     actions: list[np.ndarray] = []
     rng = np.random.default_rng(0)
     try:
         while len(actions) < ticks:
-            executor.observe({"obs": rng.standard_normal(2).astype(np.float32)})
+            executor.observe({"obs": rng.standard_normal(numbers).astype(np.float32)})
             clock.settle()
             if executor.ready:
                 actions.append(executor.action())
@@ -81,6 +86,22 @@ def test_a_compiled_policy_keeps_what_is_committed(inpainting: Path) -> None:
         assert_equal_but_for_rounding(predicted[1:4], prefix, terms=6)  # normalised and back
         rounding = 2 * allowed(prefix, terms=6)  # of both channels
         assert np.abs(actions[:, None] - prefix).sum(-1).min(axis=0).max() <= rounding  # all of it was played
+
+
+@pytest.mark.slow
+def test_a_policy_that_was_trained_with_prefixes_goes_on_from_what_is_committed(once: Once) -> None:
+    """A policy that was trained with three actions, in a loop whose calls are said to take a tick."""
+    path, _ = once.compiled("committed rk4", lambda to: committed.compiled("rk4", to))
+    info = ttscompile.load(path).info
+    resolved = [resolve(ExecutorSettings(seam=seam), info, HZ) for seam in ("prefix", "blend")]
+    assert [each.longest_prefix for each in resolved] == [committed.LONGEST, None]
+    assert [each.feasibility(0.2).committed for each in resolved] == [pytest.approx(0.2), np.inf]
+    _, calls = drive(path, ticks=20, latency=0.1, numbers=4)
+    assert [len(prefix) for prefix, _ in calls[1:]] == [2] * (
+        len(calls) - 1
+    )  # now, and the tick that the call may take
+    for prefix, predicted in calls:
+        assert_equal_but_for_rounding(predicted[1 : 1 + len(prefix)], prefix, terms=6)
 
 
 def test_a_policy_that_cannot_inpaint_is_refused_when_the_executor_is_made(toy_compiled: Path) -> None:
