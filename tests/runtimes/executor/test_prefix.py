@@ -97,9 +97,7 @@ def test_a_policy_that_was_trained_with_prefixes_goes_on_from_what_is_committed(
     assert [each.longest_prefix for each in resolved] == [committed.LONGEST, None]
     assert [each.feasibility(0.2).committed for each in resolved] == [pytest.approx(0.2), np.inf]
     _, calls = drive(path, ticks=20, latency=0.1, numbers=4)
-    assert [len(prefix) for prefix, _ in calls[1:]] == [2] * (
-        len(calls) - 1
-    )  # now, and the tick that the call may take
+    assert max(len(prefix) for prefix, _ in calls) == 2  # now, and the tick that the call may take
     for prefix, predicted in calls:
         assert_equal_but_for_rounding(predicted[1 : 1 + len(prefix)], prefix, terms=6)
 
