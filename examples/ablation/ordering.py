@@ -45,6 +45,7 @@ WAYS = {
     "importance": "the same times the patch's importance",
     "head": "a learned head",
     "found": "importance; the others from where their patch was",
+    "similar": "as today; the others from a similar one that is computed",
     "merged": "importance; the others from a similar one that is computed",
     "effect": "the effect in this very call, after the fact",
 }

@@ -211,7 +211,7 @@ class Chains:
             return orders.by_head(seen)
         if way == "effect":
             return effect(seen)
-        return seen.differences * (1.0 if way == "difference" else orders.importance)
+        return seen.differences * (1.0 if way in ("difference", "similar") else orders.importance)
 
     def _sources(self, way: str, seen: Seen, chosen: Tensor) -> tuple[Tensor, Kept]:
         """Whose rows of this frame each token has (``MaskedTower.some``), and what counts as kept."""
@@ -224,7 +224,7 @@ class Chains:
             least, where = apart.min(2)
             own = torch.arange(count).expand_as(where)
             kept = self._tower.moved(kept, torch.where(least < 0.8 * seen.differences, where, own))
-        if way == "merged":
+        if way in ("similar", "merged"):
             apart = _apart(seen.new, seen.new).masked_fill(chosen[:, None] == 0, np.inf)
             least, where = apart.min(2)
             other = (least < seen.differences) & (chosen == 0)
