@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -139,7 +140,8 @@ class TokenPolicy:
         self._frames = evaluator(backward_slice(pieces.frames, tuple(graph.inputs), {}), view.weights)
 
         self.cameras = [key for key, one in self.spec.observations.items() if one.image]
-        self.model._once = {**self.model._once, self._piece: lambda _: self._given}
+        once: dict[str, Any] = {**self.model._once, self._piece: lambda _: self._given}
+        self.model._once = once
         self._given: Sequence[Tensor] = ()
 
     def rows(self, obs: Observation) -> Tensor:

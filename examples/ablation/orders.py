@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -183,7 +184,7 @@ class Chains:
                     old = tower.patches(self.rows[c][at])
                     continue
                 seen = self._seen(self.rows[c][at], old, kept)
-                score = self._score(way, seen, orders, generator, lambda one, c=c, at=at: self._effect(one, c, at))
+                score = self._score(way, seen, orders, generator, partial(self._effect, c=c, at=at))
                 chosen = torch.zeros(score.shape).scatter(1, score.topk(size, 1).indices, 1.0)
                 mix, start = self._sources(way, seen, chosen)
                 with torch.no_grad():
@@ -217,8 +218,9 @@ class Chains:
         """Whose rows of this frame each token has (``MaskedTower.some``), and what counts as kept."""
         fixed, count = self._tower.fixed, chosen.shape[1]
         mix, kept = torch.eye(count).expand(len(chosen), -1, -1) * chosen[:, :, None], seen.kept
-        away = (torch.cdist(*(torch.stack(torch.meshgrid(*map(torch.arange, self._tower.grid), indexing="ij"), -1)
-                .flatten(0, 1).float() for _ in range(2)), p=float("inf")))  # fmt: skip
+        down, across = (torch.arange(size, dtype=torch.float32) for size in self._tower.grid)
+        places = torch.cartesian_prod(down, across)
+        away = torch.cdist(places, places, p=float("inf"))
         if way == "found":
             apart = _apart(seen.new, seen.old).masked_fill(away > REACH, np.inf)
             least, where = apart.min(2)
