@@ -19,6 +19,7 @@ from .window import FrameSpec
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from ttscompile.core.spec import FloatArray, Switch
     from ttscompile.runtimes.frames import FrameWork
     from ttscompile.runtimes.info import PolicyInfo
 
@@ -185,6 +186,7 @@ class Resolved(ExecutorSettings):
         frames: what one frame holds.
         stall: when the policy has stopped moving; None if nobody looks.
         longest_prefix: of a policy that was trained with prefixes, where the seam is ``prefix``; None: any.
+        switches: numbers of an action that have two values alone.
     """
 
     policy_hz: float
@@ -199,6 +201,14 @@ class Resolved(ExecutorSettings):
     frames: FrameSpec
     stall: StallRule | None
     longest_prefix: int | None
+    switches: tuple[Switch, ...]
+
+    def switched(self, row: FloatArray) -> FloatArray:
+        """An action with the nearer of two values where it has no other: a seam or ``linear`` may be between them."""
+        row = row.copy()
+        for one in self.switches:
+            row[one.channel] = min(one.below, one.above, key=lambda value: abs(value - row[one.channel]))
+        return row
 
     @property
     def plans(self) -> tuple[str, ...]:
@@ -262,5 +272,6 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         "frames": FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
         "stall": stall,
         "longest_prefix": info.longest_prefix if trained else None,
+        "switches": chunk.switches,
     }
     return Resolved(**{**vars(settings), **found})

@@ -135,6 +135,7 @@ class ExecutorState:
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
+        row = self._settings.switched(row)
         late = tick >= schedule.due
         if late:
             recorder.counts.reserve += 1
