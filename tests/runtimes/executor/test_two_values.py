@@ -13,6 +13,7 @@ from ttscompile.runtimes.executor import ExecutorSettings
 
 from .simulation import TA, TO, FakeClock, ScriptedPolicy, World
 
+RESERVE = 6  # so that a chunk and the one before have actions for the same ticks
 GRIPPER = Switch(channel=2, threshold=0.5, below=-1.0, above=1.0)
 
 
@@ -21,11 +22,11 @@ def given(settings: ExecutorSettings, switches: tuple[Switch, ...]) -> np.ndarra
     turns = itertools.cycle((1.0, -1.0))
 
     def actions(seen: np.ndarray) -> np.ndarray:
-        chunk = np.zeros((TO - 1 + TA, 3), np.float32)
+        chunk = np.zeros((TO - 1 + TA + RESERVE, 3), np.float32)
         chunk[:, 2] = next(turns) * np.where(np.arange(len(chunk)) % 3 < 2, 1, -1)
         return chunk
 
-    policy = ScriptedPolicy(FakeClock(), actions=actions)
+    policy = ScriptedPolicy(FakeClock(), actions=actions, reserve=RESERVE)
     policy.info = replace(policy.info, action=replace(policy.info.action, switches=switches))
     world = World(20.0 if settings.interpolation == "linear" else 10.0, settings, policy)
     with world.executor:
