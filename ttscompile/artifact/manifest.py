@@ -283,7 +283,7 @@ class Manifest:
         spec: the policy beside its network.
         blocks: block table, in order of execution.
         pieces: ONNX graphs: ``condition``, ``step``, ``pruner``, ``stem``, ``advance``, ``block_00``...; those that the
-            policy has; ``blocks``, all of its blocks in one (``ir.joint``); of one block alone ``layers``; and
+            policy has; ``blocks``, all of its blocks in one (``ir.pieces``); of one block alone ``layers``; and
             ``pixels_00`` and ``tokens_00`` of each frame piece in ``tokens``.
         contexts: binding and type of every context.
         features: condition values that the pruner reads, and corrections.
