@@ -36,11 +36,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """One thread for each of torch's operations: those of the tests are small, and wait for each other otherwise.
 
-    Where the processor has no integer dot products, every policy with blocks of eight bits warns that it is slow there.
-    That is no error of the test that loads it; that it warns, a test of its own checks.
+    Where the processor has no integer dot products, every policy with blocks of eight or four bits warns that it is
+    slow there. That is no error of the test that loads it; that it warns, a test of its own checks.
     """
     if not has_integer_dot_product():
-        config.addinivalue_line("filterwarnings", "ignore:precision 'int8' is fast on a processor:RuntimeWarning")
+        config.addinivalue_line("filterwarnings", "ignore:precision 'int[48]' is fast on a processor:RuntimeWarning")
     if importlib.util.find_spec("hypothesis") is not None:
         from hypothesis import HealthCheck, settings
 

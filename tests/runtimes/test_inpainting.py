@@ -26,7 +26,7 @@ from ttscompile.errors import ObservationError
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.inpainting import TOLERANCE, MaskedUpdates, known_samples, noise_levels, prefix_refusal
+from ttscompile.runtimes.inpainting import TOLERANCE, Known, MaskedUpdates, known_samples, noise_levels, prefix_refusal
 from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table, set_timesteps
@@ -228,10 +228,11 @@ def test_a_network_inpaints_as_the_loop_of_its_scheduler(make_artifact: MakeArti
 def test_matrices_are_masked_where_a_prefix_is_and_put_back(groups: int, actions: int) -> None:
     """Of two memories beside the sample, and of channels that are no actions, nothing is taken."""
     plain = np.random.default_rng(0).uniform(1, 2, (4, groups, 11, 3 * HORIZON)).astype(np.float32)
-    masked = MaskedUpdates(plain, ChunkSpec(actions, START, HORIZON))
+    masked = MaskedUpdates(plain)
     before = plain.copy()
     for length in (3, 5, 1, 1, 4):
-        masked.mask(length)
+        known = np.zeros((1, 1, length, actions), np.float32)
+        masked.mask(Known(slice(START, START + length), slice(actions), known))
         expected = before.copy()
         expected[:, : min(groups, actions), :, START : START + length] = 0
         np.testing.assert_array_equal(masked.updates, expected)

@@ -260,7 +260,7 @@ def test_frames_are_computed_in_fewer_bits(once: Once) -> None:
         ),
         (
             {"runtime": "onnxruntime", "plan": "dense@fp16"},
-            "computes in fp32, and beside it int8; the plan wants 'blocks'",
+            "computes in fp32, and beside it int8, int4; the plan wants 'blocks'",
         ),
     ],
 )

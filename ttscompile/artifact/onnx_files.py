@@ -18,7 +18,7 @@ from .strict_json import REMEDY
 
 MAX_BYTES = 64 * 2**20
 """Of all models of an artifact, whose weights lie beside them. Push-T has 0.2 MB."""
-MAX_FIELDS = 1_000_000
+MAX_FIELDS = 500_000
 """In all models of an artifact. Push-T has 20,000."""
 MAX_DEPTH = 32
 LOOPS = frozenset({"Loop", "SequenceMap"})

@@ -22,6 +22,9 @@ from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
 from .trials import Trials
 
+SAME = 1e-4
+"""Of a distance: plans that differ by less are told apart by rounding alone."""
+
 
 class Kept:
     """See the module.
@@ -94,7 +97,7 @@ class Kept:
         difference, limit = further(score, best)
         told = f"its distance from the original is {score.distance:.4g} on held-out calls, and that of {self.default!r}"
         if margin is None:
-            return None if difference < 0 else f"is no better: {told} {best.distance:.4g}."
+            return None if difference < -SAME * best.distance else f"is no better: {told} {best.distance:.4g}."
         if limit <= margin:
             return None
         return f"is too far off: {told} {best.distance:.4g}: {limit:.4g} more at worst, and {margin:.4g} is allowed."

@@ -3,8 +3,6 @@
 ``docs/decisions.md`` has what that costs in time and in error, beside eight bits.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

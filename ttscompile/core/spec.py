@@ -18,6 +18,7 @@ from .coercion import integer, numbers
 from .pictures import in_bytes
 from .rules import LOOP_NAME, OMITTED, DType, LoopName, Positive, Shape
 from .sampler import FloatArray as FloatArray, SamplerTable as SamplerTable
+from .tokenizer import Instruction as Instruction
 
 FP32, INT8, INT4, BF16, FP16 = "fp32", "int8", "int4", "bf16", "fp16"
 PRECISIONS = (FP32, INT8, INT4)
@@ -168,44 +169,6 @@ class ObservationSpec:
     def normalized(self, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """What the network is given of observations ``[..., *shape]``; the array itself without a normaliser."""
         return array if self.normalizer is None else self.normalizer.normalize(array)
-
-
-@dataclass(frozen=True)
-class Instruction:
-    """How the text of a task becomes two observations, where somebody has the tokenizer.
-
-    Attributes:
-        tokens: key of the tokens, int64 ``[B, L]``, padded at the end.
-        mask: key of what says which of them count, bool ``[B, L]``.
-        new_line: whether the text ends with a new line before it is tokenized.
-        before: lines before the text, of a policy that has some. The text is then stripped, unless it is in a line with
-            others.
-        skipped: the first so many tokens of all together are no part of the observation.
-        around: what is in the same line before and after the text, of a policy that has such.
-        plain: whether the text is in lower case, and of its signs only letters, digits, spaces and ``_`` are left.
-        otherwise: stands for an empty text.
-    """
-
-    tokens: str
-    mask: str
-    new_line: bool
-    before: tuple[str, ...] = field(default=(), metadata=OMITTED)
-    skipped: int = field(default=0, metadata=OMITTED)
-    around: tuple[str, ...] = field(default=(), metadata=OMITTED)
-    plain: bool = field(default=False, metadata=OMITTED)
-    otherwise: str = field(default="", metadata=OMITTED)
-
-    def line(self, text: str) -> str:
-        """What is tokenized."""
-        text = text or self.otherwise
-        if self.plain:
-            text = "".join(c for c in text.lower() if c.isalnum() or c.isspace() or c == "_") or self.otherwise
-        if self.around:
-            text = text.join(self.around)
-        elif self.before:
-            text = text.strip()
-        text = "\n".join([*self.before, text])
-        return f"{text}\n" if self.new_line and not text.endswith("\n") else text
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .coercion import Errors
-from .spec import Instruction
+from .rules import OMITTED
 
 TASK = "task"
 """The key of an instruction's text, as LeRobot has it."""
@@ -20,6 +21,44 @@ _MOST_BYTES = 64 * 2**20
 
 _WORDS = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
 """What CLIP takes for a word, as transformers has it; its ``vocab.json`` does not say so."""
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """How the text of a task becomes two observations, where somebody has the tokenizer.
+
+    Attributes:
+        tokens: key of the tokens, int64 ``[B, L]``, padded at the end.
+        mask: key of what says which of them count, bool ``[B, L]``.
+        new_line: whether the text ends with a new line before it is tokenized.
+        before: lines before the text, of a policy that has some. The text is then stripped, unless it is in a line with
+            others.
+        skipped: the first so many tokens of all together are no part of the observation.
+        around: what is in the same line before and after the text, of a policy that has such.
+        plain: whether the text is in lower case, and of its signs only letters, digits, spaces and ``_`` are left.
+        otherwise: stands for an empty text.
+    """
+
+    tokens: str
+    mask: str
+    new_line: bool
+    before: tuple[str, ...] = field(default=(), metadata=OMITTED)
+    skipped: int = field(default=0, metadata=OMITTED)
+    around: tuple[str, ...] = field(default=(), metadata=OMITTED)
+    plain: bool = field(default=False, metadata=OMITTED)
+    otherwise: str = field(default="", metadata=OMITTED)
+
+    def line(self, text: str) -> str:
+        """What is tokenized."""
+        text = text or self.otherwise
+        if self.plain:
+            text = "".join(c for c in text.lower() if c.isalnum() or c.isspace() or c == "_") or self.otherwise
+        if self.around:
+            text = text.join(self.around)
+        elif self.before:
+            text = text.strip()
+        text = "\n".join([*self.before, text])
+        return f"{text}\n" if self.new_line and not text.endswith("\n") else text
 
 
 class Tokenizer:

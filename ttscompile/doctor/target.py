@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.finding import Finding, Level
-from ..core.spec import FP32
 from ..errors import NonFiniteActionsError, TtscompileError
 from .machine import available_bytes
 
@@ -51,7 +50,7 @@ def _needs(artifact: Artifact) -> list[Finding]:
     told = f"{written}; opset {needs.opset}, onnxruntime {needs.onnxruntime} or later"
     found = [Finding(PART, "identity", manifest.short_identity), Finding(PART, "format", told)]
     precision = manifest.precision_name
-    slow = precision != FP32 and has_integer_dot_product() is False
+    slow = precision != "fp32" and has_integer_dot_product() is False
     remedy = "Its fast kernels saturate on this processor. Take plans in fp32, which it holds too: 'NAME@fp32'."
     found.append(Finding.judged(PART, "precision", precision + ", without VNNI or AMX" * slow, slow, remedy))
     weights = artifact.bytes

@@ -377,8 +377,7 @@ def test_it_runs_the_compiled_policy_on_every_runtime(toy_compiled: Path, runtim
             assert time.monotonic() < limit
             executor.observe({"obs": np.array([0.5, -0.5], np.float32)})
             action = executor.action(timeout=5.0)
-            assert action.shape == (2,)
-            assert np.isfinite(action).all()
+            assert action.shape == (2,) and np.isfinite(action).all()
             time.sleep(0.05)
     names = {event["name"] for event in executor.trace.to_json()["traceEvents"]}
     assert {"tick", "inference", "prologue", "decode"} <= names
