@@ -379,8 +379,7 @@ def test_it_runs_the_compiled_policy_on_every_runtime(toy_compiled: Path, runtim
             action = executor.action(timeout=5.0)
             assert action.shape == (2,) and np.isfinite(action).all()
             time.sleep(0.05)
-    names = {event["name"] for event in executor.trace.to_json()["traceEvents"]}
-    assert {"tick", "inference", "prologue", "decode"} <= names
+    assert {"tick", "inference", "prologue", "decode"} <= {e["name"] for e in executor.trace.to_json()["traceEvents"]}
     policy.reset()  # it is the caller's again
     assert policy.predict_action({"obs": np.zeros((1, 2), np.float32)})["action"].shape == (1, 2, 2)
 
