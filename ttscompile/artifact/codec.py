@@ -111,9 +111,10 @@ def identities(manifest: Manifest) -> tuple[str, str]:
 
     The model identity covers graphs, weights, tables, loops, normalisers, observations, chunk and block table. The
     identity covers that, pruners, all fields of all plans by name, which of them is the default, and by name the
-    weights and models that plans may take: a calibration belongs to the model with or without them. Every file stands
-    in them with its name, by which others name it, and its hash. Neither covers what no action depends on: source,
-    FLOPs, reasons, sparsities, calibration record, versions, what is required, and the golden record.
+    weights and models that plans may take: a calibration belongs to the model with or without them, unless a precision
+    has a file of its own for what fp32 alone reads. Every file stands in them with its name, by which others name it,
+    and its hash. Neither covers what no action depends on: source, FLOPs, reasons, sparsities, calibration record,
+    versions, what is required, and the golden record.
 
     Returns:
         Two sha256 of 64 digits.
