@@ -13,7 +13,7 @@ from ..artifact.manifest import StartRecord, WeightsRecord
 from ..artifact.stores import BlockWeights
 from ..core.plan import DENSE, FULL, Plan
 from ..errors import CalibrationFailedError
-from ..measure.points import ALIKE, Point, best_plan, efficient
+from ..measure.points import ALIKE, SAME, Point, best_plan, efficient
 from ..measure.timer import Times
 from .judge import Score, further, judge, timed
 from .proposer import SAFER, Proposal, Request, near
@@ -21,9 +21,6 @@ from .proposers.loops import too_far
 from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
 from .trials import Trials
-
-SAME = 1e-4
-"""Of a distance: plans that differ by less are told apart by rounding alone."""
 
 
 class Kept:

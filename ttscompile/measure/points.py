@@ -17,7 +17,7 @@ from .timer import Times
 Numbers = npt.NDArray[np.float64]
 
 SAME, TENTH = 1e-4, 0.1
-"""Of what another observation changes: less is rounding; and the unit of distances where noise changes no more."""
+"""Of what another observation changes, or of a distance: less is rounding; and the unit where noise changes no more."""
 
 
 def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
