@@ -4,8 +4,6 @@ Neither lerobot nor transformers is needed. Sizes are those of the base model's 
 lerobot needs, too. Source: ``GrootPolicy.predict_action_chunk`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

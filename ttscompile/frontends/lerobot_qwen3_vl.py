@@ -1,7 +1,5 @@
 """Qwen3-VL inside a LeRobot policy: its folder, which lerobot needs, too, and its weights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ What it learns from videos is learned in training alone: no weight of V-JEPA is 
 lerobot nor transformers is needed. Source: ``VLAJEPAPolicy.predict_action_chunk`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Attribute names are those under which lerobot saves the weights. Sources: Black 
 (arXiv 2504.16054); ``lerobot.policies.pi0`` and ``pi05`` of huggingface/lerobot 0.6.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ An attribute's name is that of transformers' weights, but for what ``rebuilt_wei
 Sources: Bai et al., Qwen3-VL (arXiv 2511.21631); Meng et al., DeepStack (arXiv 2406.04334).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
