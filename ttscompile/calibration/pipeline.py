@@ -21,9 +21,10 @@ from ..verification.record_golden import record_plans
 from .arguments import calls_to_learn_from, require_alone, require_directory, require_limits
 from .budget import DISTANCE, ERROR, LATENCY, goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
+from .choose import choose
 from .clock import Clock
 from .judge import Score, other_noise, other_observations
-from .kept import Kept, choose
+from .kept import Kept
 from .progress import Bar
 from .proposer import LOOPS, Proposer, Request, Row, rows_of
 from .schedule import SCHEDULE, Schedule

@@ -18,9 +18,10 @@ from tests.calibration.killed import killed
 from tests.once import Once
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.choose import choose
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, judge
-from ttscompile.calibration.kept import Kept, choose
+from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import SAFER, Proposal, near
 from ttscompile.calibration.proposers.loops import Cost, Loops
@@ -204,7 +205,7 @@ def test_killed_at_random_moments_and_resumed_it_ends_the_same(
     milliseconds = {loop: Times((one,)) for loop, (one, _) in COSTS.items()}
     monkeypatch.setattr(Clock, "elapsed", lambda self: 0.0)
     monkeypatch.setattr(
-        "ttscompile.calibration.kept.timed", lambda entrants, threads: [milliseconds[p.loop] for _, p in entrants]
+        "ttscompile.calibration.choose.timed", lambda entrants, threads: [milliseconds[p.loop] for _, p in entrants]
     )
     own = shutil.copytree(directory, tmp_path / "own")
     how: dict[str, Any] = {"learn": ("loops",), "max_distance": 0.4, "progress": False}
@@ -252,9 +253,9 @@ def chosen(
         distance, limit, _ms = figures[names[id(plan)]]
         return Score(distance, (0.0, limit), None, None, 0.0, 0.0, 0.0, 1)
 
-    monkeypatch.setattr("ttscompile.calibration.kept.judge", scored)
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", scored)
     monkeypatch.setattr(
-        "ttscompile.calibration.kept.timed",
+        "ttscompile.calibration.choose.timed",
         lambda entrants, threads: [Times((figures[names[id(plan)]][2],) * 3) for _, plan in entrants],
     )
     warned: list[str] = []
