@@ -7,27 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from safetensors.torch import load_file, save_file
 
 import ttscompile
 from tests.once import Once
-from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise
-from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
-from ttscompile.frontends.lerobot_files import lerobot_files
-from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
-from ..rounding import bound
-from ..runtimes.agreement import call_terms, largest_difference
 from . import evo1s, originals
 from .lerobot_tiny import change_json
-from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
+from .whole_vlas import assert_a_task_alone_makes_files_of_lerobot, assert_agreement_on_random_plans, eager_chunk
 
 STATISTICS = "policy_preprocessor_step_4_normalizer_processor.safetensors"
 
@@ -44,15 +37,8 @@ def directory(tmp_path: Path) -> Path:
 
 def eager(directory: Path, kind: str, call: int, options: LoadOptions = AS_SAVED) -> Array:
     """The whole chunk of the rebuilt network, not compiled."""
-    module, spec = load_checkpoint_policy(directory, options=options)
-    given = {key: value[None] for key, value in evo1s.observation(call).items()}
-    if spec.instruction is not None:
-        made = Tokenizer(directory.parent / evo1s.LANGUAGE, CheckpointError)(spec.instruction.line(evo1s.TASKS[call]))
-        own, length = made[spec.instruction.skipped :], spec.observations[TOKENS].shape[0]
-        given[TOKENS] = np.array([own + [0] * (length - len(own))])
-        given[MASK] = np.arange(length)[None] < len(own)
-    obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
-    return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(evo1s.noise(kind))).numpy())
+    told = directory.parent / evo1s.LANGUAGE, evo1s.TASKS[call]
+    return eager_chunk(directory, options, evo1s.observation(call), evo1s.noise(kind), *told)[1]
 
 
 @pytest.mark.parametrize("kind", evo1s.KINDS)
@@ -97,10 +83,7 @@ def test_what_is_compiled_gives_them_too(compiled: Path, golden: Mapping[str, Ar
 
 @pytest.mark.slow
 def test_runtimes_agree_on_random_plans(compiled: Path) -> None:
-    artifact = load_artifact(compiled)
-    runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "reference")]
-    rng = np.random.default_rng(3)
-    assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=2) < bound(call_terms(artifact))
+    assert_agreement_on_random_plans(compiled, "onnxruntime")
 
 
 @pytest.mark.slow
@@ -151,10 +134,7 @@ def test_statistics_of_the_robots_own_width(directory: Path, golden: Mapping[str
 
 
 def test_lerobots_commands_take_it_with_its_task_alone(directory: Path) -> None:
-    """None of lerobot's steps writes what is before the instruction."""
-    assert not lerobot_files(directory, load_checkpoint_policy(directory)[1])
-    beside = lerobot_files(directory, load_checkpoint_policy(directory, options=LoadOptions(task="go"))[1])
-    assert set(json.loads(beside["config.json"])["input_features"]) == {STATE, *CAMERAS}
+    assert_a_task_alone_makes_files_of_lerobot(directory)
 
 
 @pytest.mark.parametrize(

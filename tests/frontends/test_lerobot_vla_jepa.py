@@ -14,22 +14,22 @@ import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise, Switch
-from ttscompile.core.tokenizer import Tokenizer, padded
 from ttscompile.errors import CheckpointError, ObservationError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
-from ttscompile.frontends.lerobot_files import lerobot_files
 from ttscompile.passes.split_frames import SplitFrames
-from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
-from ..rounding import bound
-from ..runtimes.agreement import call_terms, largest_difference
 from . import originals, vla_jepas
 from .lerobot_tiny import change_json
-from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
+from .whole_vlas import (
+    assert_a_task_alone_makes_files_of_lerobot,
+    assert_agreement_on_random_plans,
+    eager_chunk,
+    rename_weight,
+)
 
 EMBEDDING = "model.qwen.model.model.language_model.embed_tokens.weight"
 PATCHES = "model.video_encoder.encoder.embeddings.patch_embeddings.proj.weight"
@@ -48,15 +48,8 @@ def directory(tmp_path: Path) -> Path:
 
 def eager(directory: Path, kind: str, call: int, options: LoadOptions = AS_SAVED) -> Array:
     """The whole chunk of the rebuilt network, not compiled."""
-    module, spec = load_checkpoint_policy(directory, options=options)
-    given = {key: value[None] for key, value in vla_jepas.observation(kind, call).items()}
-    if spec.instruction is not None:
-        length = spec.observations[TOKENS].shape[0]
-        made = Tokenizer(directory.parent / vla_jepas.BACKBONE, CheckpointError)
-        own = made.of_task(vla_jepas.TASKS[call], spec.instruction, length)
-        given[TOKENS], given[MASK] = padded([own], length)
-    obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
-    return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(vla_jepas.noise())).numpy())
+    told = directory.parent / vla_jepas.BACKBONE, vla_jepas.TASKS[call]
+    return eager_chunk(directory, options, vla_jepas.observation(kind, call), vla_jepas.noise(), *told)[1]
 
 
 @pytest.mark.parametrize("kind", vla_jepas.KINDS)
@@ -115,10 +108,7 @@ def batched(given: Mapping[str, Any]) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "torch"])
 def test_runtimes_agree_on_random_plans(compiled: Path, runtime: str) -> None:
-    artifact = load_artifact(compiled)
-    runtimes = [open_runtime(artifact, name) for name in (runtime, "reference")]
-    rng = np.random.default_rng(3)
-    assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=2) < bound(call_terms(artifact))
+    assert_agreement_on_random_plans(compiled, runtime)
 
 
 @pytest.mark.slow
@@ -207,11 +197,7 @@ def test_the_rule_of_the_gripper_may_be_another(
 
 
 def test_either_of_the_tied_embeddings_is_enough(directory: Path, golden: Mapping[str, Array]) -> None:
-    path = directory / "model.safetensors"
-    weights = load_file(path)
-    weights[EMBEDDING] = weights.pop("model.qwen.model.lm_head.weight")
-    path.unlink()
-    save_file(weights, path)
+    rename_weight(directory, "model.qwen.model.lm_head.weight", EMBEDDING)
     assert np.abs(eager(directory, "libero", 0) - golden["libero.0"]).max() < 1e-4
 
 
@@ -235,10 +221,7 @@ def test_an_instruction_is_told_as_lerobot_tells_it(directory: Path) -> None:
 
 
 def test_lerobots_commands_take_it_with_its_task_alone(directory: Path) -> None:
-    """None of lerobot's steps writes what is around the instruction."""
-    assert not lerobot_files(directory, load_checkpoint_policy(directory)[1])
-    beside = lerobot_files(directory, load_checkpoint_policy(directory, options=LoadOptions(task="go"))[1])
-    assert set(json.loads(beside["config.json"])["input_features"]) == {STATE, *CAMERAS}
+    assert_a_task_alone_makes_files_of_lerobot(directory)
 
 
 def test_doctor_knows_statistics_and_tokenizer(directory: Path) -> None:

@@ -12,24 +12,19 @@ from safetensors.torch import load_file, save_file
 
 import ttscompile
 from tests.once import Once
-from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise
-from ttscompile.core.tokenizer import Tokenizer, padded
 from ttscompile.errors import CheckpointError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.frontends.lerobot_files import lerobot_files
 from ttscompile.passes.split_frames import SplitFrames
-from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
-from ..rounding import bound
-from ..runtimes.agreement import call_terms, largest_difference
 from . import originals, xvlas
 from .lerobot_tiny import change_json
-from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
+from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
 
 TOKENIZER = xvlas.SAVED / xvlas.LANGUAGE
 
@@ -46,14 +41,8 @@ def directory(tmp_path: Path) -> Path:
 
 def eager(directory: Path, kind: str, call: int, options: LoadOptions = AS_SAVED) -> Array:
     """The whole chunk of the rebuilt network, not compiled."""
-    module, spec = load_checkpoint_policy(directory, options=options)
-    given = {key: value[None] for key, value in xvlas.observation(call, kind).items()}
-    if spec.instruction is not None:
-        length = spec.observations[TOKENS].shape[0]
-        made = Tokenizer(TOKENIZER, CheckpointError)(spec.instruction.line(xvlas.TASKS[call]), length)
-        given[TOKENS], given[MASK] = padded([made], length)
-    obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
-    return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(xvlas.noise(kind))).numpy())
+    told = TOKENIZER, xvlas.TASKS[call]
+    return eager_chunk(directory, options, xvlas.observation(call, kind), xvlas.noise(kind), *told)[1]
 
 
 @pytest.mark.parametrize(("kind", "compiled_in"), [("ee6d", False), *((kind, True) for kind in xvlas.KINDS)])
@@ -103,12 +92,8 @@ def test_what_is_compiled_gives_them_too(compiled: Path, golden: Mapping[str, Ar
 
 @pytest.mark.slow
 def test_runtimes_agree_on_random_plans(compiled: Path) -> None:
-    artifact = load_artifact(compiled)
-    reference = open_runtime(artifact, "reference")
-    for name in ("onnxruntime", "torch"):
-        rng, other = np.random.default_rng(3), open_runtime(artifact, name)
-        found = largest_difference(artifact, other, reference, rng, streams=2, calls=2)
-        assert found < bound(call_terms(artifact))
+    for runtime in ("onnxruntime", "torch"):
+        assert_agreement_on_random_plans(compiled, runtime)
 
 
 @pytest.mark.slow
