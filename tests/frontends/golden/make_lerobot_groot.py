@@ -155,12 +155,18 @@ def main() -> None:
     print(path, path.stat().st_size, "bytes")
 
 
-def backbone(kind: str) -> None:
-    """The files of a tiny Qwen3-VL; of its tokenizer every byte is a token."""
+def of_bytes() -> Tokenizer:
+    """A tokenizer of which every byte is a token."""
     vocabulary = {letter: i for i, letter in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
     made = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
     made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     made.add_special_tokens(SPECIAL)
+    return made
+
+
+def backbone(kind: str) -> None:
+    """The files of a tiny Qwen3-VL; of its tokenizer every byte is a token."""
+    made = of_bytes()
     tokenizer = PreTrainedTokenizerFast(tokenizer_object=made, pad_token=SPECIAL[0], chat_template=TEMPLATE)
     folder = Path(BACKBONE)
     tokenizer.save_pretrained(folder)

@@ -21,7 +21,6 @@ from lerobot.policies.vla_jepa.configuration_vla_jepa import VLAJEPAConfig
 from lerobot.policies.vla_jepa.modeling_vla_jepa import VLAJEPAPolicy
 from lerobot.policies.vla_jepa.processor_vla_jepa import make_vla_jepa_pre_post_processors
 from safetensors.torch import load_file
-from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import (
     PreTrainedTokenizerFast,
     Qwen2VLImageProcessor,
@@ -36,7 +35,7 @@ from transformers import (
 
 from .. import groots, vla_jepas
 from ..vlas import CAMERAS, STATE
-from .make_lerobot_groot import SPECIAL, TEMPLATE, TEXT, VISION
+from .make_lerobot_groot import SPECIAL, TEMPLATE, TEXT, VISION, of_bytes
 
 VIDEO = "vjepa2-tiny"
 TEMPLATE += "{%- if add_generation_prompt -%}{{- '<|im_start|>assistant\\n' -}}{%- endif -%}"
@@ -124,10 +123,7 @@ def main() -> None:
 
 def backbone(kind: str) -> None:
     """A tiny Qwen3-VL; of its tokenizer every byte is a token."""
-    vocabulary = {letter: i for i, letter in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
-    made = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    made.add_special_tokens(SPECIAL)
+    made = of_bytes()
     tokenizer = PreTrainedTokenizerFast(tokenizer_object=made, pad_token=SPECIAL[0])
     half, size = [0.5] * 3, {"shortest_edge": 512, "longest_edge": 1024}
     settings: dict[str, Any] = {"patch_size": 4, "merge_size": 2, "image_mean": half, "image_std": half, "size": size}
