@@ -39,8 +39,8 @@ class PolicyInfo:
         precision: ``fp32``, or what that plan has some parts in: ``int8``, or on torch ``bf16`` and ``fp16``.
         rollout: what keeping the rollout cache of one stream takes.
         prefix_refusal: why ``predict_action`` takes no ``prefix``; None if it does.
-        longest_prefix: how many actions a ``prefix`` may hold; 0 where there can be none.
-        trained_prefix: whether the policy was trained to go on from a ``prefix``, which is inpainted otherwise.
+        trained_prefix: how many actions a ``prefix`` may hold that the policy was trained to go on from; 0 where it was
+            not, and a ``prefix`` of any length is inpainted.
         frames: how many pieces depend on one frame alone, and are remembered by its content; 0 where there are none, or
             where the runtime computes all of them in every call.
         reuses_tokens: whether of new frames only some tokens are computed, so that a call depends on the frames before.
@@ -71,5 +71,4 @@ class PolicyInfo:
     follows: bool = False
     noise: str = "normal"
     other_noise: float | None = None
-    longest_prefix: int = 0
-    trained_prefix: bool = False
+    trained_prefix: int = 0

@@ -120,11 +120,6 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
     return None
 
 
-def longest_prefix(spec: PolicySpec) -> int:
-    """How many actions a prefix may hold, of a policy that takes one."""
-    return spec.trained_prefix or spec.sample[0] - spec.chunk.start
-
-
 def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
     """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, a copy of the caller's.
 
@@ -141,7 +136,7 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
     if shape[1] > room:
         rest = f"{room}, from its first executed one to the end of the prediction"
         raise ObservationError(f"prefix holds {shape[1]} actions; the chunk has {rest}. Give at most {room}.")
-    if shape[1] > longest_prefix(spec):
+    if shape[1] > (spec.trained_prefix or room):
         told = f"prefix holds {shape[1]} actions; the policy was trained to go on from at most {spec.trained_prefix}"
         raise ObservationError(f"{told}. Give no more, or call earlier, so that fewer are executed meanwhile.")
     if shape[1] and refusal is not None:

@@ -18,7 +18,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 from .arrays import Array, check_observation, check_seed, like, read_observation
 from .frames import FrameWork
 from .info import BlockInfo, PolicyInfo
-from .inpainting import check_prefix, longest_prefix, prefix_refusal
+from .inpainting import check_prefix, prefix_refusal
 from .instruct import Instruct
 from .liveness import rollout_needs
 from .queues import Queues, is_window
@@ -108,8 +108,7 @@ class CompiledPolicy:
             follows=default.otherwise is not None,
             noise=manifest.spec.noise,
             other_noise=(self._artifact.manifest.calibration or {}).get("other_noise") or None,
-            longest_prefix=longest_prefix(spec) if refusal is None else 0,
-            trained_prefix=spec.trained_prefix > 0,
+            trained_prefix=spec.trained_prefix,
         )
 
     @property

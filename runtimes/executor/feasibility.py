@@ -41,8 +41,7 @@ class Feasibility:
         horizon_steps: actions of a chunk that the policy executes: ``play``.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
         reserve_steps: actions after these that may be played.
-        prefix_steps: actions that may be committed while a call computes, of a policy that was trained with prefixes;
-            None: any number.
+        prefix_steps: actions that may be committed while a call computes; 0 for any number.
     """
 
     latency: float
@@ -51,7 +50,7 @@ class Feasibility:
     horizon_steps: int
     margin_ticks: int
     reserve_steps: int = 0
-    prefix_steps: int | None = None
+    prefix_steps: int = 0
 
     @property
     def frame_period(self) -> float:
@@ -76,7 +75,7 @@ class Feasibility:
     @property
     def committed(self) -> float:
         """How long a call may take for no more than ``prefix_steps`` to be committed, the first at its beginning."""
-        return inf if self.prefix_steps is None else self.prefix_steps / self.policy_hz - 1 / self.control_hz
+        return self.prefix_steps / self.policy_hz - 1 / self.control_hz if self.prefix_steps else inf
 
     @property
     def needed(self) -> float:

@@ -167,7 +167,7 @@ class Schedule:
 
     def committed(self, observed: float, until: float) -> FloatArray:
         """Actions given out and scheduled between two times, one a step of the policy, no more than it takes."""
-        most = min(self._settings.horizon, self._settings.longest_prefix or self._settings.horizon)
+        most = min(self._settings.horizon, self._settings.trained_prefix or self._settings.horizon)
         tick, last = self.grid.tick(observed), self.grid.tick(until)
         played, timeline, rows = dict(self._played), self.timeline, list[FloatArray]()
         if timeline is not None and not played:  # it begins with the first action, and so does the next chunk

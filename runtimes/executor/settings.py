@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 INTERPOLATIONS = ("hold", "linear")
 SEAMS = ("replace", "blend", "ensemble", "prefix")
 
-_MAY_BE_ZERO = frozenset({"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve", "first"})
+_MAY_BE_ZERO = frozenset(
+    {"blend_steps", "max_hold", "margin_ticks", "warm_up", "trace_events", "reserve", "first", "trained_prefix"}
+)
 """Of the whole numbers among the settings; the others are at least 1."""
 
 _MOST = 10**9
@@ -185,7 +187,7 @@ class Resolved(ExecutorSettings):
         channels: Da.
         frames: what one frame holds.
         stall: when the policy has stopped moving; None if nobody looks.
-        longest_prefix: of a policy that was trained with prefixes, where the seam is ``prefix``; None: any.
+        trained_prefix: see ``PolicyInfo``; 0 where the seam is not ``prefix``.
         switches: numbers of an action that have two values alone.
     """
 
@@ -200,7 +202,7 @@ class Resolved(ExecutorSettings):
     channels: int
     frames: FrameSpec
     stall: StallRule | None
-    longest_prefix: int | None
+    trained_prefix: int
     switches: tuple[Switch, ...]
 
     def switched(self, row: FloatArray) -> FloatArray:
@@ -218,7 +220,7 @@ class Resolved(ExecutorSettings):
     def feasibility(self, latency: float) -> Feasibility:
         """The arithmetic of calls of so many seconds."""
         own = latency, self.control_hz, self.policy_hz, self.horizon, self.margin_ticks, self.reserve
-        return Feasibility(*own, self.longest_prefix)
+        return Feasibility(*own, self.trained_prefix)
 
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
@@ -258,7 +260,6 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         raise ExecutorError(
             f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
         )
-    trained = settings.seam == "prefix" and getattr(info, "trained_prefix", False)
     found = {
         "policy_hz": policy_hz,
         "horizon": horizon,
@@ -271,7 +272,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         "channels": chunk.action_dim,
         "frames": FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
         "stall": stall,
-        "longest_prefix": info.longest_prefix if trained else None,
+        "trained_prefix": info.trained_prefix if settings.seam == "prefix" else 0,
         "switches": chunk.switches,
     }
     return Resolved(**{**vars(settings), **found})

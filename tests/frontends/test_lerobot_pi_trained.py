@@ -50,7 +50,7 @@ def test_lerobots_actions_without_a_prefix_and_with_all_lengths_of_it(once: Once
     """LeRobot gives the committed actions back as they are, and so do we: of all others it is the network's own."""
     golden = originals.golden("lerobot_pi_trained")
     policy = ttscompile.load(compiled(once, tmp_path), runtime=runtime)
-    assert (policy.info.prefix_refusal, policy.info.longest_prefix) == (None, pis.TRAINED)
+    assert (policy.info.prefix_refusal, policy.info.trained_prefix) == (None, pis.TRAINED)
     committed = policy.info.action.unnormalized(pis.left_over())
     assert np.abs(chunk(policy, None) - golden["without"]).max() < 1e-4
     for delay in range(pis.TRAINED + 1):
@@ -69,7 +69,7 @@ def test_without_a_prefix_it_is_the_policy_that_knows_of_none(once: Once, tmp_pa
     """And with one it is not what inpainting would make of it."""
     plain, _ = once.compiled("whole pi05", lambda to: ttscompile.convert(pis.save("pi05", tmp_path / "plain"), to))
     policies = [ttscompile.load(path) for path in (compiled(once, tmp_path), plain)]
-    assert [policy.info.trained_prefix for policy in policies] == [True, False]
+    assert [policy.info.trained_prefix for policy in policies] == [pis.TRAINED, 0]
     committed = policies[0].info.action.unnormalized(pis.left_over()[:, :2])
     without, inpainted = (np.subtract(*(chunk(each, prefix) for each in policies)) for prefix in (None, committed))
     assert np.abs(without).max() < 1e-6

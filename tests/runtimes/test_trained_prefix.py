@@ -132,7 +132,7 @@ def test_a_policy_says_how_long_a_prefix_it_takes_and_refuses_a_longer_one(once:
     artifact = artifact_of(once, "ddpm")
     policy = ttscompile.load(artifact.path, seed=0)
     info = policy.info
-    assert (info.prefix_refusal, info.longest_prefix, info.trained_prefix) == (None, LONGEST, True)
+    assert (info.prefix_refusal, info.trained_prefix) == (None, LONGEST)
     assert set(info.observation) == {"obs"}
     obs, prefix = {"obs": np.zeros((1, 4), np.float32)}, np.zeros((1, LONGEST + 1, ACTIONS), np.float32)
     with pytest.raises(

@@ -153,8 +153,8 @@ class TtscompilePolicy(PreTrainedPolicy):
         """
         if self._shadow is not None:
             return self._shadow.predict_action_chunk(batch)
-        prefix, most = _committed(inference_delay, prev_chunk_left_over), self._policy.info.longest_prefix
-        if prefix is not None and self._policy.info.trained_prefix and prefix.shape[1] > most:
+        prefix, most = _committed(inference_delay, prev_chunk_left_over), self._policy.info.trained_prefix
+        if prefix is not None and 0 < most < prefix.shape[1]:
             told = "%d actions are executed meanwhile; the policy was trained to go on from %d, and is told of no more"
             logger.warning(told, prefix.shape[1], most)
             prefix = prefix[:, :most]

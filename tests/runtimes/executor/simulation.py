@@ -117,6 +117,7 @@ class Facts:
     sample: tuple[int, int]
     plans: tuple[str, ...]
     default_plan: str
+    trained_prefix: int = 0
 
 
 @dataclass

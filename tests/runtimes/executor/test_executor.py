@@ -216,7 +216,7 @@ def test_the_prefix_seam_gives_the_policy_what_is_committed(trained: int) -> Non
     policy = Inpainting(clock, {"dense": 0.2})
     settings = ExecutorSettings(seam="prefix")
     if trained:
-        vars(policy.info).update(trained_prefix=True, longest_prefix=trained)
+        vars(policy.info).update(trained_prefix=trained)
         with pytest.raises(InfeasibleError, match=r"latency 200 ms > 100 ms, of a prefix of 2 actions at 10 Hz"):
             World(settings=settings, policy=policy)
         policy.prefixes.clear()

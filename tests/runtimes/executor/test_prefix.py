@@ -94,7 +94,7 @@ def test_a_policy_that_was_trained_with_prefixes_goes_on_from_what_is_committed(
     path, _ = once.compiled("committed rk4", lambda to: committed.compiled("rk4", to))
     info = ttscompile.load(path).info
     resolved = [resolve(ExecutorSettings(seam=seam), info, HZ) for seam in ("prefix", "blend")]
-    assert [each.longest_prefix for each in resolved] == [committed.LONGEST, None]
+    assert [each.trained_prefix for each in resolved] == [committed.LONGEST, 0]
     assert [each.feasibility(0.2).committed for each in resolved] == [pytest.approx(0.2), np.inf]
     _, calls = drive(path, ticks=20, latency=0.1, numbers=4)
     assert max(len(prefix) for prefix, _ in calls) == 2  # now, and the tick that the call may take
