@@ -199,8 +199,8 @@ def needs_care(precision: str) -> bool:
     what = "nothing that says what this one has" if found is None else "one without them"
     warnings.warn(
         f"precision {precision!r} is fast on a processor with integer dot products (on x86 avx512_vnni, avx_vnni or"
-        f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and take about as long as"
-        " in fp32. Take a plan without it (plan.exact), or convert the checkpoint with --precision fp32.",
+        f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and gain less time: compare"
+        " with a plan in fp32 (ttscompile bench), and take that where it is faster (NAME@fp32).",
         RuntimeWarning,
         stacklevel=2,
     )

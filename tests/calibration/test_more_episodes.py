@@ -53,12 +53,19 @@ def task(make_task: MakeTask) -> Task:
 
 
 def test_what_all_bring_over_half_is_told(task: Task, told: Told) -> None:
-    assert told(task, 2.0, 1.5) == "more episodes may pay: all 5 bring it 25% nearer than half of them do"
+    assert (
+        told(task, 2.0, 1.5) == "more episodes may pay: learned from 5 it is 25% nearer than learned from half of them"
+    )
 
 
 @pytest.mark.parametrize(("every", "gain"), [(1.96, "2%"), (2.0, "0%"), (2.5, "0%")])
 def test_where_half_are_as_good_more_would_bring_nothing(task: Task, told: Told, every: float, gain: str) -> None:
-    assert told(task, 2.0, every) == f"more episodes would hardly bring it nearer: all 5 bring {gain} over half"
+    expected = f"more episodes would hardly pay: learned from 5 it is {gain} nearer than learned from half of them"
+    assert told(task, 2.0, every) == expected
+
+
+def test_where_nothing_is_left_nothing_is_to_gain(task: Task, told: Told) -> None:
+    assert told(task, 0.0, 0.0).startswith("more episodes would hardly pay: learned from 5 it is")
 
 
 def test_few_episodes_and_windows_say_nothing(make_task: MakeTask, told: Told) -> None:

@@ -166,10 +166,9 @@ class WholeSteps:
         parts = (self._executor.select(self._calls, some[:count]) for some in (half, every))
         loops = (SparseLoop(self._executor, part, self._compared, reads=reads, whole=True) for part in parts)
         before, now = (self._errors(one.end(self.plan(steps)).samples).normalised for one in loops)
-        gain = 1 - now / before
-        if not gain >= WORTH:
-            return f"more episodes would hardly bring it nearer: all {len(episodes)} bring {max(gain, 0):.0%} over half"
-        return f"more episodes may pay: all {len(episodes)} bring it {gain:.0%} nearer than half of them do"
+        gain = max(before - now, 0.0) / max(before, 1e-30)  # 0 where nothing is left
+        told = f"learned from {len(episodes)} it is {gain:.0%} nearer than learned from half of them"
+        return f"more episodes {'may' if gain >= WORTH else 'would hardly'} pay: {told}"
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
