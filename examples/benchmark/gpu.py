@@ -51,7 +51,8 @@ def unet(_: Path) -> Network:
 
 def smolvla(folder: Path) -> Network:
     """LeRobot's SmolVLA, whole, with its default configuration and two cameras."""
-    large_smolvla.save(folder / "smolvla")
+    if not (folder / "smolvla").exists():
+        large_smolvla.save(folder / "smolvla")
     return Network("SmolVLA", 0, *load_checkpoint_policy(folder / "smolvla"))
 
 
@@ -77,7 +78,9 @@ class Row:
     times_ms: tuple[float, ...]
 
 
-def time_network(name: str, folder: Path, device: str, calls: int, say_that: Callable[[str], None]) -> list[Row]:
+def time_network(
+    name: str, folder: Path, device: str, calls: int, torch_compiled: bool, say_that: Callable[[str], None]
+) -> list[Row]:
     """Compile a network, unless that was done, and time all contestants on it.
 
     Args:
@@ -85,6 +88,7 @@ def time_network(name: str, folder: Path, device: str, calls: int, say_that: Cal
         folder: where its artifact is, or is written.
         device: as torch calls it.
         calls: that are counted, of each contestant.
+        torch_compiled: whether torch.compile is one of them.
         say_that: is told what begins.
     """
     make, share = NETWORKS[name]
@@ -114,11 +118,12 @@ def time_network(name: str, folder: Path, device: str, calls: int, say_that: Cal
         entered.append(plan_contestant(f"{share:.0%} reused, fp32, one core", one, sparse, spec))
     off = {one.label: _off(one, calls_compared, expected[one.plan.partition("@")[0]]) for one in entered}
     counted = {one.label: kernels(one, device) for one in entered}
-    say_that("torch.compile")
-    try:
-        entered.insert(1, torch_compile_contestant(network, flops, 1, "reduce-overhead"))
-    except RuntimeUnavailableError as error:
-        say_that(f"left out: {error}")
+    if torch_compiled:
+        say_that("torch.compile")
+        try:
+            entered.insert(1, torch_compile_contestant(network, flops, 1, "reduce-overhead"))
+        except RuntimeUnavailableError as error:
+            say_that(f"left out: {error}")
     say_that("timing")
     measured = measure(entered, calls, seed=0)
     return [
@@ -182,13 +187,14 @@ def results_table(rows: Sequence[Row]) -> None:
 @click.argument("name", type=click.Choice(list(NETWORKS)))
 @click.option("--device", default="cuda", show_default=True, help="As torch calls it.")
 @click.option("--calls", type=click.IntRange(1), default=20, show_default=True, help="That are counted, of each.")
+@click.option("--torch-compile/--no-torch-compile", default=True, show_default=True, help="It compiles for minutes.")
 @click.option("--output", type=click.Path(path_type=Path), help="A folder to keep the artifact in, for another run.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document instead of the table.")
-def main(name: str, device: str, calls: int, output: Path | None, as_json: bool) -> None:
+def main(name: str, device: str, calls: int, torch_compile: bool, output: Path | None, as_json: bool) -> None:
     """Time calls of the policy NAME on a GPU."""
     torch.set_num_threads(1)
     with TemporaryDirectory() as temporary, only_results_on_stdout():
-        rows = time_network(name, output or Path(temporary), device, calls, progress().print)
+        rows = time_network(name, output or Path(temporary), device, calls, torch_compile, progress().print)
     machine = fingerprint() | {"device": torch.cuda.get_device_name(device) if device != "cpu" else device}
     if as_json:
         print_json({"machine": machine, "calls": calls, "rows": [asdict(row) for row in rows]})

@@ -247,7 +247,8 @@ def cuda_graphs(device: torch.device) -> Capture:
         if not alive:
             own[:] = torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=own[0], stream=own[1]):
+        # By default whatever another thread waits for or allocates on the GPU meanwhile ends the capture.
+        with torch.cuda.graph(graph, pool=own[0], stream=own[1], capture_error_mode="thread_local"):
             line()
         alive.add(graph)
         replay: Line = graph.replay
