@@ -1,4 +1,4 @@
-"""For the site's reference: the package as it is installed, with passes/, runtimes/ and plugins/rivals/ inside it.
+"""For the site's reference: the package as it is installed, with passes/, runtimes/ and parts of plugins/ inside it.
 
 mkdocstrings reads source files where they lie; in this tree two parts of the package lie beside it. See pyproject.toml.
 """
@@ -17,5 +17,5 @@ def on_startup(command: str, dirty: bool) -> None:
     shutil.rmtree(TARGET, ignore_errors=True)
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "ttscompile", TARGET, ignore=ignored)
-    for part in ("passes", "runtimes", "plugins/rivals"):
+    for part in ("passes", "runtimes", "plugins/heads", "plugins/rivals"):
         shutil.copytree(ROOT / part, TARGET / Path(part).name, ignore=ignored)

@@ -11,6 +11,7 @@ PACKAGES = {
     "ttscompile": "ttscompile",
     "passes": "ttscompile.passes",
     "runtimes": "ttscompile.runtimes",
+    "plugins/heads": "ttscompile.heads",
     "plugins/rivals": "ttscompile.rivals",
 }
 """Folder of the tree -> package that it is installed as."""

@@ -21,7 +21,7 @@ FLOORS = (
     ("core", "measure"),
     ("hub", "ir", "plots", "samplers", "trajectories"),
     ("artifact", "frontends", "lower", "passes"),
-    ("capture", "pool", "runtimes"),
+    ("capture", "heads", "pool", "runtimes"),
     ("doctor", "verification"),
     ("calibration", "driver", "report"),
     ("builder", "rivals"),
