@@ -4,7 +4,8 @@ Network, policy, normaliser, optimiser, learning rate, moving average and the fo
 own (a checkout of github.com/real-stanford/diffusion_policy, which is not part of this project), and so is the
 configuration, except for what a recipe changes. The loop is written anew, since the original's needs an account at
 wandb and its own simulators. A CPU multiplies matrices in half the time in bfloat16: a copy of the network in bfloat16
-gives the gradients, and the weights are float32.
+gives the gradients, and the weights are float32. On a GPU a step is one CUDA graph: launching its
+thousand small kernels takes longer than they do.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import sys
 import time
 import typing
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,35 @@ import torch
 
 TOLD_EVERY = 100
 """Steps between lines of progress."""
+WARMED_UP = 3
+"""Steps before a graph is captured, which make what is made once."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a step of a training changes, and the examples that it draws from.
+
+    Attributes:
+        workspace: The original's, with ``model``, ``ema_model`` and ``optimizer``.
+        average: The original's, of ``ema_model``.
+        obs: ``[F, Do]``, the frames' observations.
+        action: ``[F, Da]``, their actions.
+        frames: ``[N, T]``, the frames of each example.
+        batch: Examples of a step.
+        seed: Of those that are drawn.
+    """
+
+    workspace: Any
+    average: Any
+    obs: torch.Tensor
+    action: torch.Tensor
+    frames: torch.Tensor
+    batch: int
+    seed: list[int]
+
+
+MakeStep = Callable[[Training], Callable[[], torch.Tensor]]
+"""Makes what takes one step, and gives its loss. The original's scheduler changes the learning rate between steps."""
 
 
 def find_original(original: Path) -> None:
@@ -95,26 +126,101 @@ def configuration(original: Path, name: str, changes: dict[str, Any], seed: int,
     return merged
 
 
-def in_bfloat16(policy: Any, time_embedding: Callable[[Any], Any]) -> Any:
-    """A copy of the policy whose network computes in bfloat16, and takes and gives float32.
+def in_bfloat16(time_embedding: Callable[[Any], Any]) -> MakeStep:
+    """Steps on a CPU, whose gradients are of a copy of the network in bfloat16.
 
     Args:
-        policy: The original's policy.
         time_embedding: Gives the network's module that turns timesteps into float32 numbers.
     """
-    faster = copy.deepcopy(policy)
-    network = faster.model.to(torch.bfloat16)
 
-    def halve(given: Any) -> Any:
-        return given.bfloat16() if torch.is_tensor(given) and given.is_floating_point() else given
+    def make(training: Training) -> Callable[[], torch.Tensor]:
+        policy = training.workspace.model
+        faster = copy.deepcopy(policy)
+        network = faster.model.to(torch.bfloat16)
+        time_embedding(network).register_forward_hook(lambda module, given, result: result.bfloat16())
+        network.register_forward_pre_hook(
+            lambda module, given, named: (tuple(map(_half, given)), {name: _half(one) for name, one in named.items()}),
+            with_kwargs=True,
+        )
+        network.register_forward_hook(lambda module, given, result: result.float())
+        pairs = list(zip(policy.model.parameters(), network.parameters(), strict=True))
+        rng = np.random.default_rng(training.seed)
 
-    time_embedding(network).register_forward_hook(lambda module, given, result: result.bfloat16())
-    network.register_forward_pre_hook(
-        lambda module, given, named: (tuple(map(halve, given)), {name: halve(value) for name, value in named.items()}),
-        with_kwargs=True,
-    )
-    network.register_forward_hook(lambda module, given, result: result.float())
-    return faster
+        def step() -> torch.Tensor:
+            chosen = training.frames[rng.integers(len(training.frames), size=training.batch)]
+            loss: torch.Tensor = faster.compute_loss({"obs": training.obs[chosen], "action": training.action[chosen]})
+            loss.backward()  # type: ignore[no-untyped-call]  # of torch
+            for weight, fast in pairs:
+                weight.grad, fast.grad = (None if fast.grad is None else fast.grad.float()), None
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            training.workspace.optimizer.step()
+            training.average.step(policy)
+            with torch.no_grad():
+                for weight, fast in pairs:
+                    fast.copy_(weight)
+            return loss.detach()
+
+        return step
+
+    return make
+
+
+def _half(given: Any) -> Any:
+    return given.bfloat16() if torch.is_tensor(given) and given.is_floating_point() else given
+
+
+def captured(loss_of: Callable[[Any, torch.Tensor, torch.Tensor], torch.Tensor]) -> MakeStep:
+    """Steps on a GPU, each a CUDA graph with its examples, noise, gradients and optimiser; products are in TF32.
+
+    Args:
+        loss_of: The loss of a policy on observations ``[N, T, Do]`` and actions ``[N, T, Da]``, as its
+            ``compute_loss``, which selects by a mask: that cannot be captured.
+    """
+
+    def make(training: Training) -> Callable[[], torch.Tensor]:
+        torch.backends.cuda.matmul.allow_tf32 = True
+        # By default torch's decoder looks into its mask to see whether it is causal, and waits for the GPU.
+        torch.nn.modules.transformer._detect_is_causal_mask = lambda mask, causal, size: bool(causal)  # type: ignore[attr-defined]
+        policy, optimizer = training.workspace.model, training.workspace.optimizer
+        policy.noise_scheduler.alphas_cumprod = policy.noise_scheduler.alphas_cumprod.to(training.obs.device)
+        trained = [weight for weight in policy.parameters() if weight.requires_grad]
+        averaged = [
+            mean
+            for mean, weight in zip(training.workspace.ema_model.parameters(), policy.parameters(), strict=True)
+            if weight.requires_grad
+        ]
+
+        def eager() -> torch.Tensor:
+            optimizer.zero_grad(set_to_none=True)
+            rows = torch.randint(len(training.frames), (training.batch,), device=training.frames.device)
+            chosen = training.frames[rows]
+            loss = loss_of(policy, training.obs[chosen], training.action[chosen])
+            loss.backward()  # type: ignore[no-untyped-call]  # of torch
+            torch.nn.utils.clip_grad_norm_(trained, 1.0, foreach=True)
+            optimizer.step()
+            return loss.detach()
+
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(WARMED_UP):
+                eager()
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            loss = eager()
+
+        @torch.no_grad()
+        def step() -> torch.Tensor:
+            graph.replay()
+            kept = training.average.get_decay(training.average.optimization_step)
+            torch._foreach_lerp_(averaged, trained, 1 - kept)
+            training.average.optimization_step += 1
+            return loss
+
+        return step
+
+    return make
 
 
 def save(workspace: Any, folder: Path, name: str) -> None:
@@ -129,7 +235,7 @@ def save(workspace: Any, folder: Path, name: str) -> None:
     torch.save(payload, folder / f"{name}_ema_fp16_{workspace.global_step}.ckpt", pickle_module=dill)
 
 
-def train(  # noqa: PLR0915  # the recipe, line by line
+def train(
     config: Any,
     obs: torch.Tensor,
     action: torch.Tensor,
@@ -138,13 +244,13 @@ def train(  # noqa: PLR0915  # the recipe, line by line
     *,
     output: Path,
     optimizer: Callable[[Any], torch.optim.Optimizer],
-    time_embedding: Callable[[Any], Any],
+    make_step: MakeStep,
     steps: int,
     save_every: int,
     seed: int,
     resume: bool,
 ) -> None:
-    """Train on one thread, and write checkpoints into a folder.
+    """Train on one thread or on a GPU, and write checkpoints into a folder.
 
     Args:
         config: The original's configuration, of ``configuration``.
@@ -154,7 +260,7 @@ def train(  # noqa: PLR0915  # the recipe, line by line
         name: What the small checkpoints' names begin with.
         output: The folder.
         optimizer: Makes the optimiser of a policy.
-        time_embedding: Gives the network's module that turns timesteps into numbers.
+        make_step: Makes a step.
         steps: Steps in all, those before ``resume`` included.
         save_every: Steps between checkpoints.
         seed: Of weights, examples and noise.
@@ -167,14 +273,18 @@ def train(  # noqa: PLR0915  # the recipe, line by line
 
     torch.set_num_threads(1)
     torch.manual_seed(seed)
+    device = config.training.device
     workspace = BaseWorkspace(config, output_dir=str(output))
     workspace.include_keys = ("global_step", "epoch")
     workspace.model = hydra.utils.instantiate(config.policy)
     normalizer = LinearNormalizer()
     normalizer.fit({"obs": obs, "action": action}, mode="limits")
     workspace.model.set_normalizer(normalizer)
+    workspace.model.to(device)
     workspace.ema_model = copy.deepcopy(workspace.model)
     workspace.optimizer = optimizer(workspace.model)
+    for group in workspace.optimizer.param_groups if device != "cpu" else ():  # a graph reads its rate from a tensor
+        group.update(capturable=True, lr=torch.tensor(group["lr"], device=device))
     workspace.global_step = workspace.epoch = 0
     if resume:
         workspace.load_checkpoint(weights_only=False)
@@ -187,31 +297,21 @@ def train(  # noqa: PLR0915  # the recipe, line by line
         num_training_steps=steps,
         last_epoch=workspace.global_step - 1,
     )
-    faster = in_bfloat16(workspace.model, time_embedding)
-    pairs = list(zip(workspace.model.model.parameters(), faster.model.parameters(), strict=True))
-    print(f"{len(frames)} windows, {sum(weight.numel() for weight, _ in pairs)} weights", flush=True)
+    examples = (obs.to(device), action.to(device), torch.from_numpy(frames).to(device))
+    now = [seed, workspace.global_step]
+    torch.manual_seed(sum(now))
+    step = make_step(Training(workspace, average, *examples, config.dataloader.batch_size, now))
+    weights = sum(weight.numel() for weight in workspace.model.model.parameters())
+    print(f"{len(frames)} windows, {weights} weights", flush=True)
 
     (output / "checkpoints").mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng([seed, workspace.global_step])
-    torch.manual_seed(seed + workspace.global_step)
-    began, losses = time.monotonic(), []
+    began, losses = time.monotonic(), torch.zeros(TOLD_EVERY, device=device)
     while workspace.global_step < steps:
-        chosen = torch.from_numpy(rng.choice(frames, config.dataloader.batch_size))
-        loss = faster.compute_loss({"obs": obs[chosen], "action": action[chosen]})
-        loss.backward()
-        for weight, fast in pairs:
-            weight.grad, fast.grad = (None if fast.grad is None else fast.grad.float()), None
-        torch.nn.utils.clip_grad_norm_(workspace.model.parameters(), 1.0)
-        workspace.optimizer.step()
+        losses[workspace.global_step % TOLD_EVERY] = step()
         rate.step()
-        average.step(workspace.model)
-        with torch.no_grad():
-            for weight, fast in pairs:
-                fast.copy_(weight)
         workspace.global_step += 1
-        losses.append(loss.item())
         if workspace.global_step % TOLD_EVERY == 0:
             taken = time.monotonic() - began
-            print(f"step {workspace.global_step}: loss {np.mean(losses[-TOLD_EVERY:]):.4f}, {taken:.0f} s", flush=True)
+            print(f"step {workspace.global_step}: loss {losses.mean():.4f}, {taken:.0f} s", flush=True)
         if workspace.global_step % save_every == 0 or workspace.global_step == steps:
             save(workspace, output, name)

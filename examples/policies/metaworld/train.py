@@ -19,7 +19,7 @@ import torch
 
 sys.path[1:1] = [str(Path(__file__).parents[1])]
 
-from diffusion_policy_training import configuration, cut, find_original, recipe_options, train  # noqa: E402
+from diffusion_policy_training import configuration, cut, find_original, in_bfloat16, recipe_options, train  # noqa: E402
 
 HORIZON, WINDOW, EXECUTED = 8, 2, 4
 """T, To and Ta."""
@@ -70,7 +70,7 @@ def main(original: Path, demonstrations: Path, steps: int, seed: int, **run: Any
         frames,
         "metaworld_dpt",
         optimizer=lambda policy: policy.get_optimizer(**config.optimizer),
-        time_embedding=lambda network: network.time_emb,
+        make_step=in_bfloat16(lambda network: network.time_emb),
         steps=steps,
         seed=seed,
         **run,

@@ -20,7 +20,7 @@ import torch
 
 sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "evaluation")]
 
-from diffusion_policy_training import configuration, cut, find_original, recipe_options, train  # noqa: E402
+from diffusion_policy_training import configuration, cut, find_original, in_bfloat16, recipe_options, train  # noqa: E402
 from environments.pusht import observation  # noqa: E402
 
 HORIZON, WINDOW, EXECUTED = 16, 2, 8
@@ -65,7 +65,7 @@ def main(original: Path, demonstrations: Path, steps: int, seed: int, **run: Any
         frames,
         "pusht_unet",
         optimizer=lambda policy: hydra.utils.instantiate(config.optimizer, params=policy.model.parameters()),
-        time_embedding=lambda network: network.diffusion_step_encoder[0],
+        make_step=in_bfloat16(lambda network: network.diffusion_step_encoder[0]),
         steps=steps,
         seed=seed,
         **run,
