@@ -19,8 +19,8 @@ from tests.imports import home, imports, modules  # noqa: E402
 FLOORS = (
     ("errors",),
     ("core", "measure"),
-    ("hub", "ir", "plots", "samplers", "trajectories"),
-    ("artifact", "frontends", "lower", "passes"),
+    ("hub", "ir", "plots", "samplers"),
+    ("artifact", "frontends", "lower", "passes", "trajectories"),
     ("capture", "heads", "pool", "runtimes"),
     ("doctor", "verification"),
     ("calibration", "driver", "report"),

@@ -14,6 +14,7 @@ from .calibration.state import FILE as STATE
 from .core.spec import INT8
 from .driver import Explain, convert
 from .errors import CalibrationError, CalibrationFailedError
+from .frontends.data_set import recordings_of
 from .runtimes.executor import ExecutorSettings
 from .runtimes.executor.settings import resolve
 from .runtimes.load import open_policy
@@ -31,7 +32,7 @@ most of an hour."""
 def build(
     checkpoint: str | os.PathLike[str],
     directory: str | os.PathLike[str],
-    trajectories: Sequence[str | os.PathLike[str]],
+    trajectories: Sequence[str | os.PathLike[str]] = (),
     *,
     control_hz: float | None = None,
     policy_hz: float | None = None,
@@ -56,7 +57,8 @@ def build(
     Args:
         checkpoint: see ``convert``.
         directory: where the artifact goes; see ``convert``.
-        trajectories: recorded episodes; see ``calibrate``.
+        trajectories: recorded episodes; see ``calibrate``. None: those that the policy was trained on, by their name
+            on the hub (``frontends.data_set``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
             plan is then the nearest of those whose longest call keeps up.
         policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
@@ -83,6 +85,9 @@ def build(
     """
     if latency_ms is not None and control_hz is not None:
         raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
+    if not trajectories:
+        trajectories = (recordings_of(checkpoint),)
+        explain("recordings_of", (f"{trajectories[0]}, which the policy was trained on",))
     how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, **of_checkpoint}
     _converted(checkpoint, Path(directory), resume, explain, how)
     if control_hz is not None:

@@ -13,6 +13,8 @@ from urllib.parse import unquote, urlsplit
 
 LARGE = (".safetensors", ".onnx", ".ckpt")
 """Ends of the names of files that are uploaded by git-lfs' interface; the others are in the commit itself."""
+_NAME = r"(?:models/)?((?:datasets/)?[^/]+/[^/]+)"
+"""Of a repository, after ``/api/``: of a data set it begins with ``datasets/``, as on the command line."""
 
 
 class Hub:
@@ -50,7 +52,8 @@ class Hub:
 
     def downloaded(self) -> set[str]:
         """Paths of the files that were asked for."""
-        return {unquote(m[1]) for each in self.asked if (m := re.match(r"[^/]+ /[^/]+/[^/]+/resolve/[^/]+/(.+)", each))}
+        file = re.compile(r"[^/]+ /(?:datasets/)?[^/]+/[^/]+/resolve/[^/]+/(.+)")
+        return {unquote(m[1]) for each in self.asked if (m := file.match(each))}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -82,18 +85,18 @@ class _Handler(BaseHTTPRequestHandler):
         path = urlsplit(self.path).path
         self.hub.asked.append(f"{self.command} {path}")
         try:
-            if m := re.fullmatch(r"/api/models/([^/]+/[^/]+)(?:/revision/([^/]+))?", path):
+            if m := re.fullmatch(rf"/api/{_NAME}(?:/revision/([^/]+))?", path):
                 commit, files = self.hub.find(m[1], unquote(m[2] or "main"))
                 siblings = [{"rfilename": name} for name in files]
                 private = m[1] in self.hub.private
                 self._answer({"id": m[1], "sha": commit, "siblings": siblings, "tags": [], "private": private})
-            elif m := re.fullmatch(r"/api/models/([^/]+/[^/]+)/tree/([^/]+)/?", path):
+            elif m := re.fullmatch(rf"/api/{_NAME}/tree/([^/]+)/?", path):
                 commit, files = self.hub.find(m[1], unquote(m[2]))
                 if self.hub.without_lists:
                     self._answer(b"", 404)
                     return
                 self._answer([_entry(name, content) for name, content in files.items()])
-            elif m := re.fullmatch(r"/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path):
+            elif m := re.fullmatch(r"/((?:datasets/)?[^/]+/[^/]+)/resolve/([^/]+)/(.+)", path):
                 commit, files = self.hub.find(m[1], unquote(m[2]))
                 content = files.get(unquote(m[3]))
                 if content is None:

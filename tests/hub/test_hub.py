@@ -225,7 +225,7 @@ def test_the_card_tells_what_was_left_out(tmp_path: Path) -> None:
 def test_of_a_directory_of_lerobot_its_own_files_are_taken(hub: Hub) -> None:
     root = Path(__file__).parents[2] / "examples" / "policies" / "flow" / "policy"
     files = {each.relative_to(root).as_posix(): each.read_bytes() for each in root.rglob("*") if each.is_file()}
-    hub.commit("org/lerobot", {**files, **HOSTILE, "train_config.json": b"{}", "a/b/config.json": b"{}"})
+    hub.commit("org/lerobot", {**files, **HOSTILE, "optimizer.json": b"{}", "a/b/config.json": b"{}"})
     fetched = fetch_checkpoint("hf://org/lerobot")
     assert hub.downloaded() == set(files) and fetched.licence is None
     hub.commit("org/inner", {f"pretrained_model/{name}": content for name, content in files.items()})

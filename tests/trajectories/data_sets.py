@@ -117,8 +117,8 @@ def as_lerobot_with_videos(path: Path, version: int = 3, codec: str = "libx264")
     write_video(root / "videos" / "top" / "chunk-000" / "file-000.mp4", 0, ENDS[-1], codec)
     places = {"chunk_index": [0, 0], "file_index": [0, 0], "from_timestamp": [begin / FPS for begin, _ in parts]}
     table = {"episode_index": [0, 1]} | {f"videos/top/{of}": values for of, values in places.items()}
-    (root / "meta" / "episodes").mkdir()
-    parquet.write_table(pa.table(table), root / "meta" / "episodes" / "file-000.parquet")
+    (root / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
+    parquet.write_table(pa.table(table), root / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
     return root
 
 

@@ -82,7 +82,7 @@ def test_an_encoder_leaves_the_priority_of_the_tests_alone(tmp_path: Path) -> No
 
 
 def _episodes(root: Path, **columns: list[Any]) -> None:
-    file = root / "meta" / "episodes" / "file-000.parquet"
+    file = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     table = parquet.read_table(file)
     parquet.write_table(pa.table({name: columns.get(name, table[name]) for name in table.column_names}), file)
 

@@ -47,7 +47,7 @@ class Joining:
 
 def compare(
     path: Path,
-    trajectories: Sequence[Path],
+    trajectories: Sequence[Path | str],
     others: Sequence[Path] = (),
     *,
     observation: Mapping[str, Sequence[str]] | None = None,

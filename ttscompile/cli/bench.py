@@ -16,7 +16,14 @@ from ttscompile.calibration.proposer import near
 from ttscompile.cli import options
 from ttscompile.cli.contestants import Way, compare, contestants, draw_comparison, originals, print_comparison
 from ttscompile.cli.output import print_identity, print_json, progress, results, say, table, warn_if_busy
-from ttscompile.cli.sections import Section, SectionedCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.sections import (
+    Recordings,
+    Section,
+    SectionedCommand,
+    Sources,
+    require_recordings,
+    trajectories_options,
+)
 from ttscompile.cli.summary import print_facts
 from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
 from ttscompile.core.plan import DENSE, UNIFORM
@@ -122,7 +129,7 @@ def bench(
     checkpoint: Path | None,
     encoders: Path | None,
     control_hz: float | None,
-    trajectories: tuple[Path, ...],
+    trajectories: Recordings,
     sources: Sources,
     chooses: bool,
     picture: Path | None,

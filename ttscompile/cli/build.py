@@ -10,18 +10,29 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, warn_if_busy
-from ttscompile.cli.sections import LEROBOT, SectionedCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.sections import (
+    LEROBOT,
+    Recordings,
+    SectionedCommand,
+    Sources,
+    require_recordings,
+    trajectories_options,
+)
 from ttscompile.cli.summary import print_frontier
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.errors import CheckpointError
+from ttscompile.frontends.data_set import recordings_of
 from ttscompile.frontends.families import FAMILIES
 from ttscompile.report.summary import document
 
 
 @click.command(cls=SectionedCommand, sections=(LEROBOT,))
 @click.argument("checkpoint", type=PATH_OR_HUB)
-@trajectories_options()
+@trajectories_options(
+    required=False,
+    what="Learn from these recorded episodes; without any, from the data set that a policy of LeRobot was trained on.",
+)
 @click.option("-o", "--output", "directory", required=True, type=PATH, help="Write the artifact into this folder.")
 @number_option(
     "--control-hz",
@@ -50,7 +61,7 @@ from ttscompile.report.summary import document
 def build(
     checkpoint: Path | str,
     directory: Path,
-    trajectories: tuple[Path, ...],
+    trajectories: Recordings,
     sources: Sources,
     error: float | None,
     minutes: float,
@@ -71,6 +82,9 @@ def build(
     require_recordings(trajectories)
     console = progress()
     warn_if_busy(console)
+    if not trajectories:
+        trajectories = (recordings_of(checkpoint),)
+        console.print(f"no --trajectories: the first episodes of {trajectories[0]}, which the policy was trained on")
     with only_results_on_stdout(), console.status("compiling") as status:
 
         def explain(stage: str, notes: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ from ttscompile.calibration.strategies import DEFAULT, NAMES, STRATEGIES
 from ttscompile.cli import options
 from ttscompile.cli.ending import Status
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
-from ttscompile.cli.sections import SectionedCommand, Sources, require_recordings, trajectories_options
+from ttscompile.cli.sections import Recordings, SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, NumberOption
 
@@ -83,7 +83,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
 @options.json_option
 def calibrate(
     directory: Path,
-    trajectories: tuple[Path, ...],
+    trajectories: Recordings,
     sources: Sources,
     as_json: bool,
     **budget_and_search: Any,  # ttscompile.calibrate takes them by the same names

@@ -14,6 +14,7 @@ from ttscompile.artifact.manifest import marked
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.progress import Bar
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress, say, table
+from ttscompile.cli.sections import Recordings
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import ArtifactChangedError, SpecError, needing
@@ -192,7 +193,7 @@ def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
 
 
 def compare(
-    directory: Path, artifacts: Mapping[str, Artifact], others: Sequence[Path], trajectories: Sequence[Path], **how: Any
+    directory: Path, artifacts: Mapping[str, Artifact], others: Sequence[Path], recordings: Recordings, **how: Any
 ) -> Comparison:
     """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
 
@@ -203,7 +204,7 @@ def compare(
     with needing("-t", "compile"):
         from ttscompile.calibration.compare import compare as measure
     with only_results_on_stdout(), Bar(shown=True) as bar:
-        found = measure(directory, trajectories, others, progress=bar.tell, **how)
+        found = measure(directory, recordings, others, progress=bar.tell, **how)
     pairs = zip((directory, *others), artifacts.values(), strict=True)
     if changed := [path for path, one in pairs if manifest_of(path).identity != one.manifest.identity]:
         raise ArtifactChangedError(f"{changed[0]}: it was replaced meanwhile. Try again.")

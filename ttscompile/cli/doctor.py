@@ -7,7 +7,7 @@ import click
 
 from ttscompile.cli.options import json_option
 from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json
-from ttscompile.cli.sections import SectionedCommand, require_recordings, trajectories_options
+from ttscompile.cli.sections import Recordings, SectionedCommand, require_recordings, trajectories_options
 from ttscompile.cli.types import PathOrHub
 from ttscompile.doctor import diagnosis as examination
 
@@ -18,7 +18,7 @@ from ttscompile.doctor import diagnosis as examination
 @json_option
 @click.pass_context
 def doctor(
-    context: click.Context, /, target: Path | str | None, trajectories: tuple[Path, ...], as_json: bool, **how: Any
+    context: click.Context, /, target: Path | str | None, trajectories: Recordings, as_json: bool, **how: Any
 ) -> None:
     """Look at Python, packages, processor, cores, memory and clock; with TARGET, also at that.
 

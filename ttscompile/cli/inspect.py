@@ -1,6 +1,6 @@
 """``ttscompile inspect``: what is in an artifact, as tables, as a picture of a plan, or all of it on a page."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -10,7 +10,7 @@ from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, progress, say
-from ttscompile.cli.sections import Section, SectionedCommand, Sources, trajectories_options
+from ttscompile.cli.sections import Recordings, Section, SectionedCommand, Sources, trajectories_options
 from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
 from ttscompile.core.lattice import PlanArray
@@ -57,7 +57,7 @@ def inspect(
     directory: Path,
     output: Path | None,
     picture: Path | None,
-    trajectories: tuple[Path, ...],
+    trajectories: Recordings,
     sources: Sources,
     name: str | None,
     verifies: bool,
@@ -162,7 +162,7 @@ def write_page(
 
 
 def checked(
-    directory: Path, identity: str, trajectories: Sequence[Path], sources: Sources, progress: Callable[[str], None]
+    directory: Path, identity: str, trajectories: Recordings, sources: Sources, progress: Callable[[str], None]
 ) -> tuple[bool, OfPage]:
     """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
 

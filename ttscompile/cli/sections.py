@@ -1,6 +1,6 @@
 """Options of a command in parts, each with a heading in the help; and those of commands that read recorded episodes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,9 +9,12 @@ import click
 from click.core import ParameterSource
 
 from ttscompile.cli.options import Decorator, together
-from ttscompile.cli.types import PATH, TEXT
-from ttscompile.core.paths import require_path
+from ttscompile.cli.types import PATH_OR_HUB, TEXT
+from ttscompile.core.paths import on_hub, require_path
 from ttscompile.errors import TrajectoryError
+
+Recordings = tuple[Path | str, ...]
+"""Paths, and names of data sets on the hub."""
 
 Sources = dict[str, tuple[str, ...]]
 """By key of the observation, the arrays of a recording that it is made of; of ``task``, the tokenizer's folder."""
@@ -30,24 +33,26 @@ def _sources(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> 
     return found
 
 
-def require_recordings(paths: Iterable[Path]) -> None:
+def require_recordings(paths: Recordings) -> None:
     """Raise TrajectoryError unless all of these exist: to be told before torch is imported, which takes seconds."""
     for path in paths:
-        require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
+        if not on_hub(path):
+            require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
 
 
 def trajectories_options(required: bool = True, what: str = "Learn from these recorded episodes.") -> Decorator:
-    """``--trajectories`` as ``trajectories: tuple[Path, ...]`` and ``--observation`` as ``sources: Sources``."""
+    """``--trajectories`` as ``trajectories: Recordings`` and ``--observation`` as ``sources: Sources``."""
     return together(
         click.option(
             "-t",
             "--trajectories",
             required=required,
             multiple=True,
-            type=PATH,
+            type=PATH_OR_HUB,
             metavar="FILE...",
             help=f"{what} They are .npz files, zarr replay buffers of Diffusion Policy, HDF5 files of robomimic, or"
-            " LeRobot data sets; every word up to the next option is one.",
+            " LeRobot data sets, on the hub too (hf://datasets/ORGANISATION/NAME); every word up to the next option is"
+            " one.",
         ),
         click.option(
             "--observation",

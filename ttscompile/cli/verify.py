@@ -9,7 +9,7 @@ import ttscompile
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, table
-from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
+from ttscompile.cli.sections import Recordings, SectionedCommand, Sources, trajectories_options
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.report.build import figure
 
@@ -19,9 +19,7 @@ from ttscompile.report.build import figure
 @trajectories_options(required=False, what="Check what the plans do on these recorded episodes, too.")
 @json_option
 @click.pass_context
-def verify(
-    context: click.Context, directory: Path, trajectories: tuple[Path, ...], sources: Sources, as_json: bool
-) -> None:
+def verify(context: click.Context, directory: Path, trajectories: Recordings, sources: Sources, as_json: bool) -> None:
     """Check the artifact DIRECTORY against the answers of the original network that it holds.
 
     Neither the checkpoint nor PyTorch is needed. Without --trajectories the error of the plans is shown, and not

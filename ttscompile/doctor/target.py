@@ -103,7 +103,7 @@ def _call(artifact: Artifact) -> list[Finding]:
 
 
 def target_findings(
-    target: Path | str, recordings: Sequence[Path] = (), sources: Mapping[str, Sequence[str]] | None = None
+    target: Path | str, recordings: Sequence[Path | str] = (), sources: Mapping[str, Sequence[str]] | None = None
 ) -> list[Finding]:
     """What ``convert`` takes or wrote, and whether recordings fit it; see there and ``load_trajectories``."""
     try:

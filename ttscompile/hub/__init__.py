@@ -4,6 +4,6 @@ Its cache keeps what was downloaded and serves it without a network; its login a
 (``HF_TOKEN``, ``HF_HOME``, ``HF_ENDPOINT``, ``HF_HUB_OFFLINE``) hold.
 """
 
-from .repository import Fetched, fetch_artifact, fetch_checkpoint, upload
+from .repository import Fetched, fetch_artifact, fetch_checkpoint, fetch_recording, upload
 
-__all__ = ["Fetched", "fetch_artifact", "fetch_checkpoint", "upload"]
+__all__ = ["Fetched", "fetch_artifact", "fetch_checkpoint", "fetch_recording", "upload"]

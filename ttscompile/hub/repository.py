@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -24,6 +25,8 @@ _REVISION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._/-]{0,199}")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.=+ -]{0,199}")
 """Of a file or a folder: nothing that a path, a pattern or a terminal would take for something else."""
 EXPECTED = "expected hf://ORGANISATION/NAME, and perhaps @REVISION and /PATH after it"
+DATA_SETS = f"{HUB}datasets/"
+"""How the name of a data set begins."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ _POLICIES = (
     {_CONFIG, "adapter_config.json", "adapter_model.safetensors"},
 )  # a whole one or an adapter
 _OF_LEROBOT = re.compile(
-    rf"(adapter_)?{_CONFIG}|policy_(pre|post)processor\.json|[^/]+\.safetensors"
+    rf"(adapter_|train_)?{_CONFIG}|policy_(pre|post)processor\.json|[^/]+\.safetensors"
     r"|[^/]+/(config|vocab|tokenizer|tokenizer_config|special_tokens_map|added_tokens)\.json|[^/]+/merges\.txt"
 )
 """What ``convert`` reads of a directory that lerobot saved, whose processors name the files of their statistics as they
@@ -99,6 +102,16 @@ like, and of a folder of its encoders in it."""
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _CHECKPOINT = ".ckpt"
 MOST_FILES = 1000
+MOST_EPISODES = 32
+"""Of a data set, that are downloaded and read."""
+_FIRST_EPISODES = (
+    *(f"meta/*.{end}" for end in ("json", "jsonl", "parquet")),
+    *(f"{one}/chunk-000/file-000.parquet" for one in ("meta/episodes", "data")),
+    "videos/*/chunk-000/file-000.mp4",
+    *(f"data/chunk-000/episode_{n:06d}.parquet" for n in range(MOST_EPISODES)),
+    *(f"videos/chunk-000/*/episode_{n:06d}.mp4" for n in range(MOST_EPISODES)),
+)
+"""Of version 3, which has many episodes in a file, and of version 2, which has a file for each."""
 MOST_MANIFEST_BYTES = 32 << 20
 MOST_CARD_BYTES = 1 << 20
 _ENDS = (".json", ".onnx", ".safetensors", ".txt", _CHECKPOINT)
@@ -168,6 +181,26 @@ def fetch_checkpoint(text: str) -> Fetched:
         return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, files))
 
 
+def fetch_recording(text: str) -> Fetched:
+    """The first episodes of a LeRobot data set: data sets have up to terabytes, and a recording needs a few episodes.
+
+    Args:
+        text: ``hf://datasets/org/name[@revision]``.
+
+    Raises:
+        HubError: there is no such data set, it is not LeRobot's, or there is no network and nothing in the cache.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
+    """
+    if not text.startswith(DATA_SETS):
+        raise HubError(f"{text:.200}: expected {DATA_SETS}ORGANISATION/NAME, and perhaps @REVISION after it.")
+    name, hub = read_name(text.replace(DATA_SETS, HUB)), library()
+    with told(text):
+        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, *_FIRST_EPISODES], kind="dataset")
+    if not (folder / "meta" / "info.json").is_file():
+        raise HubError(f"{text}: there is no meta/info.json in it; expected a LeRobot data set.")
+    return Fetched(folder, name.at(folder.name).replace(HUB, DATA_SETS), _licence(folder / CARD))
+
+
 def _whole(name: HubName, kept: list[str]) -> bool:
     """Whether files in the cache say without a listing what the checkpoint is: a directory of LeRobot does.
 
@@ -205,19 +238,22 @@ def _fetched(hub: Any, name: HubName, text: str, commit: str, chosen: list[str],
     return Fetched(folder / (chosen[0] if single else name.inside), name.at(commit), _licence(folder / CARD))
 
 
-def _snapshot(hub: Any, repository: str, revision: str | None, files: list[str], anew: bool = False) -> Path:
+def _snapshot(
+    hub: Any, repository: str, revision: str | None, files: list[str], anew: bool = False, kind: str = "model"
+) -> Path:
     """The folder of a commit in the cache, which has its name, with these files of those that there are."""
     commit = branch = revision or "main"
+    download = partial(hub.snapshot_download, repo_type=kind)
     if not _COMMIT.fullmatch(branch):
         try:
-            commit = str(hub.HfApi().model_info(repository, revision=branch).sha)
+            commit = str(hub.HfApi().repo_info(repository, revision=branch, repo_type=kind).sha)
         except hub.errors.HfHubHTTPError:
             raise
         except Exception:  # no network, of whichever library: the cache may know what it meant
-            return Path(hub.snapshot_download(repository, revision=branch, allow_patterns=files, local_files_only=True))
+            return Path(download(repository, revision=branch, allow_patterns=files, local_files_only=True))
         if not _COMMIT.fullmatch(commit):  # the library takes it for the name of a folder
             raise HubError(f"{HUB}{repository}: expected a commit of 40 digits from the hub; found {commit!a:.100}.")
-    folder = Path(hub.snapshot_download(repository, revision=commit, allow_patterns=files, force_download=anew))
+    folder = Path(download(repository, revision=commit, allow_patterns=files, force_download=anew))
     if commit != branch:  # as the library does where it is given the branch: what it means where nobody answers
         (ref := folder.parents[1] / "refs" / branch).parent.mkdir(parents=True, exist_ok=True)
         ref.write_text(commit)

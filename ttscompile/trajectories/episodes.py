@@ -19,13 +19,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.coercion import integer
-from ..core.paths import require_path
+from ..core.paths import on_hub, require_path
 from ..core.spec import Instruction, ObservationSpec
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values, fitted
 from ..core.zip_files import open_zip
 from ..errors import TrajectoryError
+from ..hub import fetch_recording
+from ..hub.repository import MOST_EPISODES
 from .frames import Frames, few, frames_of_calls, instruction_rows, observation_frames, one_error, require_proportion
 from .sandbox import sandboxed_frames
 
@@ -64,6 +66,7 @@ def load_trajectories(
     """Read episodes from files.
 
     Args:
+        paths: of files and directories, or ``hf://datasets/org/name``: of a LeRobot data set, the first episodes.
         action_steps: how many actions of a chunk are executed: the frames between two calls.
         sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
             are called otherwise; ``NAME:N`` are the first N numbers of one. With ``task``, the path of a tokenizer, the
@@ -87,7 +90,7 @@ def load_trajectories(
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
     how = observations, action_steps, sources or {}, instruction
-    for episode in [each for path in paths for each in _read(Path(path), *how)]:
+    for episode in [each for path in paths for each in _read(*local(path), *how)]:
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
@@ -99,8 +102,16 @@ def load_trajectories(
     return list(different.values())
 
 
+def local(path: str | os.PathLike[str]) -> tuple[Path, Mapping[str, int]]:
+    """Where a recording is on this machine, and how much of it is read."""
+    if not on_hub(path):
+        return Path(path), {}
+    return fetch_recording(os.fspath(path)).path, {"most": MOST_EPISODES}
+
+
 def _read(
     path: Path,
+    part: Mapping[str, int],
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
     given: Mapping[str, Sequence[str]],
@@ -114,7 +125,7 @@ def _read(
     text = {words.tokens, words.mask} if words else set()
     seen = {key: spec for key, spec in observations.items() if key not in text}
     used = {part.partition(":")[0] for key in seen for part in sources.get(key, (key,))} | ({TASK} & set(given))
-    other, held, frames = _opened(path, sorted(used))
+    other, held, frames = _opened(path, part, sorted(used))
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
@@ -151,15 +162,15 @@ def _read(
 
 def recorded_names(path: Path) -> tuple[list[str], bool]:
     """Names of the arrays of a recording, and whether its rows are frames rather than calls."""
-    _, held, frames = _opened(path, [])
+    _, held, frames = _opened(path, {}, [])
     return list(held.names), frames
 
 
-def _opened(path: Path, wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
+def _opened(path: Path, part: Mapping[str, int], wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
     """What a file is that is no ``.npz``, what it holds, and whether that is frames."""
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
     other = _other_format(path)
-    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted), True))
+    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted, **part), True))
 
 
 def _npz(path: Path) -> tuple[Frames, bool]:

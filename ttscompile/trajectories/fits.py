@@ -1,5 +1,6 @@
 """Whether recordings fit a policy: names, pictures, ranges and rate; for the doctor, and for who learns from them."""
 
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from ..core.spec import Affine, PolicySpec
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .episodes import Episode, load_trajectories, recorded_names
+from .episodes import Episode, load_trajectories, local, recorded_names
 from .frames import few, one_error
 from .lerobot_dataset import MAX_INFO
 
@@ -120,7 +121,9 @@ _BLIND_SECONDS = 3.0
 """For which a chunk is executed without looking, from which on a robot misses what happens."""
 
 
-def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping[str, Sequence[str]]) -> list[Finding]:
+def examine_recordings(
+    paths: Sequence[str | os.PathLike[str]], spec: PolicySpec, sources: Mapping[str, Sequence[str]]
+) -> list[Finding]:
     """Look at recordings, which are given as to ``load_trajectories``, as the policy would observe them."""
     found, renamed = list[Finding](), dict(sources)
     if said := [key for key in spec.observations if key.startswith(_LANGUAGE) and not {key, TASK} & set(sources)]:
@@ -131,7 +134,7 @@ def examine_recordings(paths: Sequence[Path], spec: PolicySpec, sources: Mapping
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
-            for path in paths:
+            for path in (local(each)[0] for each in paths):
                 found += [*_names(path, spec, renamed), *_rate(path, spec)]
             steps = spec.chunk.stop - spec.chunk.start
             episodes = load_trajectories(paths, spec.observations, steps, renamed, spec.instruction)

@@ -26,8 +26,15 @@ ROWS, IMAGES = 4096, 8
 """Rows that are decoded at once: a table of rows that are all the same is a thousandth of what it holds."""
 
 
-def lerobot_recording(path: Path) -> Recording:
-    """Open a data set. Raises TrajectoryError: not one, or damaged."""
+def lerobot_recording(path: Path, most: int | None = None) -> Recording:
+    """Open a data set.
+
+    Args:
+        most: how many of its first episodes are read, and of these only those whose videos are there; None for all.
+
+    Raises:
+        TrajectoryError: not one, or damaged.
+    """
     import pyarrow.parquet as parquet
 
     require_files(path / "data")
@@ -54,16 +61,23 @@ def lerobot_recording(path: Path) -> Recording:
 
     def read(name: str) -> tuple[int, Iterator[Array]]:
         if name == TASK and told:
-            return len(order), _texts(path, _index(path, tables, TASKS, size))
+            return len(episodes), _texts(path, _index(path, tables, TASKS, size))
         if name in videos:
             times = np.concatenate([np.zeros(0, np.float32), *_column(path, tables, TIME, size)])
-            return len(order), video_frames(path, name, info, episodes, times, columns)
-        return len(order), _column(path, tables, name, size)
+            rows = len(episodes) if most is None else int(order.max()) + 1
+            return rows, video_frames(path, name, info, episodes[:rows], times[:rows], columns)
+        return len(episodes), _column(path, tables, name, size)
 
     def columns(files: Sequence[Path], name: str) -> Array:
         return np.concatenate(list(_column(path, [parquet.ParquetFile(file) for file in files], name, size)))
 
-    sorted_already = bool((order == np.arange(len(order))).all())
+    if most is not None:
+        files_of = [_begins(path, name, info, columns) for name in videos]
+        first = episodes[order[ends - 1]].tolist()[:most]
+        lacking = (i for i, n in enumerate(first) if not all(n in each and each[n][0].is_file() for each in files_of))
+        ends = ends[: next(lacking, len(first))]
+        order = order[: ends[-1] if len(ends) else 0]
+    sorted_already = np.array_equal(order, np.arange(len(episodes)))
     return Recording([*names, *videos, *([TASK] if told else [])], read, ends, None if sorted_already else order)
 
 

@@ -42,10 +42,10 @@ serve_alone(request)
 """
 
 
-def sandboxed_frames(path: Path, kind: str, wanted: Sequence[str]) -> Frames:
-    """The wanted arrays of a data set that is one of ``FORMATS``; those that it lacks are left out."""
+def sandboxed_frames(path: Path, kind: str, wanted: Sequence[str], **how: int) -> Frames:
+    """The wanted arrays of a data set that is one of ``FORMATS``, opened so; those that it lacks are left out."""
     arrays, own = dict[str, Array](), dict[str, Array]()
-    with reader({"path": os.fsdecode(path), "kind": kind, "wanted": list(wanted)}) as stream:
+    with reader({"path": os.fsdecode(path), "kind": kind, "wanted": list(wanted), "how": how}) as stream:
         names = _line(stream)["names"]
         while "end" not in (line := _line(stream)):
             array = _array(stream, line)
@@ -142,7 +142,7 @@ def serve(request: Mapping[str, Any], out: BinaryIO) -> None:
     path = Path(request["path"])
     try:
         with one_error(f"{path}: is damaged, or no recording of its format", ". Copy it again"):
-            recording: Recording = FORMATS[request["kind"]](path)
+            recording: Recording = FORMATS[request["kind"]](path, **request["how"])
             _send(out, names=list(recording.names))
             for name, own in {"ends": recording.ends, "order": recording.order}.items():
                 if own is not None:

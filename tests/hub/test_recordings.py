@@ -1,0 +1,101 @@
+"""LeRobot data sets from a hub: their first episodes, and those that a policy was trained on."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import ttscompile
+from tests.trajectories.data_sets import ENDS, as_lerobot, as_lerobot_with_videos
+from ttscompile.cli import main
+from ttscompile.core.spec import ObservationSpec
+from ttscompile.errors import CalibrationError, CheckpointError, HubError
+from ttscompile.frontends.data_set import recordings_of
+from ttscompile.trajectories import episodes, load_trajectories
+
+from .served import Hub
+
+SPECS = {"top": ObservationSpec((2, 3, 16, 32)), "state": ObservationSpec((2, 5))}
+NAME = "hf://datasets/org/data"
+
+
+def commit(hub: Hub, root: Path, version: int = 3) -> None:
+    """Of version 2 each episode has a table of its own; of version 3 the second is in another file than the first."""
+    files = {file.relative_to(root).as_posix(): file.read_bytes() for file in root.rglob("*") if file.is_file()}
+    if version == 2:
+        files = {name.replace("file-", "episode_000"): content for name, content in files.items()}
+    hub.commit("datasets/org/data", {**files, "README.md": b"---\nlicense: mit\n---\n", "other.bin": b"0"})
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_first_episodes_are_those_of_the_data_set(hub: Hub, tmp_path: Path, version: int) -> None:
+    root = as_lerobot_with_videos(tmp_path, version)
+    commit(hub, root, version)
+    whole, found = load_trajectories([root], SPECS, 2), load_trajectories([NAME], SPECS, 2)
+    assert len(found) == {2: 2, 3: 1}[version]
+    for one, other in zip(whole, found, strict=False):
+        assert all(np.array_equal(one.observations[key], other.observations[key]) for key in SPECS)
+    assert {"other.bin", "data/chunk-000/file-001.parquet"}.isdisjoint(hub.downloaded())
+
+
+def test_an_episode_without_its_video_ends_what_is_read(hub: Hub, tmp_path: Path) -> None:
+    root = as_lerobot_with_videos(tmp_path, 2)
+    (root / "videos/chunk-000/top/episode_000001.mp4").unlink()
+    commit(hub, root, 2)
+    (found,) = load_trajectories([NAME], SPECS, 2)
+    assert found.calls == -(-ENDS[0] // 2)
+
+
+def test_no_more_are_read_than_asked_for(tmp_path: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = as_lerobot(tmp_path)
+    commit(hub, root, 2)
+    specs = {"state": ObservationSpec((2, 5))}
+    assert len(load_trajectories([NAME], specs, 2)) == 2
+    monkeypatch.setattr(episodes, "MOST_EPISODES", 1)
+    assert len(load_trajectories([NAME], specs, 2)) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("hf://org/data", "expected hf://datasets/ORGANISATION/NAME, and perhaps"),
+        ("hf://datasets/org", "this is no name of a repository"),
+        ("hf://datasets/org/none", "org/none"),
+        ("hf://datasets/org/empty", "there is no meta/info.json in it; expected a LeRobot data set"),
+    ],
+)
+def test_what_is_no_data_set_is_refused(hub: Hub, text: str, message: str) -> None:
+    hub.commit("datasets/org/empty", {"README.md": b"x"})
+    with pytest.raises(HubError, match=message):
+        load_trajectories([text], SPECS, 2)
+
+
+@pytest.mark.parametrize("noted", [None, {}, {"dataset": {"repo_id": 3}}, {"dataset": "org/data"}])
+def test_a_checkpoint_that_names_no_data_set_wants_recordings(tmp_path: Path, noted: object) -> None:
+    if noted is not None:
+        (tmp_path / "train_config.json").write_text(json.dumps(noted))
+    with pytest.raises(CheckpointError, match="does not say which data set it was trained on. Give recorded episodes"):
+        recordings_of(tmp_path)
+
+
+def test_a_checkpoint_says_what_it_was_trained_on(tmp_path: Path) -> None:
+    (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "org/data"}}))
+    assert recordings_of(tmp_path) == NAME
+
+
+def test_build_says_from_what_it_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = list[tuple[str, ...]]()
+
+    def build(checkpoint: Path, directory: Path, trajectories: tuple[str, ...], **_: Any) -> None:
+        given.append(trajectories)
+        raise CalibrationError("as far as this.")
+
+    monkeypatch.setattr(ttscompile, "build", build)
+    (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "org/data"}}))
+    result = CliRunner().invoke(main, ["build", str(tmp_path), "-o", str(tmp_path / "compiled")])
+    assert (result.exit_code, given) == (2, [(NAME,)])
+    told = " ".join(result.stderr.split())
+    assert f"no --trajectories: the first episodes of {NAME}, which the policy was trained on" in told
