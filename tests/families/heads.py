@@ -1,5 +1,6 @@
 """Action heads of vision-language-action models, rebuilt, and what their originals made; see ``golden/README.md``."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -7,16 +8,17 @@ import diffusers
 from torch import nn
 
 from tests.families.checks import Arrays, golden
-from tests.families.cogact import CogACTHead
 from tests.families.dit_policy import DiTPolicyHead
 from tests.families.dita import DitaHead
 from tests.families.groot import GR00THead
 from tests.families.pi import PiHead
-from tests.families.rdt import RDTHead
 from tests.families.scaledp import ScaleDPHead
 from tests.families.smolvla import SmolVLAHead
 from tests.families.weights import draw_weights
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.heads.cogact import CogACTHead
+from ttscompile.heads.last_step import marked
+from ttscompile.heads.rdt import RDTConfig, RDTHead
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table
 
@@ -36,7 +38,7 @@ class Family:
         loop: largest share of the FLOPs that may stay in the loop.
         others: names and shapes of the original's parameters that the head does not have.
         scale: by which the golden file's timesteps are larger than the head's.
-        masks: whether the original multiplies the actions by ``action_mask`` at the end.
+        whole: what is compiled of the module, where that is more than it.
     """
 
     title: str
@@ -49,7 +51,7 @@ class Family:
     loop: float = 0.9
     others: dict[str, tuple[int, ...]] = field(default_factory=dict)
     scale: float = 1.0
-    masks: bool = False
+    whole: Callable[[Any], nn.Module] = lambda module: module
 
 
 UP_TO = "up to the rounding of float32"
@@ -78,14 +80,14 @@ def smolvla() -> Family:
 def rdt() -> Family:
     solver = diffusers.DPMSolverMultistepScheduler(beta_schedule="squaredcos_cap_v2", prediction_type="sample")
     return Family(
-        title="RDT-1B",
-        verified=f"RoboticsDiffusionTransformer deb71d8 `conditional_sample`, {UP_TO}",
-        module=RDTHead(width=32, heads=4, layers=4, horizon=6, actions=5, lengths=(9, 8), features=(12, 10)),
-        conditions=("language", "language_mask", "image", "state", "action_mask", "frequency"),
-        sampler=sampler_table(solver, 5, name="dpmsolver++"),
+        title="RDT-1B, its checkpoint",
+        verified=f"RoboticsDiffusionTransformer deb71d8 `predict_action`, {UP_TO}",
+        module=RDTHead(RDTConfig(32, heads=4, layers=4, horizon=6, actions=5, lengths=(9, 8), features=(12, 10))),
+        conditions=("lang_tokens", "lang_attn_mask", "img_tokens", "state_tokens", "action_mask", "ctrl_freqs"),
+        sampler=marked(sampler_table(solver, 5, name="dpmsolver++")),
         blocks={"self_attention": 4, "cross_attention": 4, "feed_forward": 4},
-        loop=0.78,
-        masks=True,
+        loop=0.93,
+        whole=RDTHead.compiled,
     )
 
 
@@ -116,7 +118,7 @@ def groot() -> Family:
 
 def cogact() -> Family:
     return Family(
-        title="CogACT action model, guidance 1.5",
+        title="CogACT action model, its checkpoint, guidance 1.5",
         verified=f"CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, {UP_TO}",
         module=CogACTHead(24, heads=3, layers=2, horizon=6, actions=5, cognition=18, guidance=1.5),
         conditions=("cognition",),
@@ -182,4 +184,4 @@ def loaded(family: Family, name: str) -> tuple[nn.Module, Arrays, PolicySpec]:
     horizon, channels = arrays["noise"].shape[1:]
     chunk = ChunkSpec(channels, horizon - arrays["actions"].shape[1], horizon)
     spec = PolicySpec((horizon, channels), observations, family.sampler, chunk)
-    return family.module.eval(), arrays, spec
+    return family.whole(family.module).eval(), arrays, spec

@@ -32,42 +32,6 @@ class Waves(nn.Module):
         return self.down(functional.silu(self.up(torch.cat([angle.cos(), angle.sin()], -1))))
 
 
-class TimestepEmbedder(nn.Module):
-    """DiT's: 256 waves of periods up to 10,000, then an MLP, ``[B] -> [B, width]``; RDT and CogACT have it too."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(256, width), nn.SiLU(), nn.Linear(width, width))
-
-    def forward(self, t: Tensor) -> Tensor:
-        angle = t[:, None].float() * torch.exp(-math.log(10000) * torch.arange(128, dtype=torch.float32) / 128)
-        return self.mlp(torch.cat([angle.cos(), angle.sin()], -1))
-
-
-class TimmAttention(nn.Module):
-    """timm's self-attention, one projection for query, key and value; CogACT and ScaleDP have it."""
-
-    def __init__(self, width: int, count: int) -> None:
-        super().__init__()
-        self.count = count
-        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        q, k, v = (heads(part, self.count) for part in self.qkv(x).chunk(3, -1))
-        return self.proj(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
-
-
-class TimmMlp(nn.Module):
-    """timm's feed-forward, four times as wide inside; CogACT and ScaleDP have it."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(functional.gelu(self.fc1(x), approximate="tanh"))
-
-
 class GatedFeedForward(nn.Module):
     """Llama's, with SiLU, and Gemma's, with GELU; SmolVLA, Dita and pi0 have them.
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .layers import TimmAttention, TimmMlp
+from ttscompile.heads.layers import TimmAttention, TimmMlp
 
 
 class _Timestep(nn.Module):

@@ -29,10 +29,9 @@ W = torch.zeros(2)
 OWN_MODULE = r"compile_denoiser\(module, spec\)"
 
 PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
-    ({"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}}, "CogACT", OWN_MODULE),
     ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "inside its language"),
     ({"parameter": {"blocks.0.weight": W}}, "Dita", r"tokens of words and frames.*dita\.py"),
-    ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "dpmsolver"),
+    ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "config.json, and model"),
     ({"model": {"noise_net.dec_pos": W, "noise_net.time_net.w": W}, "optim": {}}, "DiT-Policy", OWN_MODULE),
     (
         {"state_dict": {"model.inner_model.blocks.0.mlp.router.weight": W}, "pytorch-lightning_version": "2"},
@@ -93,7 +92,7 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["manifest.json", "weights.safetensors"], "compiled already.*ttscompile.load"),
     (["checkpoints/latest.ckpt", ".hydra/config.yaml"], "a directory of checkpoints.*latest.ckpt"),
     (["config.json", "model.safetensors"], r"a directory of weights .told by model\.safetensors"),
-    (["config.json=lang_adaptor", "pytorch_model.bin"], r"this is RDT .told by config\.json: lang_adaptor.*dpmsolver"),
+    (["config.json", "checkpoints/step-1.pt"], r"a directory of checkpoints .told by checkpoints/step-1\.pt"),
     (["config.json=model_type=Gr00tN1d7", "model-00001.safetensors"], r"N1\.7 as NVIDIA saves it.*save_pretrained"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
     (["config.json=policy_head_type=scale_dp_policy", "model.safetensors"], r"DexVLA.*scaledp\.py"),

@@ -68,10 +68,11 @@ _STAND_INS: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
 ]
 
 
-def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_checkpoint(path: str | os.PathLike[str], mapped: bool = False) -> dict[str, Any]:
     """Read a torch zip checkpoint; tensors on the CPU, configuration objects as inert stand-ins.
 
-    Entries that are pickles of their own (``pickles``) stay the bytes they are.
+    Entries that are pickles of their own (``pickles``) stay the bytes they are. Tensors that are ``mapped`` stay in the
+    file until they are used: copy what you keep.
 
     Raises:
         CheckpointError: missing, truncated, not a torch zip, or naming a global that is not known to be harmless.
@@ -93,7 +94,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
                     f"{path}: refused, because its pickle names {', '.join(unknown)}, which could run code while"
                     " loading. Nothing of the file was executed. Save the checkpoint again without these objects."
                 )
-            payload = torch.load(path, map_location="cpu", weights_only=True)
+            payload = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except CheckpointError:
         raise
     except Exception as error:  # a damaged directory or pickle; of whatever kind

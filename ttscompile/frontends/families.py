@@ -71,8 +71,8 @@ class Family:
         reads: what the user gives, for messages; begins with an article.
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
-        module: in this package. Its ``load(path, options)`` gives the network in eval mode and the ``PolicySpec``, and
-            raises CheckpointError or SpecError. Imported when a checkpoint is loaded, with torch and all it needs.
+        module: in this package, or with a dot before it in ``ttscompile``. Its ``load(path, options)`` gives network
+            and ``PolicySpec``, or a CheckpointError or SpecError; imported then, with torch.
         options: names of ``LoadOptions`` that it takes; the others are refused.
     """
 
@@ -95,10 +95,16 @@ class Family:
         return import_module(f".{self.module}", __package__).load(path, options)  # type: ignore[no-any-return]
 
 
-def _is_lerobot(path: Path) -> bool:
-    """Whether a directory is a policy that lerobot saved; a compiled one has such a file as well, and a manifest."""
+def _says(path: Path, entry: str) -> bool:
+    """Whether a directory has a ``config.json`` with an entry; a compiled policy may have one, and has a manifest."""
     config = path / "config.json"
-    return not (path / "manifest.json").is_file() and config.is_file() and "type" in read_json(config)
+    return not (path / "manifest.json").is_file() and config.is_file() and entry in read_json(config)
+
+
+def _begins_with(path: Path, word: bytes) -> bool:
+    """Whether the names that a torch file begins with hold a word."""
+    with path.open("rb") as file:
+        return word in file.read(2**20)
 
 
 FAMILIES = (
@@ -107,9 +113,27 @@ FAMILIES = (
         title="LeRobot",
         reads="a directory that lerobot's save_pretrained wrote, with config.json and model.safetensors",
         kind="directory",
-        detect=_is_lerobot,
+        detect=lambda path: _says(path, "type"),
         module="lerobot",
         options=frozenset({"sampler", "steps", "spacing", "loops", "task", "encoders", "without_cameras", "base"}),
+    ),
+    Family(
+        name="rdt",
+        title="RDT",
+        reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
+        kind="directory",
+        detect=lambda path: _says(path, "lang_adaptor"),
+        module=".heads.rdt",
+        options=frozenset({"sampler", "steps", "spacing", "loops"}),
+    ),
+    Family(
+        name="cogact",
+        title="CogACT",
+        reads="a .pt file of CogACT",
+        kind="file",
+        detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"action_model"),
+        module=".heads.cogact",
+        options=frozenset({"sampler", "steps", "spacing", "loops"}),
     ),
     Family(
         name="diffusion_policy",

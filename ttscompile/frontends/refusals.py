@@ -21,6 +21,7 @@ _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language 
 _DITA = f"{_HEAD} For Dita they are the tokens of words and frames; examples/vla/dita.py does it."
 _SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleDP."
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
+_RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
@@ -93,11 +94,10 @@ DIRECTORIES = (
     Refusal(r"^(example_batch|octo[^/]*)\.msgpack$", "an Octo model", _OCTO),
     Refusal(_JAX_FILES, "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
-    Refusal(r"^config\.json: (lang|img|state)_adaptor\b", "RDT", f"{_HEAD} Its sampler is dpmsolver++."),
     Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
     Refusal(r"^config\.json: (policy_head|model)_type=scale_dp", "DexVLA or its ScaleDP", _SCALEDP),
-    Refusal(r"\.ckpt$", "a directory of checkpoints", "Give one of the files in it, checkpoints/latest.ckpt say."),
+    Refusal(r"\.ckpt$|^checkpoints/[^/]+\.pt$", "a directory of checkpoints", "Give one of the files in it."),
     Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
 )
 """By the path of a file in a directory, three levels deep, or an entry of its ``config.json``."""
@@ -128,8 +128,8 @@ LEROBOT = (
 
 STATES = (
     Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
-    Refusal(r"^action_model\b", "a checkpoint of CogACT", f"{_HEAD} Guidance doubles the batch inside the module."),
-    Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", f"{_HEAD} Its sampler is dpmsolver++."),
+    Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
+    Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
     Refusal(r"(^|\.)noise_net\.|(^|\.)time_net\.", "a checkpoint of DiT-Policy", _HEAD),
     Refusal(
         r"\.router\.|\.experts?\.\d+\.",

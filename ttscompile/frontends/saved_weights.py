@@ -50,6 +50,11 @@ def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
             numbers = sum(math.prod(file.get_slice(name).get_shape()) for name in names)
     except Exception:  # a damaged file, which its reader describes
         return
+    require_memory_for(path, numbers)
+
+
+def require_memory_for(path: Path, numbers: int) -> None:
+    """The same of so many weights, which the file at ``path`` has."""
     need, there = TIMES * 4 * numbers, memory_bytes()
     if need > there:
         raise CheckpointError(

@@ -20,7 +20,7 @@ LANGUAGE, IMAGE, HZ = 12, 10, (25.0, 10.0)
 
 
 def run(folder: Path) -> dict[str, Arrays]:
-    """A prediction at two timesteps, and the actions of ``conditional_sample``; language of two lengths."""
+    """A prediction at two timesteps, and the actions of ``predict_action``; language of two lengths."""
     timm("1.0.3")
     sys.path.insert(0, str(folder))
     from models.rdt_runner import RDTRunner
@@ -65,16 +65,18 @@ def run(folder: Path) -> dict[str, Arrays]:
     tokens = torch.cat([start, tokens], 1)
     prediction = runner.model(tokens, rate, torch.from_numpy(timesteps), words, patches, lang_mask=mask)
     with noise_from(noise):
-        actions = runner.conditional_sample(words, mask, patches, start, valid, rate)
+        actions = runner.predict_action(
+            torch.from_numpy(language), mask, torch.from_numpy(image), torch.from_numpy(state), valid, rate
+        )
     return {
         "rdt": {
             "seed": SEED,
-            "language": language,
-            "image": image,
-            "state": state,
-            "language_mask": language_mask,
+            "lang_tokens": language,
+            "lang_attn_mask": language_mask,
+            "img_tokens": image,
+            "state_tokens": state,
             "action_mask": action_mask,
-            "frequency": frequency[:, None],  # an observation has an axis besides the batch
+            "ctrl_freqs": frequency[:, None],  # an observation has an axis besides the batch
             "noise": noise,
             "timesteps": timesteps,
             "prediction": prediction.numpy(),

@@ -1,0 +1,198 @@
+"""CogACT's action model, read from a checkpoint of the whole: what is around it becomes an observation, one token.
+
+Source: ``CogACT.predict_action_batch`` of microsoft/CogACT at b174a1b, from the cognition feature to the action, with
+its guidance and statistics.
+
+Guidance doubles the batch, with the cognition token and with the learned none. Parameters are called as in a
+checkpoint. Token 0 is the sum of timestep and condition.
+"""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ttscompile.core.spec import Affine, ChunkSpec, ObservationSpec, PolicySpec, Switch
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.checkpoint import read_checkpoint
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.saved_weights import as_float32, filled, names_of
+from ttscompile.frontends.scheduler import configured_loops
+from ttscompile.frontends.settings import Settings, read_json
+
+from .last_step import changed, clipped
+from .layers import TimestepEmbedder, TimmAttention, TimmMlp
+
+MODELS = {"DiT-S": (384, 6, 4), "DiT-B": (768, 12, 12), "DiT-L": (1024, 24, 16)}
+"""Width, layers and heads of the action models; the shapes of the weights tell the first two."""
+GUIDANCE, STEPS = 1.5, 10
+STATISTICS = "dataset_statistics.json"
+_TRAINED = {"num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2", "clip_sample": False}
+_GRIPPER = 6
+"""The number of an action that the original makes 0 or 1."""
+_UNREAD = "history_embedder."
+_MOST_DATA_SETS, _LEAST_WIDTH = 1000, 1e-8
+
+
+class _Layer(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.attn, self.mlp = TimmAttention(width, heads), TimmMlp(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attn(functional.layer_norm(x, x.shape[-1:], eps=1e-6))
+        done: Tensor = x + self.mlp(functional.layer_norm(x, x.shape[-1:], eps=1e-6))
+        return done
+
+
+class _Linear(nn.Module):
+    def __init__(self, features: int, width: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(features, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        made: Tensor = self.linear(x)
+        return made
+
+
+class CogACTHead(nn.Module):
+    """``forward_with_cfg``, which doubles the batch, on a batch that is not doubled yet.
+
+    Inputs: ``sample [B, T, D]``, ``timestep [B]``, ``cognition [B, 1, .]``.
+    """
+
+    def __init__(
+        self, width: int, heads: int, layers: int, horizon: int, actions: int, cognition: int, guidance: float
+    ) -> None:
+        super().__init__()
+        self.guidance = guidance
+        self.x_embedder, self.t_embedder = _Linear(actions, width), TimestepEmbedder(width)
+        self.z_embedder = _Linear(cognition, width)
+        self.z_embedder.uncondition = nn.Parameter(torch.zeros(1, cognition))
+        self.positional_embedding = nn.Parameter(torch.zeros(horizon + 1, width))
+        self.blocks = nn.ModuleList(_Layer(width, heads) for _ in range(layers))
+        self.final_layer = _Linear(width, actions)
+
+    def forward(self, sample: Tensor, timestep: Tensor, cognition: Tensor) -> Tensor:
+        """See the class."""
+        none = self.z_embedder.uncondition[None].expand(len(sample), -1, -1)
+        z = self.z_embedder(torch.cat([cognition, none], 0))
+        c = self.t_embedder(torch.cat([timestep, timestep], 0))[:, None] + z
+        x = torch.cat([c, self.x_embedder(torch.cat([sample, sample], 0))], 1) + self.positional_embedding
+        for layer in self.blocks:
+            x = layer(x)
+        x = self.final_layer(functional.layer_norm(x, x.shape[-1:], eps=1e-6))[:, 1:]
+        given, free = torch.split(x, len(x) // 2, dim=0)
+        return free + self.guidance * (given - free)
+
+
+def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild an action model from a checkpoint; see ``Family.load``."""
+    weights = _weights(path)
+    width, layers, horizon, actions, cognition = _sizes(weights, path)
+    heads = next((n for w, depth, n in MODELS.values() if (w, depth) == (width, layers)), None)
+    if heads is None:
+        known = ", ".join(f"{name} of {depth} layers {w} wide" for name, (w, depth, _) in MODELS.items())
+        raise CheckpointError(
+            f"{path}: the action model has {layers} layers {width} wide; expected {known}. Weights do not tell the"
+            " number of heads: build it with the code that trained it and use ttscompile.compile_denoiser."
+        )
+    sizes = {"layers": layers, "horizon": horizon, "actions": actions, "cognition": cognition}
+    head = filled(lambda: CogACTHead(width, heads, guidance=GUIDANCE, **sizes), weights, "its own shapes", path)
+    settings = {"_target_": "DDIMScheduler", **_TRAINED}
+    loops = configured_loops(settings, STEPS, options, where=f"{path}: the sampler")
+    loops = changed(loops, lambda table: clipped(table, 1.0))  # predict_action clips what the loop gives
+    own = _statistics(path, actions)
+    spec = PolicySpec(
+        sample=(horizon, actions),
+        observations={"cognition": ObservationSpec((1, cognition), window=False)},
+        sampler=loops.original,
+        loops=loops.others,
+        chunk=ChunkSpec(actions, 0, horizon, own.normalizer, switches=own.switches),
+        source={"format": "cogact", "guidance": str(GUIDANCE), "statistics": own.name, **loops.source},
+    )
+    return head.eval(), spec
+
+
+def _weights(path: Path) -> dict[str, Tensor]:
+    """Of the action model; the rest, some 30 GB, stays on the disk."""
+    payload: Any = read_checkpoint(path, mapped=True).get("model")
+    found = payload.get("action_model") if isinstance(payload, dict) else None
+    if not isinstance(found, dict):
+        what = f"found {sorted(map(str, payload))[:8]}" if isinstance(payload, dict) else "found no entry model"
+        raise CheckpointError(
+            f"{path}: expected {{model: {{action_model: weights, ...}}}}, as CogACT's training saves it; {what}. Give a"
+            " .pt file of its folder checkpoints."
+        )
+    weights = as_float32(found, f"{path}: ")
+    read = {name.removeprefix("net."): value for name, value in weights.items()}
+    return {name: value.clone() for name, value in read.items() if not name.startswith(_UNREAD)}
+
+
+def _sizes(weights: Mapping[str, Tensor], path: Path) -> tuple[int, int, int, int, int]:
+    """Width, layers, horizon, numbers of an action and of the cognition token, as shapes tell them."""
+    shapes = []
+    for name in ("positional_embedding", "x_embedder.linear.weight", "z_embedder.linear.weight"):
+        if name not in weights or weights[name].ndim != 2:
+            found = f"shape {list(weights[name].shape)}" if name in weights else "none"
+            raise CheckpointError(
+                f"{path}: the action model's {name} must be a matrix; found {found}. Give what CogACT's training saved."
+            )
+        shapes.append(tuple(weights[name].shape))
+    (tokens, width), (_, actions), (_, cognition) = shapes
+    layers = {name.split(".")[1] for name in weights if name.startswith("blocks.")}
+    return width, len(layers), tokens - 1, actions, cognition
+
+
+@dataclass(frozen=True)
+class _Statistics:
+    """How actions leave -1..1, and whose statistics say so."""
+
+    name: str
+    normalizer: Affine | None
+    switches: tuple[Switch, ...]
+
+
+def _statistics(path: Path, actions: int) -> _Statistics:
+    """Those of the one data set that the policy was trained on; else actions stay in -1..1, with a warning."""
+    where = path.absolute().parents[1] / STATISTICS
+    sets = read_json(where) if where.is_file() else {}
+    gripper = (Switch(_GRIPPER, 0.5, 0.0, 1.0),) if actions > _GRIPPER else ()
+    if len(sets) != 1:
+        there = f"holds {len(sets)} data sets ({names_of(sorted(sets))})" if where.is_file() else "is not there"
+        warnings.warn(
+            f"{where} {there}: actions stay in -1..1, as the network makes them. For those of a robot, put a file there"
+            " that holds its data set alone, and convert again.",
+            stacklevel=4,
+        )
+        return _Statistics("none", None, gripper)
+    name, entry = next(iter(sets.items()))
+    inner = entry.get("action") if isinstance(entry, dict) else None
+    entries = inner if isinstance(inner, dict) else {}
+    settings = Settings(entries, f"{where}: {name:.80}.action.", "Copy the file again.")
+    low, high = (_vector(settings, key, actions) for key in ("q01", "q99"))
+    mask = settings.values.get("mask", [True] * actions)
+    if not (isinstance(mask, list) and len(mask) == actions and all(type(one) is bool for one in mask)):
+        raise settings.refusal("mask", f"{actions} times true or false")
+    width = high - low
+    width[width == 0] = _LEAST_WIDTH  # one that never changed stays what it was
+    scale, offset = np.where(mask, 2 / width, 1.0), np.where(mask, -2 * low / width - 1, 0.0)
+    switches = ()
+    if gripper:
+        ends = [end if not mask[_GRIPPER] else (end + 1) / 2 * width[_GRIPPER] + low[_GRIPPER] for end in (0.0, 1.0)]
+        switches = (Switch(_GRIPPER, 0.5, *map(float, ends)),)
+    return _Statistics(name, Affine(scale, offset), switches)
+
+
+def _vector(settings: Settings, name: str, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    value = settings.values.get(name)
+    plain = isinstance(value, list) and all(type(one) in (int, float) for one in value)
+    if not plain or len(value) != count or not np.isfinite(found := np.asarray(value, np.float64)).all():
+        raise settings.refusal(name, f"{count} finite numbers")
+    return found

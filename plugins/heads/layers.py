@@ -1,0 +1,58 @@
+"""Layers that several action heads have; parameters are called as in the originals."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+_WAVES, _LONGEST = 128, 10_000
+"""Of the timestep: pairs of sine and cosine, and the longest period."""
+
+
+class TimestepEmbedder(nn.Module):
+    """DiT's: 256 waves of periods up to 10,000, then an MLP, ``[B] -> [B, width]``."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(2 * _WAVES, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, t: Tensor) -> Tensor:
+        """See the class."""
+        rates = torch.exp(-math.log(_LONGEST) * torch.arange(_WAVES, dtype=torch.float32) / _WAVES)
+        angle = t[:, None].float() * rates
+        embedded: Tensor = self.mlp(torch.cat([angle.cos(), angle.sin()], -1))
+        return embedded
+
+
+class TimmAttention(nn.Module):
+    """timm's self-attention: one projection for query, key and value."""
+
+    def __init__(self, width: int, count: int) -> None:
+        super().__init__()
+        self.count = count
+        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[B, T, width]`` to the same."""
+        q, k, v = (split(part, self.count) for part in self.qkv(x).chunk(3, -1))
+        added: Tensor = self.proj(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        return added
+
+
+class TimmMlp(nn.Module):
+    """timm's feed-forward, so many times as wide inside."""
+
+    def __init__(self, width: int, out: int | None = None, times: int = 4) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(width, times * width), nn.Linear(times * width, out or width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[B, T, width]`` to ``[B, T, out]``."""
+        added: Tensor = self.fc2(functional.gelu(self.fc1(x), approximate="tanh"))
+        return added
+
+
+def split(x: Tensor, count: int) -> Tensor:
+    """``[B, T, E]`` to ``[B, count, T, E / count]``."""
+    return x.unflatten(-1, (count, -1)).transpose(1, 2)

@@ -1,0 +1,185 @@
+"""CogACT's own checkpoint: its action model read and compiled, with the actions that the original gives."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+import ttscompile
+from tests.families.checks import golden, rounded
+from tests.families.weights import draw_weights
+from tests.heads.saved import save_cogact, weights_of
+from tests.rounding import assert_equal_but_for_rounding
+from ttscompile.cli import main
+from ttscompile.core.spec import Noise
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.heads import cogact
+from ttscompile.heads.cogact import CogACTHead
+
+LOW, HIGH = [-0.5, -1.0, 0.0, -2.0, 0.25, 0.5, 0.0], [0.5, 3.0, 0.5, -1.0, 0.25, 1.0, 1.0]
+MASK = [True, True, True, True, True, True, False]
+ONE = {"bridge_orig": {"action": {"q01": LOW, "q99": HIGH, "mask": MASK, "mean": LOW}, "num_trajectories": 3}}
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model of the size of the golden file beside the original's three, as where that was made."""
+    monkeypatch.setitem(cogact.MODELS, "tiny", (24, 2, 3))
+
+
+def seven() -> dict[str, torch.Tensor]:
+    """Weights of a model with as many numbers in an action as the original's have."""
+    own = CogACTHead(24, 3, 2, horizon=6, actions=7, cognition=18, guidance=1.5).state_dict()
+    return draw_weights({key: tuple(value.shape) for key, value in own.items()}, 3)
+
+
+@pytest.mark.slow
+def test_a_converted_checkpoint_acts_as_the_original(tmp_path: Path) -> None:
+    """With the runtime of the robot. ``predict_action`` clips what the golden file holds."""
+    path, out = save_cogact(tmp_path / "run", weights_of("cogact")), tmp_path / "compiled"
+    with pytest.warns(UserWarning, match=r"dataset_statistics\.json is not there: actions stay in -1\.\.1"):
+        result = CliRunner().invoke(main, ["convert", str(path), "-o", str(out)], catch_exceptions=False)
+        module, spec = load_checkpoint_policy(path)
+    assert result.exit_code == 0, result.output
+    arrays = golden("cogact")
+    obs = {"cognition": arrays["cognition"]}
+    terms, angle = rounded(module, obs, spec)
+    policy = ttscompile.load(out, runtime="onnxruntime")
+    made = policy.predict_action(obs, noise=Noise(arrays["noise"]), plan="dense")["action"]
+    # Rounding is of the largest number that was computed, which clipping takes away.
+    largest = np.abs(arrays["actions"]).max()
+    expected = np.clip(arrays["actions"], -1, 1)
+    assert (np.abs(expected) < 1).mean() > 0.2
+    assert_equal_but_for_rounding(np.append(made, largest), np.append(expected, largest), terms, angle)
+    assert policy.info.K == 10
+    assert dict(policy._spec.source) == {"format": "cogact", "guidance": "1.5", "statistics": "none"}
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "ddpm", "dpmsolver++"])
+def test_every_loop_clips_what_it_gives_and_nothing_before(sampler: str, tmp_path: Path) -> None:
+    path = save_cogact(tmp_path / "run", weights_of("cogact"), {"own": {"action": {"q01": [-1] * 5, "q99": [1] * 5}}})
+    module, spec = load_checkpoint_policy(path, options=LoadOptions(sampler=sampler, steps=20))
+    own = spec.in_loop(f"{sampler}-20")
+    assert own.sampler.bound == 1
+    plain = cogact.configured_loops(
+        {"_target_": "DDIMScheduler", **cogact._TRAINED}, 10, LoadOptions(sampler=sampler, steps=20), where="here"
+    ).others[f"{sampler}-20"]
+    noise = Noise(golden("cogact")["noise"], np.random.default_rng(0).standard_normal((20, 2, 6, 5), dtype=np.float32))
+    obs = {"cognition": torch.from_numpy(golden("cogact")["cognition"])}
+    found = eager_policy(module, own)(obs, noise).numpy()
+    wanted = eager_policy(module, replace(own, sampler=plain))(obs, noise).numpy()
+    assert np.abs(wanted).max() > 1
+    np.testing.assert_allclose(found, np.clip(wanted, -1, 1), atol=1e-4 * np.abs(wanted).max())
+
+
+def test_statistics_of_one_data_set_give_the_robots_actions(tmp_path: Path) -> None:
+    """By the original's formula, the gripper 0 or 1 and a number that never changed at its value."""
+    module, spec = load_checkpoint_policy(save_cogact(tmp_path / "run", seven(), ONE))
+    assert spec.source["statistics"] == "bridge_orig"
+    rng = np.random.default_rng(0)
+    obs = {"cognition": torch.from_numpy(rng.standard_normal((4, 1, 18), dtype=np.float32))}
+    sample = eager_policy(module, spec)(obs, Noise(rng.standard_normal((4, 6, 7), dtype=np.float32))).numpy()
+    assert np.abs(sample).max() == 1
+    normalized = sample.astype(np.float64)
+    normalized[..., 6] = np.where(normalized[..., 6] < 0.5, 0, 1)
+    low, high = np.array(LOW), np.array(HIGH)
+    expected = np.where(MASK, 0.5 * (normalized + 1) * (high - low) + low, normalized)
+    found = spec.chunk.unnormalized(sample)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert set(np.unique(found[..., 6])) == {0, 1}
+
+
+def test_a_gripper_that_statistics_are_of_has_their_ends(tmp_path: Path) -> None:
+    """``mask`` may be absent, and is then true for all."""
+    only = {"own": {"action": {"q01": [*LOW[:6], -3.0], "q99": [*HIGH[:6], 5.0]}}}
+    spec = load_checkpoint_policy(save_cogact(tmp_path / "run", seven(), only))[1]
+    found = spec.chunk.unnormalized(np.array([[[0.0] * 6 + [0.49], [0.0] * 6 + [0.5]]], np.float32))
+    np.testing.assert_allclose(found[0, :, 6], [1.0, 5.0])
+
+
+def test_of_several_data_sets_none_is_chosen(tmp_path: Path) -> None:
+    """The warning names them; the gripper is 0 or 1 as the original's normalised one is."""
+    path = save_cogact(tmp_path / "run", seven(), ONE | {"fractal20220817_data": ONE["bridge_orig"]})
+    with pytest.warns(UserWarning, match=r"holds 2 data sets \(bridge_orig, fractal20220817_data\): .* data set alone"):
+        spec = load_checkpoint_policy(path)[1]
+    assert spec.chunk.normalizer is None and spec.source["statistics"] == "none"
+    found = spec.chunk.unnormalized(np.array([[[0.25] * 7]], np.float32))
+    assert found.tolist() == [[[0.25] * 6 + [0.0]]]
+
+
+def test_the_rest_of_the_model_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some 30 GB of it: tensors are mapped, and what is kept are copies."""
+    seen = list[bool]()
+    plain = torch.load
+    monkeypatch.setattr(torch, "load", lambda *args, **more: seen.append(more["mmap"]) or plain(*args, **more))
+    path = save_cogact(tmp_path / "run", weights_of("cogact"), {"a": {"action": {"q01": [-1] * 5, "q99": [1] * 5}}})
+    module, _ = load_checkpoint_policy(path)
+    path.write_bytes(bytes(path.stat().st_size))  # who overwrites the file does not change the network
+    assert seen == [True]
+    expected = weights_of("cogact")
+    assert all(torch.equal(value, expected[name]) for name, value in module.state_dict().items())
+
+
+def changed(**changes: Any) -> dict[str, Any]:
+    return {key: value for key, value in (weights_of("cogact") | changes).items() if value is not None}
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        (changed(positional_embedding=None), "positional_embedding must be a matrix; found none. Give what CogACT's"),
+        (changed(positional_embedding=torch.zeros(3)), r"positional_embedding must be a matrix; found shape \[3\]"),
+        (changed(positional_embedding=torch.zeros(7, 32)), "has 2 layers 32 wide; expected DiT-S of 6 layers 384 wide"),
+        (changed(**{"blocks.7.attn.qkv.weight": torch.zeros(2)}), "has 3 layers 24 wide; expected DiT-S"),
+        (changed(**{"blocks.0.attn.qkv.weight": None}), r"missing blocks\.0\.attn\.qkv\.weight"),
+        (changed(**{"x_embedder.linear.bias": torch.full((24,), np.nan)}), "24 values that are not finite"),
+        (changed(**{"x_embedder.linear.bias": torch.zeros(24, dtype=torch.int8)}), "is a torch.int8 tensor"),
+        (changed(more=torch.zeros(2)), "unexpected more"),
+        (changed(more=print), "could run code while loading. Nothing of the file was executed"),
+    ],
+)
+def test_a_file_that_is_no_such_policy_is_refused(weights: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = save_cogact(tmp_path / "run", weights)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint_policy(path)
+    assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"action": {"q01": LOW, "q99": HIGH[:6]}}, r"q99 is \[.*; expected 7 finite numbers"),
+        ({"action": {"q01": [*LOW[:6], "0"], "q99": HIGH}}, "q01 is .*; expected 7 finite numbers"),
+        ({"action": {"q01": LOW, "q99": HIGH, "mask": [1] * 7}}, "mask is .*; expected 7 times true or false"),
+        ({"proprio": {}}, "bridge.action.q01 is None; expected 7 finite numbers. Copy the file again"),
+        (3, "bridge.action.q01 is None"),
+    ],
+)
+def test_statistics_that_are_none_are_refused(entry: Any, message: str, tmp_path: Path) -> None:
+    path = save_cogact(tmp_path / "run", seven(), {"bridge": entry})
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint_policy(path)
+    assert str(caught.value).startswith(str(tmp_path / "run" / "dataset_statistics.json"))
+
+
+def test_other_files_are_told_from_it(tmp_path: Path) -> None:
+    """A file without the name, and one without the weights."""
+    path = save_cogact(tmp_path / "run", weights_of("cogact"))
+    other = path.rename(path.with_suffix(".bin"))
+    with pytest.raises(CheckpointError, match=r"this is a checkpoint of CogACT .*Give it a name that ends with \.pt"):
+        load_checkpoint_policy(other)
+    torch.save({"model": {"action_model_of_others": {}}}, path)
+    with pytest.raises(CheckpointError, match=r"action_model: weights.*found \['action_model_of_others'\]. Give"):
+        load_checkpoint_policy(path)
+    torch.save({"action_model": torch.zeros(2)}, path)
+    with pytest.raises(CheckpointError, match=r"as CogACT's training saves it; found no entry model"):
+        load_checkpoint_policy(path)
+    with pytest.raises(CheckpointError, match="is a directory without|this is a directory of checkpoints"):
+        load_checkpoint_policy(tmp_path / "run")

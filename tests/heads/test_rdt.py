@@ -1,0 +1,144 @@
+"""RDT-1B's own directory: read, compiled, and its actions those of the original's ``predict_action``."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from safetensors.torch import save_file
+
+import ttscompile
+from tests.families.checks import golden, rounded
+from tests.heads.saved import RDT, rdt_observation, rdt_with, save_rdt, weights_of
+from tests.rounding import assert_equal_but_for_rounding
+from ttscompile.cli import main
+from ttscompile.core.spec import Noise
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.families import LoadOptions
+
+
+@pytest.mark.slow
+def test_a_converted_directory_acts_as_the_original(tmp_path: Path) -> None:
+    """With the runtime of the robot. A number that the mask leaves out is 0, as the original's is."""
+    directory, out = save_rdt(tmp_path / "rdt"), tmp_path / "compiled"
+    result = CliRunner().invoke(main, ["convert", str(directory), "-o", str(out)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    module, spec = load_checkpoint_policy(directory)
+    arrays, obs = golden("rdt"), rdt_observation()
+    terms, angle = rounded(module, obs, spec)
+    policy = ttscompile.load(out, runtime="onnxruntime")
+    made = policy.predict_action(obs, noise=Noise(arrays["noise"]), plan="dense")["action"]
+    assert_equal_but_for_rounding(made, arrays["actions"], terms, angle)
+    assert not made[..., 4].any() and made[..., :4].all()
+    assert policy.info.K == 5 and dict(spec.source) == {"format": "rdt"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampler", ["dpmsolver++", "ddim", "ddpm"])
+def test_every_loop_masks_what_it_gives_and_nothing_before(sampler: str, tmp_path: Path) -> None:
+    directory = save_rdt(tmp_path / "rdt")
+    module, spec = load_checkpoint_policy(directory, options=LoadOptions(sampler=sampler, steps=8))
+    own = spec.in_loop(f"{sampler}-8")
+    assert (own.sampler.timesteps < 0).tolist() == 7 * [False] + [True]
+    rng = np.random.default_rng(0)
+    noise = Noise(golden("rdt")["noise"], rng.standard_normal((8, 2, 6, 5), dtype=np.float32))
+    obs = {key: torch.from_numpy(value) for key, value in rdt_observation().items()}
+    found = eager_policy(module, own)(obs, noise).numpy()
+    timesteps = own.sampler.timesteps.copy()
+    timesteps[-1] = -1 - timesteps[-1]
+    unmarked = replace(own, sampler=replace(own.sampler, timesteps=timesteps))
+    plain = eager_policy(module, unmarked)(obs, noise).numpy()
+    assert plain[..., 4].all() and not found[..., 4].any()
+    np.testing.assert_array_equal(found[..., :4], plain[..., :4])
+
+
+def test_weights_are_read_from_either_file_in_any_floating_point_type(tmp_path: Path) -> None:
+    """As the original does: safetensors first."""
+    directory, weights = save_rdt(tmp_path / "rdt"), weights_of("rdt")
+    first = load_checkpoint_policy(directory)[0].state_dict()
+    save_file({key: value.bfloat16() for key, value in weights.items()}, directory / "model.safetensors")
+    second = load_checkpoint_policy(directory)[0].state_dict()
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert value.dtype == second[name].dtype == torch.float32
+        assert torch.equal(value.bfloat16().float(), second[name])
+
+
+@pytest.mark.parametrize(("adaptor", "depths"), [("linear", (0, 2, 3)), ("mlp1x_gelu", (1, 2, 3))])
+def test_adaptors_are_what_their_names_say(adaptor: str, depths: tuple[int, int, int], tmp_path: Path) -> None:
+    directory = save_rdt(tmp_path / "rdt", rdt_with(depths).state_dict(), lang_adaptor=adaptor)
+    module, spec = load_checkpoint_policy(directory)
+    obs = {key: torch.from_numpy(value) for key, value in rdt_observation().items()}
+    assert torch.isfinite(eager_policy(module, spec)(obs, Noise(golden("rdt")["noise"]))).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rdt": RDT["rdt"] | {"depth": 5}}, r"missing model\.blocks\.4.*config\.json describes another network"),
+        (
+            {"rdt": RDT["rdt"] | {"hidden_size": 2**30}},
+            "rdt.hidden_size is 1073741824; expected a positive whole number,",
+        ),
+        ({"rdt": RDT["rdt"] | {"num_heads": 5}}, "hidden_size is 32 with 5 heads; expected a multiple of the heads"),
+        ({"rdt": None}, "rdt is None; expected its entries. Give the folder"),
+        ({"img_adaptor": "resampler"}, r"img_adaptor is 'resampler'; expected linear, or mlpNx_gelu with N = 1 to 16"),
+        ({"img_adaptor": "mlp99x_gelu"}, "img_adaptor is 'mlp99x_gelu'; expected linear"),
+        ({"state_token_dim": 6}, "state_token_dim is 6; expected 5, as action_dim is"),
+        ({"img_cond_len": 9}, r"img_cond_pos_embed has shape \(1, 8, 32\); expected \(1, 9, 32\)"),
+        ({"pred_horizon": 10**9}, "pred_horizon is 1000000000; expected a positive whole number, 65536 at most"),
+        ({"noise_scheduler": {"num_inference_timesteps": 5}}, "noise_scheduler: num_train_timesteps is None"),
+        (
+            {"noise_scheduler": RDT["noise_scheduler"] | {"prediction_type": "epsilon"}},
+            "prediction_type is 'epsilon'; expected sample: another is not rebuilt here",
+        ),
+    ],
+)
+def test_a_directory_that_is_no_such_policy_is_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    directory = save_rdt(tmp_path / "rdt", **changes)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint_policy(directory)
+    assert str(caught.value).startswith(str(directory))
+
+
+def test_weights_that_are_missing_damaged_or_hostile_are_refused(tmp_path: Path) -> None:
+    directory = save_rdt(tmp_path / "rdt", {"lang_adaptor.0.weight": print})  # type: ignore[dict-item]
+    with pytest.raises(CheckpointError, match="could run code while loading. Nothing of the file was executed"):
+        load_checkpoint_policy(directory)
+    (directory / "pytorch_model.bin").write_bytes(b"no archive")
+    with pytest.raises(CheckpointError, match="not a torch checkpoint, or a truncated one"):
+        load_checkpoint_policy(directory)
+    (directory / "pytorch_model.bin").unlink()
+    with pytest.raises(
+        CheckpointError, match=r"expected model\.safetensors or pytorch_model\.bin; found neither. Copy"
+    ):
+        load_checkpoint_policy(directory)
+    (directory / "model.safetensors").write_bytes(b"no tensors")
+    with pytest.raises(CheckpointError, match=r"model\.safetensors: not a safetensors file, or a truncated one"):
+        load_checkpoint_policy(directory)
+    (directory / "config.json").write_text(json.dumps(RDT)[:-20])
+    with pytest.raises(CheckpointError, match=r"config\.json: cannot be read as JSON"):
+        load_checkpoint_policy(directory)
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "pytorch_model.bin"])
+def test_more_weights_than_the_machine_can_compile_are_refused(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = save_rdt(tmp_path / "rdt")
+    if file == "model.safetensors":
+        save_file(weights_of("rdt"), directory / file)
+    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 1000)
+    with pytest.raises(CheckpointError, match=rf"{file}: 0 million weights. Compiling them takes about 0\.0 GiB"):
+        load_checkpoint_policy(directory)
+
+
+def test_options_of_other_families_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="the option task is for LeRobot policies; this is one of RDT"):
+        load_checkpoint_policy(save_rdt(tmp_path / "rdt"), options=LoadOptions(task="push the block"))
