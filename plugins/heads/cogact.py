@@ -121,7 +121,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
 
 
 def _weights(path: Path) -> dict[str, Tensor]:
-    """Of the action model; the rest, some 30 GB, stays on the disk."""
+    """Copies of those of the action model; the rest, some 30 GB, stays on the disk."""
     payload: Any = read_checkpoint(path, mapped=True).get("model")
     found = payload.get("action_model") if isinstance(payload, dict) else None
     if not isinstance(found, dict):

@@ -280,4 +280,4 @@ def _weights(directory: Path) -> dict[str, Tensor]:
     path = directory / PICKLED
     saved = read_checkpoint(path, mapped=True)
     require_memory_for(path, sum(value.numel() for value in saved.values() if isinstance(value, Tensor)))
-    return {name: value.clone() for name, value in as_float32(saved, f"{path}: ").items()}
+    return as_float32(saved, f"{path}: ")

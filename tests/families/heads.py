@@ -80,7 +80,7 @@ def smolvla() -> Family:
 def rdt() -> Family:
     solver = diffusers.DPMSolverMultistepScheduler(beta_schedule="squaredcos_cap_v2", prediction_type="sample")
     return Family(
-        title="RDT-1B, its checkpoint",
+        title="RDT-1B, read from its directory",
         verified=f"RoboticsDiffusionTransformer deb71d8 `predict_action`, {UP_TO}",
         module=RDTHead(RDTConfig(32, heads=4, layers=4, horizon=6, actions=5, lengths=(9, 8), features=(12, 10))),
         conditions=("lang_tokens", "lang_attn_mask", "img_tokens", "state_tokens", "action_mask", "ctrl_freqs"),
@@ -118,8 +118,8 @@ def groot() -> Family:
 
 def cogact() -> Family:
     return Family(
-        title="CogACT action model, its checkpoint, guidance 1.5",
-        verified=f"CogACT b174a1b `forward_with_cfg`, `ddim_sample_loop`, {UP_TO}",
+        title="CogACT action model, read from its file, guidance 1.5",
+        verified=f"CogACT b174a1b `predict_action_batch`, `forward_with_cfg`, {UP_TO}",
         module=CogACTHead(24, heads=3, layers=2, horizon=6, actions=5, cognition=18, guidance=1.5),
         conditions=("cognition",),
         sampler=ddim(10, clip_sample=False),

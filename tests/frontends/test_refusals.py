@@ -32,6 +32,11 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "inside its language"),
     ({"parameter": {"blocks.0.weight": W}}, "Dita", r"tokens of words and frames.*dita\.py"),
     ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "config.json, and model"),
+    (
+        {"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}},
+        "CogACT",
+        "ends with .pt",
+    ),
     ({"model": {"noise_net.dec_pos": W, "noise_net.time_net.w": W}, "optim": {}}, "DiT-Policy", OWN_MODULE),
     (
         {"state_dict": {"model.inner_model.blocks.0.mlp.router.weight": W}, "pytorch-lightning_version": "2"},
@@ -50,11 +55,11 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
 @pytest.mark.parametrize(("payload", "what", "remedy"), PAYLOADS)
 def test_torch_files(tmp_path: Path, payload: dict[str, Any], what: str, remedy: str) -> None:
     """Told by an entry or by the name of a weight, which the message quotes."""
-    torch.save(payload, tmp_path / "model.pt")
+    torch.save(payload, tmp_path / "model.pth")
     with pytest.raises(CheckpointError, match=rf"{what}.*{remedy}") as caught:
-        load_checkpoint_policy(tmp_path / "model.pt")
+        load_checkpoint_policy(tmp_path / "model.pth")
     message = str(caught.value)
-    assert message.startswith(f"{tmp_path / 'model.pt'}: no entry 'cfg'")
+    assert message.startswith(f"{tmp_path / 'model.pth'}: no entry 'cfg'")
     assert "(told by " in message
     assert "\n" not in message
 
