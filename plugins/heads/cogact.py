@@ -37,7 +37,7 @@ _TRAINED = {"num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2", "c
 _GRIPPER = 6
 """The number of an action that the original makes 0 or 1."""
 _UNREAD = "history_embedder."
-_MOST_DATA_SETS, _LEAST_WIDTH = 1000, 1e-8
+_LEAST_WIDTH = 1e-8
 
 
 class _Layer(nn.Module):
@@ -61,6 +61,16 @@ class _Linear(nn.Module):
         return made
 
 
+class _Cognition(_Linear):
+    def __init__(self, features: int, width: int) -> None:
+        super().__init__(features, width)
+        self.uncondition = nn.Parameter(torch.zeros(1, features))
+
+    def guided(self, cognition: Tensor) -> Tensor:
+        """The batch twice: with what is known, and with what the training learned of not knowing it."""
+        return self.forward(torch.cat([cognition, self.uncondition[None].expand(len(cognition), -1, -1)], 0))
+
+
 class CogACTHead(nn.Module):
     """``forward_with_cfg``, which doubles the batch, on a batch that is not doubled yet.
 
@@ -73,17 +83,14 @@ class CogACTHead(nn.Module):
         super().__init__()
         self.guidance = guidance
         self.x_embedder, self.t_embedder = _Linear(actions, width), TimestepEmbedder(width)
-        self.z_embedder = _Linear(cognition, width)
-        self.z_embedder.uncondition = nn.Parameter(torch.zeros(1, cognition))
+        self.z_embedder = _Cognition(cognition, width)
         self.positional_embedding = nn.Parameter(torch.zeros(horizon + 1, width))
         self.blocks = nn.ModuleList(_Layer(width, heads) for _ in range(layers))
         self.final_layer = _Linear(width, actions)
 
     def forward(self, sample: Tensor, timestep: Tensor, cognition: Tensor) -> Tensor:
         """See the class."""
-        none = self.z_embedder.uncondition[None].expand(len(sample), -1, -1)
-        z = self.z_embedder(torch.cat([cognition, none], 0))
-        c = self.t_embedder(torch.cat([timestep, timestep], 0))[:, None] + z
+        c = self.t_embedder(torch.cat([timestep, timestep], 0))[:, None] + self.z_embedder.guided(cognition)
         x = torch.cat([c, self.x_embedder(torch.cat([sample, sample], 0))], 1) + self.positional_embedding
         for layer in self.blocks:
             x = layer(x)
@@ -183,16 +190,16 @@ def _statistics(path: Path, actions: int) -> _Statistics:
     width = high - low
     width[width == 0] = _LEAST_WIDTH  # one that never changed stays what it was
     scale, offset = np.where(mask, 2 / width, 1.0), np.where(mask, -2 * low / width - 1, 0.0)
-    switches = ()
-    if gripper:
-        ends = [end if not mask[_GRIPPER] else (end + 1) / 2 * width[_GRIPPER] + low[_GRIPPER] for end in (0.0, 1.0)]
-        switches = (Switch(_GRIPPER, 0.5, *map(float, ends)),)
-    return _Statistics(name, Affine(scale, offset), switches)
+    if gripper and mask[_GRIPPER]:
+        closed, opened = ((end + 1) / 2 * float(width[_GRIPPER]) + float(low[_GRIPPER]) for end in (0, 1))
+        gripper = (Switch(_GRIPPER, 0.5, closed, opened),)
+    return _Statistics(name, Affine(scale, offset), gripper)
 
 
 def _vector(settings: Settings, name: str, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    value = settings.values.get(name)
-    plain = isinstance(value, list) and all(type(one) in (int, float) for one in value)
-    if not plain or len(value) != count or not np.isfinite(found := np.asarray(value, np.float64)).all():
-        raise settings.refusal(name, f"{count} finite numbers")
-    return found
+    value: Any = settings.values.get(name)
+    if isinstance(value, list) and len(value) == count and all(type(one) in (int, float) for one in value):
+        found = np.array(value, np.float64)
+        if np.isfinite(found).all():
+            return found
+    raise settings.refusal(name, f"{count} finite numbers")

@@ -55,4 +55,5 @@ class TimmMlp(nn.Module):
 
 def split(x: Tensor, count: int) -> Tensor:
     """``[B, T, E]`` to ``[B, count, T, E / count]``."""
-    return x.unflatten(-1, (count, -1)).transpose(1, 2)
+    parts: Tensor = torch.unflatten(x, -1, (count, -1))
+    return parts.transpose(1, 2)

@@ -20,6 +20,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.scheduler import configured_loops
 from ttscompile.heads import cogact
 from ttscompile.heads.cogact import CogACTHead
 
@@ -74,9 +75,8 @@ def test_every_loop_clips_what_it_gives_and_nothing_before(sampler: str, tmp_pat
     module, spec = load_checkpoint_policy(path, options=LoadOptions(sampler=sampler, steps=20))
     own = spec.in_loop(f"{sampler}-20")
     assert own.sampler.bound == 1
-    plain = cogact.configured_loops(
-        {"_target_": "DDIMScheduler", **cogact._TRAINED}, 10, LoadOptions(sampler=sampler, steps=20), where="here"
-    ).others[f"{sampler}-20"]
+    settings = {"_target_": "DDIMScheduler", **cogact._TRAINED}
+    plain = configured_loops(settings, 10, LoadOptions(sampler=sampler, steps=20)).others[f"{sampler}-20"]
     noise = Noise(golden("cogact")["noise"], np.random.default_rng(0).standard_normal((20, 2, 6, 5), dtype=np.float32))
     obs = {"cognition": torch.from_numpy(golden("cogact")["cognition"])}
     found = eager_policy(module, own)(obs, noise).numpy()
@@ -122,9 +122,13 @@ def test_of_several_data_sets_none_is_chosen(tmp_path: Path) -> None:
 
 def test_the_rest_of_the_model_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Some 30 GB of it: tensors are mapped, and what is kept are copies."""
-    seen = list[bool]()
-    plain = torch.load
-    monkeypatch.setattr(torch, "load", lambda *args, **more: seen.append(more["mmap"]) or plain(*args, **more))
+    seen, plain = list[bool](), torch.load
+
+    def watched(*args: Any, **more: Any) -> Any:
+        seen.append(more["mmap"])
+        return plain(*args, **more)
+
+    monkeypatch.setattr(torch, "load", watched)
     path = save_cogact(tmp_path / "run", weights_of("cogact"), {"a": {"action": {"q01": [-1] * 5, "q99": [1] * 5}}})
     module, _ = load_checkpoint_policy(path)
     path.write_bytes(bytes(path.stat().st_size))  # who overwrites the file does not change the network

@@ -8,6 +8,7 @@ Not run by the tests. Needs a clone of microsoft/CogACT (b174a1b), and timm 0.9.
     PYTHONPATH=timm-0.9.10 python -m tests.families.golden.make_cogact path/to/CogACT
 """
 
+import importlib
 import sys
 from functools import partial
 from pathlib import Path
@@ -111,7 +112,8 @@ def robot(tiny: Any, folder: Path) -> Arrays:
     prismatic.PrismaticVLM = vlm_class  # type: ignore[attr-defined]
     package("vla", folder / "vla")
     from action_model import action_model
-    from vla import cogactvla
+
+    cogactvla: Any = importlib.import_module("vla.cogactvla")
 
     cogactvla.LlamaTokenizerFast = _Tokenizer
     whole = cogactvla.CogACT.__new__(cogactvla.CogACT)
