@@ -7,6 +7,7 @@
     python examples/benchmark/large.py --smolvla --precision int4 --only convert --output DIR     # what it is made of
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
+    python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 
 STEPS = 4
 
-WHOLE = ("smolvla", "evo1", "xvla")
-"""LeRobot's policies that are compiled whole, from what is saved of them."""
+WHOLE = ("smolvla", "evo1", "xvla", "rdt")
+"""Policies that are compiled from what is saved of them; LeRobot's are whole."""
 
 MOST_FILES = 3
 """Whose sizes are printed by name."""
@@ -124,12 +125,14 @@ def tell_sizes(directory: Path) -> None:
 def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     """Where a whole policy is saved, by which it is written unless it is there; and the instruction of evo1 alone."""
     import large_evo1
+    import large_rdt
     import large_smolvla
     import large_xvla
 
     directory = folder / name
     if not directory.exists():
-        {"smolvla": large_smolvla.save, "evo1": large_evo1.save, "xvla": large_xvla.save}[name](directory)
+        kinds = {"smolvla": large_smolvla, "evo1": large_evo1, "xvla": large_xvla, "rdt": large_rdt}
+        kinds[name].save(directory)
     return directory, large_evo1.TASK if name == "evo1" else None
 
 
@@ -147,7 +150,7 @@ def convert_clip(folder: Path) -> None:
 
 
 def run_whole(folder: Path, rounds: int, name: str) -> None:
-    """See ``large_calls``; two steps are computed. xvla's encoder has no tokens that could be reused."""
+    """See ``large_calls``; two steps are computed. No tokens can be reused of xvla's encoder, nor of RDT's, outside."""
     import large_calls
     import large_smolvla
 
@@ -158,13 +161,14 @@ def run_whole(folder: Path, rounds: int, name: str) -> None:
     module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
     original = large_smolvla.eager(module, _vision(module), spec)
     large_calls.compare(folder, "vision, prefix, loop", original, spec, 2, rounds)
-    if name != "xvla":
+    if name not in ("xvla", "rdt"):
         large_calls.reusing(folder, spec, 2, rounds + 2)
 
 
 def _vision(module: nn.Module) -> nn.Module:
-    """The image encoder of a vision-language-action model."""
-    return next(one for name, one in module.named_modules() if name.endswith(("vision_model", "vision_tower")))
+    """The image encoder of a vision-language-action model; of RDT the adaptor of its tokens."""
+    names = ("vision_model", "vision_tower", "encoder.image")
+    return next(one for name, one in module.named_modules() if name.endswith(names))
 
 
 def run_clip(folder: Path, rounds: int) -> None:
@@ -221,6 +225,7 @@ def main() -> None:
     parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
     parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
     parser.add_argument("--xvla", action="store_true", help="LeRobot's xvla, likewise")
+    parser.add_argument("--rdt", action="store_true", help="RDT-170M, likewise")
     parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")

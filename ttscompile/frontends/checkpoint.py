@@ -101,7 +101,7 @@ def read_checkpoint(path: str | os.PathLike[str], mapped: bool = False) -> dict[
         raise _unreadable(path, error) from error
     if not isinstance(payload, dict):
         found = type(payload).__name__
-        raise CheckpointError(f"{path}: holds a {found}; expected a dictionary with cfg and state_dicts.")
+        raise CheckpointError(f"{path}: holds a {found}; expected a dictionary.")
     _require_own_data(path, payload)
     return payload
 
