@@ -40,7 +40,7 @@ def pytest_configure(config: pytest.Config) -> None:
     slow there. That is no error of the test that loads it; that it warns, a test of its own checks.
     """
     if not has_integer_dot_product():
-        config.addinivalue_line("filterwarnings", "ignore:precision 'int[48]' is fast on a processor:RuntimeWarning")
+        config.addinivalue_line("filterwarnings", "ignore:precision 'int[48]' is fast on a processor:UserWarning")
     if importlib.util.find_spec("hypothesis") is not None:
         from hypothesis import HealthCheck, settings
 

@@ -201,7 +201,6 @@ def needs_care(precision: str) -> bool:
         f"precision {precision!r} is fast on a processor with integer dot products (on x86 avx512_vnni, avx_vnni or"
         f" amx_int8 among the flags in /proc/cpuinfo); found {what}. The actions are right, and gain less time: compare"
         " with a plan in fp32 (ttscompile bench), and take that where it is faster (NAME@fp32).",
-        RuntimeWarning,
         stacklevel=2,
     )
     return True

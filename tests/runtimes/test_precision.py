@@ -108,7 +108,7 @@ def test_where_sums_saturate_they_are_made_exact_and_a_warning_says_that_it_is_s
     obs, noise = random_inputs(artifact, np.random.default_rng(3), 1)
     expected = open_runtime(artifact).predict(obs, noise, artifact.plans["full"])[0]
     monkeypatch.setattr(sessions, "has_integer_dot_product", lambda: found)
-    with pytest.warns(RuntimeWarning, match=rf"avx512_vnni.*{told}.*plan.exact"):
+    with pytest.warns(UserWarning, match=rf"avx512_vnni.*{told}.*NAME@fp32"):
         careful = open_runtime(artifact, threads=threads)
     np.testing.assert_allclose(careful.predict(obs, noise, artifact.plans["full"])[0], expected, rtol=1e-5)
     open_runtime(artifact, plan=artifact.plans["dense"])  # no warning, which would be an error here

@@ -19,7 +19,6 @@ import signal
 import sys
 import threading
 import traceback
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
@@ -30,6 +29,7 @@ from typing import Any
 import click
 
 import ttscompile
+from ttscompile.cli.output import plain_warnings
 from ttscompile.errors import CalibrationFailedError, TtscompileError
 
 TRACEBACK = "--traceback"
@@ -82,7 +82,7 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
-        with _told_at_the_end(ctx.meta[_WORDS]), _ended_by_sigterm(), _plain_warnings():
+        with _told_at_the_end(ctx.meta[_WORDS]), _ended_by_sigterm(), plain_warnings():
             _require_folder()
             return super().invoke(ctx)
 
@@ -146,21 +146,6 @@ def _defect(error: BaseException, words: Sequence[str]) -> str:
     if TRACEBACK in words[1:2]:
         return "".join(traceback.format_exception(error)) + f"{told}\n{asked} the traceback above."
     return f"{told}\n{asked} the traceback: {shlex.join((words[0], TRACEBACK, *words[1:]))[:300]}"
-
-
-@contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Show a warning for users as one line, without a line of Python."""
-    usual = warnings.formatwarning
-
-    def told(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> str:
-        return f"warning: {message}\n" if category is UserWarning else usual(message, category, *where, **more)
-
-    warnings.formatwarning = told
-    try:
-        yield
-    finally:
-        warnings.formatwarning = usual
 
 
 def _require_folder() -> None:

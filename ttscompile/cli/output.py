@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -41,10 +42,26 @@ def results_console() -> Console:
     return results(150)
 
 
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Show a warning for users as one line, without a line of Python."""
+    usual = warnings.formatwarning
+
+    def told(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> str:
+        return f"warning: {message}\n" if category is UserWarning else usual(message, category, *where, **more)
+
+    warnings.formatwarning = told
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
+
+
 def run(command: click.Command) -> None:
     """Run a script's command; an error of ttscompile is its message and exit status 2."""
     try:
-        command()
+        with plain_warnings():
+            command()
     except TtscompileError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(2)

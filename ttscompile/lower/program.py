@@ -5,20 +5,22 @@ translates its operations, and ``name_model`` turns the weights' inputs into ini
 """
 
 import logging
+import operator
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import islice
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
 import onnx
 import torch
+from torch.export.graph_signature import OutputKind, OutputSpec, TensorArgument
 
 from ..errors import LoweringError
-from ..ir.evaluate import Evaluator, without_stack_traces
-from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ..ir.evaluate import resolve_enum, resolve_op, without_stack_traces
+from ..ir.graph import Argument, Batch, Enum, Graph, Node, Ref, TensorType
 from ..ir.layers import layers_graph
 from ..ir.pieces import IDLE, LAYERS, PRUNER, TAIL, of_loop
 from ..ir.program import Program
@@ -33,6 +35,12 @@ OPSET = 23
 self-attention 0.118 ms and cross-attention 0.067 ms, against 0.146 and 0.080 with what the exporter writes for 20."""
 
 _RESHAPE, _EXPAND = "aten.reshape.default", "aten.expand.default"
+
+_EQUAL = {
+    torch.ops.aten.__and__.Tensor: torch.ops.aten.bitwise_and.Tensor,
+    torch.ops.aten.__or__.Tensor: torch.ops.aten.bitwise_or.Tensor,
+}
+"""What torch's exporter would take apart, everything else with it, to find the same operation by its other name."""
 
 EXAMPLE_STREAMS = 3
 """Batch size while exporting; neither 0 nor 1, which torch.export would specialise on."""
@@ -139,9 +147,10 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
             examples.append(torch.from_numpy(np.zeros(type_.at(EXAMPLE_STREAMS), type_.dtype)))
             sizes = [(axis, n.multiple) for axis, n in enumerate(type_.shape) if isinstance(n, Batch)]
             dynamic.append({axis: multiple * streams if multiple > 1 else streams for axis, multiple in sizes})
-    with _quiet(), without_stack_traces(), torch.no_grad():
-        shapes = (tuple(dynamic),)
-        program = torch.export.export(_SideBySide(graphs), tuple(examples), dynamic_shapes=shapes, strict=False)
+    with _quiet(), torch.no_grad():
+        given = _Arguments(sum(len(graph.outputs) for graph in graphs))
+        program = torch.export.export(given, tuple(examples), dynamic_shapes=(tuple(dynamic),), strict=False)
+        _write(program, graphs)
         result = torch.onnx.export(
             program, (), dynamo=True, opset_version=OPSET, verbose=False, custom_translation_table=dict(TRANSLATIONS)
         )
@@ -149,33 +158,105 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
     return result.model_proto
 
 
-class _SideBySide(torch.nn.Module):
-    """Graphs as one module: its arguments are each graph's inputs and then its constants, graph after graph."""
+class _Arguments(torch.nn.Module):
+    """Gives so many of its arguments. What is between is written by ``_write``: tracing it would take minutes."""
 
-    def __init__(self, graphs: list[Graph]) -> None:
+    def __init__(self, results: int) -> None:
         super().__init__()
-        self._runs = []
-        for graph in graphs:
-            types = graph.types()
-            nodes = tuple(replace(node, args=_without_symbols(node, types)) for node in graph.nodes)
-            given = {**graph.inputs, **graph.constants}
-            self._runs.append((given, Evaluator(replace(graph, inputs=given, constants={}, nodes=nodes), {})))
+        self._results = results
 
     def forward(self, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        left, results = iter(values), list[torch.Tensor]()
-        for types, run in self._runs:
-            given = list(islice(left, len(types)))
-            results += run.run(given, _streams(types.values(), given))
-        return tuple(results)
+        return tuple(islice(cycle(values), self._results))
 
 
-def _streams(types: Iterable[TensorType], values: Iterable[torch.Tensor]) -> int:
-    """The number of streams, read from the shape of an input; one if nothing depends on it."""
-    for type_, value in zip(types, values, strict=True):
-        for axis, size in enumerate(type_.shape):
-            if isinstance(size, Batch):
-                return value.shape[axis] if size.multiple == 1 else value.shape[axis] // size.multiple
-    return 1
+class _Written(torch.export.ExportedProgram):
+    """A program whose operations were written, not traced."""
+
+    def run_decompositions(self, decomp_table: Any = None, **more: Any) -> torch.export.ExportedProgram:
+        """As torch's, which traces everything again, unless the table takes none of the operations apart."""
+        known = decomp_table or {}
+        if any(node.op == "call_function" and node.target in known for node in self.graph.nodes):
+            with without_stack_traces():
+                return super().run_decompositions(decomp_table, **more)
+        return self
+
+
+def _write(program: torch.export.ExportedProgram, graphs: list[Graph]) -> None:
+    """Write the operations of graphs, whose types are known, behind the arguments of a traced program."""
+    graph = program.graph_module.graph
+    for node in reversed(graph.nodes):
+        if node.op != "placeholder":
+            graph.erase_node(node)
+    arguments, results = iter(list(graph.nodes)), list[torch.fx.Node]()
+    for each in graphs:
+        given = dict(zip((*each.inputs, *each.constants), arguments, strict=False))
+        results += _Writer(graph, each, given).results()
+    graph.output(tuple(results))
+    program.graph_module.recompile()
+    outputs = [OutputSpec(OutputKind.USER_OUTPUT, TensorArgument(node.name), None) for node in results]
+    program.graph_signature.output_specs[:] = outputs
+    program.__class__ = _Written
+
+
+class _Writer:
+    """Writes the operations of one graph into a graph of torch's."""
+
+    def __init__(self, target: torch.fx.Graph, graph: Graph, given: Mapping[str, torch.fx.Node]) -> None:
+        self._target, self._graph, self._values = target, graph, dict(given)
+        self._fake = next(iter(given.values())).meta["val"].fake_mode
+        self._sizes: dict[int, torch.fx.Node] = {}
+        self._streams: Any = 1
+        for name, type_ in graph.inputs.items():
+            batch = next(
+                ((axis, size.multiple) for axis, size in enumerate(type_.shape) if isinstance(size, Batch)), None
+            )
+            if batch is not None:  # the number of streams is read from the first input that has it
+                axis, multiple = batch
+                size = given[name].meta["val"].shape[axis]
+                self._streams = size // multiple
+                self._sizes[multiple] = self._call(torch.ops.aten.sym_size.int, (given[name], axis), size)
+                if multiple != 1:
+                    self._sizes[1] = self._call(operator.floordiv, (self._sizes[multiple], multiple), self._streams)
+                break
+
+    def results(self) -> list[torch.fx.Node]:
+        """Write all of them; the graph's outputs."""
+        types = self._graph.types()
+        for node in self._graph.nodes:
+            args = [self._argument(node, each) for each in _without_symbols(node, types)]
+            named = {name: self._argument(node, each) for name, each in node.kwargs}
+            function: Any = resolve_op(node)
+            function = _EQUAL.get(function, function)
+            made = [self._tensor(type_) for type_ in node.types]
+            returns = getattr(function, "_schema", None)
+            several = returns is not None and (len(made) > 1 or isinstance(returns.returns[0].type, torch.ListType))
+            self._values[node.name] = self._call(function, tuple(args), made if several else made[0], named)
+        return [self._values[name] for name in self._graph.outputs]
+
+    def _call(self, function: Any, args: tuple[Any, ...], value: Any, named: Any = None) -> torch.fx.Node:
+        node = self._target.call_function(function, args, named)
+        node.meta |= {"val": value, "nn_module_stack": {}}
+        return node
+
+    def _tensor(self, type_: TensorType) -> torch.Tensor:
+        shape = [self._streams * size.multiple if isinstance(size, Batch) else size for size in type_.shape]
+        with self._fake:
+            return torch.empty(shape, dtype=getattr(torch, type_.dtype))
+
+    def _argument(self, node: Node, argument: Argument) -> Any:
+        match argument:
+            case Ref(name):
+                return self._values[name]
+            case Batch(multiple):
+                if multiple not in self._sizes:
+                    once = self._sizes[1]
+                    self._sizes[multiple] = self._call(operator.mul, (once, multiple), once.meta["val"] * multiple)
+                return self._sizes[multiple]
+            case Enum():
+                return resolve_enum(node, argument, torch.device("cpu"))
+            case tuple():
+                return [self._argument(node, each) for each in argument]
+        return argument
 
 
 def _without_symbols(node: Node, types: dict[str, TensorType]) -> tuple[Argument, ...]:

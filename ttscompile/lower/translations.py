@@ -4,6 +4,7 @@
                  Here the groups are the channels of an InstanceNormalization, which has a kernel.
     conv1d       onnxruntime multiplies the weights by columns of the input, one a position. With few of them most of
                  its kernel's width is empty. Here few positions are rows, multiplied by the weights.
+    transposed   Of conv_transpose1d the exporter knows another name alone, which it finds by tracing all again.
     index_copy   The exporter takes it apart into single numbers. Here whole rows are copied, along the first axis.
     attention    The exporter transposes heads forward and back. Where they are only moved for it they stay here.
 
@@ -75,6 +76,21 @@ def conv1d(
     return op.Transpose(result, perm=[0, 2, 1])
 
 
+def conv_transpose1d(
+    input: Any,
+    weight: Any,
+    bias: Any = None,
+    stride: Sequence[int] = (1,),
+    padding: Sequence[int] = (0,),
+    output_padding: Sequence[int] = (0,),
+    groups: int = 1,
+    dilation: Sequence[int] = (1,),
+) -> Any:
+    """``aten.conv_transpose1d``."""
+    given = {"strides": list(stride), "pads": [*padding, *padding], "dilations": list(dilation), "group": groups}
+    return op.ConvTranspose(input, weight, bias, output_padding=list(output_padding), **given)
+
+
 def index_copy(self: Any, dim: int, index: Any, source: Any) -> Any:
     """``aten.index_copy``: along the first axis ScatterND, which copies rows; else between transpositions."""
     if dim == 0:
@@ -135,6 +151,7 @@ def _before_heads(value: Any) -> Any:
 TRANSLATIONS: Mapping[Any, Callable[..., Any]] = {
     torch.ops.aten.group_norm.default: group_norm,
     torch.ops.aten.conv1d.default: conv1d,
+    torch.ops.aten.conv_transpose1d.default: conv_transpose1d,
     torch.ops.aten.index_copy.default: index_copy,
     torch.ops.aten.scaled_dot_product_attention.default: attention,
 }
