@@ -8,17 +8,17 @@ import diffusers
 from torch import nn
 
 from tests.families.checks import Arrays, golden
-from tests.families.dit_policy import DiTPolicyHead
-from tests.families.dita import DitaHead
 from tests.families.groot import GR00THead
 from tests.families.pi import PiHead
-from tests.families.scaledp import ScaleDPHead
 from tests.families.smolvla import SmolVLAHead
 from tests.families.weights import draw_weights
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.heads.cogact import CogACTHead
+from ttscompile.heads.dit_policy import DiTPolicyHead
+from ttscompile.heads.dita import DitaHead
 from ttscompile.heads.last_step import marked
 from ttscompile.heads.rdt import RDTConfig, RDTHead
+from ttscompile.heads.scaledp import ScaleDPConfig, ScaleDPHead
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table
 
@@ -130,7 +130,7 @@ def cogact() -> Family:
 
 def dit_policy() -> Family:
     return Family(
-        title="DiT-Policy",
+        title="DiT-Policy, read from its file",
         verified=f"dit-policy ba22ee3 `get_actions`, {UP_TO}",
         module=DiTPolicyHead(24, heads=3, layers=2, hidden=40, waves=16, horizon=6, actions=5),
         conditions=("tokens",),
@@ -141,9 +141,9 @@ def dit_policy() -> Family:
 
 def scaledp() -> Family:
     return Family(
-        title="ScaleDP (DexVLA)",
+        title="ScaleDP (DexVLA), read from its directory",
         verified=f"DexVLA fc21a82 `model_forward`, `forward`, {UP_TO}",
-        module=ScaleDPHead(24, heads=3, layers=2, hidden=20, horizon=6, actions=5, features=18, state=4),
+        module=ScaleDPHead(ScaleDPConfig(24, heads=3, layers=2, horizon=6, actions=5, features=18, state=4, hidden=20)),
         conditions=("features", "state"),
         sampler=ddim(10),
     )
@@ -151,7 +151,7 @@ def scaledp() -> Family:
 
 def dita() -> Family:
     return Family(
-        title="Dita",
+        title="Dita, read from its file",
         verified=f"Dita 66350e7 `forward`, `inference`, {UP_TO}",
         module=DitaHead(128, heads=2, hidden=80, layers=2, actions=7),
         conditions=("prefix",),

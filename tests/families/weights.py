@@ -1,4 +1,4 @@
-"""Random weights by the names of parameters, the same here and where the golden files were made."""
+"""Random weights by the names of parameters, and images, the same here and where the golden files were made."""
 
 from collections.abc import Mapping, Sequence
 
@@ -25,3 +25,8 @@ def draw_weights(shapes: Mapping[str, Sequence[int]], seed: int) -> dict[str, to
             noise = noise / np.sqrt(np.float32(noise.shape[-1]))
         drawn[key] = torch.from_numpy(noise.astype(np.float32))
     return drawn
+
+
+def uniform_images(streams: int, cameras: int, size: int, seed: int) -> np.ndarray:
+    """Square images of 0..1, ``[streams, cameras, 3, size, size]``."""
+    return np.random.default_rng(seed).random((streams, cameras, 3, size, size), dtype=np.float32)

@@ -30,14 +30,19 @@ OWN_MODULE = r"compile_denoiser\(module, spec\)"
 
 PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "inside its language"),
-    ({"parameter": {"blocks.0.weight": W}}, "Dita", r"tokens of words and frames.*dita\.py"),
+    ({"parameter": {"blocks.0.weight": W}}, "Dita", r"\.hydra/config\.yaml that its training wrote"),
     ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "config.json, and model"),
     (
         {"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}},
         "CogACT",
         "ends with .pt",
     ),
-    ({"model": {"noise_net.dec_pos": W, "noise_net.time_net.w": W}, "optim": {}}, "DiT-Policy", OWN_MODULE),
+    (
+        {"nets": {"nets": {"policy.noise_pred_net.blocks.0.attn.qkv.weight": W}}},
+        "a first stage of DexVLA's ScaleDP",
+        "second or third",
+    ),
+    ({"model": {"noise_net.dec_pos": W, "noise_net.time_net.w": W}, "optim": {}}, "DiT-Policy", r"agent_config\.yaml"),
     (
         {"state_dict": {"model.inner_model.blocks.0.mlp.router.weight": W}, "pytorch-lightning_version": "2"},
         "a mixture of experts",
@@ -100,7 +105,7 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["config.json", "checkpoints/step-1.pt"], r"a directory of checkpoints .told by checkpoints/step-1\.pt"),
     (["config.json=model_type=Gr00tN1d7", "model-00001.safetensors"], r"N1\.7 as NVIDIA saves it.*save_pretrained"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
-    (["config.json=policy_head_type=scale_dp_policy", "model.safetensors"], r"DexVLA.*scaledp\.py"),
+    (["config.json=policy_head_type=unet_diffusion_policy", "model.safetensors"], "DexVLA.*whose head is a U-Net"),
     (["pytorch_model.bin"], "a directory of weights"),
     (["README.md"], r"found README\.md; expected the config\.json and model\.safetensors"),
     ([], "found nothing"),

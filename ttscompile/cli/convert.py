@@ -72,7 +72,7 @@ def convert(
     as_json: bool,
     **of_checkpoint: Any,  # the options of families: ttscompile.convert takes them by the same names
 ) -> None:
-    """Compile CHECKPOINT, a trained policy of Diffusion Policy or LeRobot. Nothing in it is executed.
+    """Compile CHECKPOINT, a trained policy of Diffusion Policy, LeRobot and others. Nothing in it is executed.
 
     It is a path, or hf://ORGANISATION/NAME[@REVISION][/PATH] on the Hugging Face hub.
 

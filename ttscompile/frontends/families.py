@@ -28,6 +28,7 @@ DIFFUSION_SAMPLERS = ("ddpm", "ddim", "dpmsolver++")
 
 SAMPLERS = (*DIFFUSION_SAMPLERS, *METHODS)
 SPACINGS = ("leading", "trailing", "linspace")
+DIFFUSION_OPTIONS = frozenset({"sampler", "steps", "spacing", "loops"})
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class Family:
     kind: Literal["file", "directory"]
     detect: Callable[[Path], bool]
     module: str
-    options: frozenset[str]
+    options: frozenset[str] = DIFFUSION_OPTIONS
 
     def load(self, path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
         """Load a checkpoint of this family."""
@@ -95,10 +96,10 @@ class Family:
         return import_module(f".{self.module}", __package__).load(path, options)  # type: ignore[no-any-return]
 
 
-def _says(path: Path, entry: str) -> bool:
-    """Whether a directory has a ``config.json`` with an entry; a compiled policy may have one, and has a manifest."""
+def _config(path: Path) -> Mapping[str, object]:
+    """Entries of a directory's ``config.json``; none of an artifact's, which may have one as well, and a manifest."""
     config = path / "config.json"
-    return not (path / "manifest.json").is_file() and config.is_file() and entry in read_json(config)
+    return {} if (path / "manifest.json").is_file() or not config.is_file() else read_json(config)
 
 
 def _begins_with(path: Path, word: bytes) -> bool:
@@ -113,18 +114,41 @@ FAMILIES = (
         title="LeRobot",
         reads="a directory that lerobot's save_pretrained wrote, with config.json and model.safetensors",
         kind="directory",
-        detect=lambda path: _says(path, "type"),
+        detect=lambda path: "type" in _config(path),
         module="lerobot",
-        options=frozenset({"sampler", "steps", "spacing", "loops", "task", "encoders", "without_cameras", "base"}),
+        options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras", "base"},
+    ),
+    Family(
+        name="scaledp",
+        title="DexVLA",
+        reads="a directory that DexVLA's training saved, with config.json and safetensors",
+        kind="directory",
+        detect=lambda path: "scale_dp_policy" in map(_config(path).get, ("policy_head_type", "model_type")),
+        module=".heads.scaledp",
+    ),
+    Family(
+        name="dit_policy",
+        title="DiT-Policy",
+        reads="a .ckpt file of DiT-Policy with agent_config.yaml beside it",
+        kind="file",
+        detect=lambda path: path.is_file() and (path.parent / "agent_config.yaml").is_file(),
+        module=".heads.dit_policy",
+    ),
+    Family(
+        name="dita",
+        title="Dita",
+        reads="a .pth file of Dita with .hydra/config.yaml in its folder or in the one above",
+        kind="file",
+        detect=lambda at: at.suffix == ".pth" and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
+        module=".heads.dita",
     ),
     Family(
         name="rdt",
         title="RDT",
         reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
         kind="directory",
-        detect=lambda path: _says(path, "lang_adaptor"),
+        detect=lambda path: "lang_adaptor" in _config(path),
         module=".heads.rdt",
-        options=frozenset({"sampler", "steps", "spacing", "loops"}),
     ),
     Family(
         name="cogact",
@@ -133,7 +157,6 @@ FAMILIES = (
         kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"action_model"),
         module=".heads.cogact",
-        options=frozenset({"sampler", "steps", "spacing", "loops"}),
     ),
     Family(
         name="diffusion_policy",
@@ -143,7 +166,6 @@ FAMILIES = (
         # Every file that no other family takes: its module names what a file is that is none of its own.
         detect=lambda path: not path.is_dir(),
         module="diffusion_policy",
-        options=frozenset({"sampler", "steps", "spacing", "loops"}),
     ),
 )
 

@@ -18,8 +18,7 @@ from .settings import read_json
 
 _BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
-_DITA = f"{_HEAD} For Dita they are the tokens of words and frames; examples/vla/dita.py does it."
-_SCALEDP = f"{_HEAD} examples/vla/scaledp.py does it for its policy_head, ScaleDP."
+_DITA = "Give the .pth file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
 _INNER = "Give its folder pretrained_model."
@@ -96,7 +95,7 @@ DIRECTORIES = (
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
-    Refusal(r"^config\.json: (policy_head|model)_type=scale_dp", "DexVLA or its ScaleDP", _SCALEDP),
+    Refusal(r"^config\.json: policy_head_type=unet", "a DexVLA or DiVLA whose head is a U-Net", _HEAD),
     Refusal(r"\.ckpt$|^checkpoints/[^/]+\.pt$", "a directory of checkpoints", "Give one of the files in it."),
     Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
 )
@@ -130,7 +129,8 @@ STATES = (
     Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
-    Refusal(r"(^|\.)noise_net\.|(^|\.)time_net\.", "a checkpoint of DiT-Policy", _HEAD),
+    Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
+    Refusal(r"(^|\.)(noise|time)_net\.", "a checkpoint of DiT-Policy", "Put its agent_config.yaml beside it."),
     Refusal(
         r"\.router\.|\.experts?\.\d+\.",
         "a mixture of experts (MoDE, say)",
