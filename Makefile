@@ -43,7 +43,7 @@ types: $(READY)
 	rm -rf $(TYPED)
 	mkdir -p $(TYPED)/recipes
 	cp -Rp ttscompile tests examples plugins/lerobot_policy_ttscompile $(TYPED)
-	cp -Rp passes runtimes plugins/heads plugins/rivals $(TYPED)/ttscompile
+	cp -Rp passes runtimes plugins/policies plugins/rivals $(TYPED)/ttscompile
 	mv $(TYPED)/examples/policies/*.py $(TYPED)/recipes
 	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 

@@ -8,7 +8,7 @@ COPY CHANGELOG.md LICENSE MANIFEST.in README.md constraints.txt pyproject.toml .
 COPY ttscompile ttscompile
 COPY passes passes
 COPY runtimes runtimes
-COPY plugins/heads plugins/heads
+COPY plugins/policies plugins/policies
 COPY plugins/rivals plugins/rivals
 ARG PIP_FLAGS=""
 RUN python3 -m venv /opt/ttscompile \

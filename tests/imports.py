@@ -11,7 +11,7 @@ PACKAGES = {
     "ttscompile": "ttscompile",
     "passes": "ttscompile.passes",
     "runtimes": "ttscompile.runtimes",
-    "plugins/heads": "ttscompile.heads",
+    "plugins/policies": "ttscompile.policies",
     "plugins/rivals": "ttscompile.rivals",
 }
 """Folder of the tree -> package that it is installed as."""

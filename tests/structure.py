@@ -21,7 +21,7 @@ FLOORS = (
     ("core", "measure"),
     ("hub", "ir", "plots", "samplers"),
     ("artifact", "frontends", "lower", "passes", "trajectories"),
-    ("capture", "heads", "pool", "runtimes"),
+    ("capture", "policies", "pool", "runtimes"),
     ("doctor", "verification"),
     ("calibration", "driver", "report"),
     ("builder", "rivals"),

@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "lower": BASE | {"ir"},
     "passes": BASE | {"ir"},
     "frontends": BASE | {"hub", "samplers"},
-    "heads": BASE | {"frontends", "samplers"},
+    "policies": BASE | {"frontends", "samplers"},
     "capture": BASE | {"frontends", "ir"},
     "artifact": BASE | {"ir"},
     "runtimes": BELOW_ARTIFACT | {"hub"},
@@ -72,7 +72,7 @@ COMPILES = (
     "ttscompile.capture",
     "ttscompile.driver",
     "ttscompile.frontends",
-    "ttscompile.heads",
+    "ttscompile.policies",
     "ttscompile.ir.evaluate",
     "ttscompile.ir.idle_form",
     "ttscompile.ir.tokens",
@@ -224,7 +224,7 @@ def test_passes_and_runtimes_import_what_is_outside_of_them_by_whole_names() -> 
     assert leaving("ttscompile.runtimes.base", "from ..errors import X") == [1]
     assert leaving("ttscompile.runtimes.executor.state", "from ..base import X\nfrom ...errors import X") == [2]
     for name, path in MODULES.items():
-        if part(name) in ("heads", "passes", "rivals", "runtimes"):
+        if part(name) in ("policies", "passes", "rivals", "runtimes"):
             depth = name if path.name != "__init__.py" else f"{name}.__init__"
             assert leaving(depth, path.read_text()) == [], name
 

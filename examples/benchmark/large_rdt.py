@@ -8,7 +8,7 @@ import torch
 from large_smolvla import random_weight, write_json
 
 from ttscompile.frontends.settings import Settings
-from ttscompile.heads.rdt import CONFIG, PICKLED, RDTHead, read_config
+from ttscompile.policies.rdt import CONFIG, PICKLED, RDTHead, read_config
 
 ENTRIES = {
     "action_dim": 128,

@@ -13,12 +13,12 @@ from tests.families.pi import PiHead
 from tests.families.smolvla import SmolVLAHead
 from tests.families.weights import draw_weights
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
-from ttscompile.heads.cogact import CogACTHead
-from ttscompile.heads.dit_policy import DiTPolicyHead
-from ttscompile.heads.dita import DitaHead
-from ttscompile.heads.last_step import marked
-from ttscompile.heads.rdt import RDTConfig, RDTHead
-from ttscompile.heads.scaledp import ScaleDPConfig, ScaleDPHead
+from ttscompile.policies.cogact import CogACTHead
+from ttscompile.policies.dit_policy import DiTPolicyHead
+from ttscompile.policies.dita import DitaHead
+from ttscompile.policies.last_step import marked
+from ttscompile.policies.rdt import RDTConfig, RDTHead
+from ttscompile.policies.scaledp import ScaleDPConfig, ScaleDPHead
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table
 

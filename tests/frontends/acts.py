@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from ttscompile.frontends.lerobot_act import ACT, ACTConfig, as_saved, read_config
 from ttscompile.frontends.lerobot_config import ENVIRONMENT, STATE
+from ttscompile.policies.lerobot_act import ACT, ACTConfig, as_saved, read_config
 
 from .hybrid import Array, fill
 from .lerobot_tiny import write_json, write_processors

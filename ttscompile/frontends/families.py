@@ -124,7 +124,7 @@ FAMILIES = (
         reads="a directory that DexVLA's training saved, with config.json and safetensors",
         kind="directory",
         detect=lambda path: "scale_dp_policy" in map(_config(path).get, ("policy_head_type", "model_type")),
-        module=".heads.scaledp",
+        module=".policies.scaledp",
     ),
     Family(
         name="dit_policy",
@@ -132,7 +132,7 @@ FAMILIES = (
         reads="a .ckpt file of DiT-Policy with agent_config.yaml beside it",
         kind="file",
         detect=lambda path: path.is_file() and (path.parent / "agent_config.yaml").is_file(),
-        module=".heads.dit_policy",
+        module=".policies.dit_policy",
     ),
     Family(
         name="dita",
@@ -140,7 +140,7 @@ FAMILIES = (
         reads="a .pth file of Dita with .hydra/config.yaml in its folder or in the one above",
         kind="file",
         detect=lambda at: at.suffix == ".pth" and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
-        module=".heads.dita",
+        module=".policies.dita",
     ),
     Family(
         name="rdt",
@@ -148,7 +148,7 @@ FAMILIES = (
         reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
         kind="directory",
         detect=lambda path: "lang_adaptor" in _config(path),
-        module=".heads.rdt",
+        module=".policies.rdt",
     ),
     Family(
         name="cogact",
@@ -156,7 +156,7 @@ FAMILIES = (
         reads="a .pt file of CogACT",
         kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"action_model"),
-        module=".heads.cogact",
+        module=".policies.cogact",
     ),
     Family(
         name="diffusion_policy",

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import ttscompile
 from tests.families.checks import golden, rounded
 from tests.families.weights import draw_weights
-from tests.heads.saved import save_cogact, weights_of
+from tests.policies.saved import save_cogact, weights_of
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.cli import main
 from ttscompile.core.spec import Noise
@@ -21,8 +21,8 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_loops
-from ttscompile.heads import cogact
-from ttscompile.heads.cogact import CogACTHead
+from ttscompile.policies import cogact
+from ttscompile.policies.cogact import CogACTHead
 
 LOW, HIGH = [-0.5, -1.0, 0.0, -2.0, 0.25, 0.5, 0.0], [0.5, 3.0, 0.5, -1.0, 0.25, 1.0, 1.0]
 MASK = [True, True, True, True, True, True, False]

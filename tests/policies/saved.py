@@ -9,7 +9,7 @@ import torch
 from tests.families.checks import Arrays, golden
 from tests.families.heads import FAMILIES
 from tests.families.weights import draw_weights
-from ttscompile.heads.rdt import RDTConfig, RDTHead
+from ttscompile.policies.rdt import RDTConfig, RDTHead
 
 RDT: dict[str, Any] = {
     "action_dim": 5,

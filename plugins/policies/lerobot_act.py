@@ -21,16 +21,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..core.spec import PolicySpec
-from ..errors import CheckpointError
-from ..samplers.table import DirectDenoiser, direct_table
-from .families import LoadOptions
-from .lerobot_config import ENVIRONMENT, MOST, STATE, LeRobotConfig, read_lerobot_config
-from .lerobot_policy import Measured, policy_spec, read_weights
-from .lerobot_processors import Processors, read_processors
-from .loops import Loops
-from .resnet import CHANNELS, DEPTHS, resnet
-from .saved_weights import require_weights
+from ttscompile.core.spec import PolicySpec
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.lerobot_config import ENVIRONMENT, MOST, STATE, LeRobotConfig, read_lerobot_config
+from ttscompile.frontends.lerobot_policy import Measured, policy_spec, read_weights
+from ttscompile.frontends.lerobot_processors import Processors, read_processors
+from ttscompile.frontends.loops import Loops
+from ttscompile.frontends.resnet import CHANNELS, DEPTHS, resnet
+from ttscompile.frontends.saved_weights import require_weights
+from ttscompile.samplers.table import DirectDenoiser, direct_table
 
 _PROJECTION = "encoder_{}_state_input_proj"
 

@@ -17,7 +17,7 @@ from ttscompile.cli import main
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions, find_family
-from ttscompile.heads.dita import DitaHead
+from ttscompile.policies.dita import DitaHead
 
 CONFIG: dict[str, Any] = {
     "task_name": "calvin_exp",

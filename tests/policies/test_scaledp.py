@@ -17,7 +17,7 @@ from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.cli import main
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.heads.scaledp import ScaleDPConfig, ScaleDPHead
+from ttscompile.policies.scaledp import ScaleDPConfig, ScaleDPHead
 
 SIZES = {"n_emb": 24, "num_heads": 3, "depth": 2, "prediction_horizon": 6, "cond_dim": 18, "state_dim": 4}
 HEAD: dict[str, Any] = SIZES | {

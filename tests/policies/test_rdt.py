@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 import ttscompile
 from tests.families.checks import golden, rounded
-from tests.heads.saved import RDT, rdt_observation, rdt_with, save_rdt, weights_of
+from tests.policies.saved import RDT, rdt_observation, rdt_with, save_rdt, weights_of
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile.cli import main
 from ttscompile.core.spec import Noise
