@@ -149,7 +149,7 @@ def in_bfloat16(time_embedding: Callable[[Any], Any]) -> MakeStep:
         def step() -> torch.Tensor:
             chosen = training.frames[rng.integers(len(training.frames), size=training.batch)]
             loss: torch.Tensor = faster.compute_loss({"obs": training.obs[chosen], "action": training.action[chosen]})
-            loss.backward()  # type: ignore[no-untyped-call]  # of torch
+            loss.backward()
             for weight, fast in pairs:
                 weight.grad, fast.grad = (None if fast.grad is None else fast.grad.float()), None
             torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
@@ -169,6 +169,11 @@ def _half(given: Any) -> Any:
     return given.bfloat16() if torch.is_tensor(given) and given.is_floating_point() else given
 
 
+def _as_told(mask: torch.Tensor | None, is_causal: bool | None = None, size: int | None = None) -> bool:
+    """Whether a mask is causal. Torch's decoder would look into the mask, and wait for the GPU, which no graph can."""
+    return bool(is_causal)
+
+
 def captured(loss_of: Callable[[Any, torch.Tensor, torch.Tensor], torch.Tensor]) -> MakeStep:
     """Steps on a GPU, each a CUDA graph with its examples, noise, gradients and optimiser; products are in TF32.
 
@@ -179,8 +184,7 @@ def captured(loss_of: Callable[[Any, torch.Tensor, torch.Tensor], torch.Tensor])
 
     def make(training: Training) -> Callable[[], torch.Tensor]:
         torch.backends.cuda.matmul.allow_tf32 = True
-        # By default torch's decoder looks into its mask to see whether it is causal, and waits for the GPU.
-        torch.nn.modules.transformer._detect_is_causal_mask = lambda mask, causal, size: bool(causal)  # type: ignore[attr-defined]
+        torch.nn.modules.transformer._detect_is_causal_mask = _as_told
         policy, optimizer = training.workspace.model, training.workspace.optimizer
         policy.noise_scheduler.alphas_cumprod = policy.noise_scheduler.alphas_cumprod.to(training.obs.device)
         trained = [weight for weight in policy.parameters() if weight.requires_grad]
@@ -195,7 +199,7 @@ def captured(loss_of: Callable[[Any, torch.Tensor, torch.Tensor], torch.Tensor])
             rows = torch.randint(len(training.frames), (training.batch,), device=training.frames.device)
             chosen = training.frames[rows]
             loss = loss_of(policy, training.obs[chosen], training.action[chosen])
-            loss.backward()  # type: ignore[no-untyped-call]  # of torch
+            loss.backward()
             torch.nn.utils.clip_grad_norm_(trained, 1.0, foreach=True)
             optimizer.step()
             return loss.detach()

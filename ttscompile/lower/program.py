@@ -177,7 +177,8 @@ class _Written(torch.export.ExportedProgram):
         known = decomp_table or {}
         if any(node.op == "call_function" and node.target in known for node in self.graph.nodes):
             with without_stack_traces():
-                return super().run_decompositions(decomp_table, **more)
+                made: torch.export.ExportedProgram = super().run_decompositions(decomp_table, **more)
+                return made
         return self
 
 

@@ -90,7 +90,7 @@ def load_trajectories(
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
     how = observations, action_steps, sources or {}, instruction
-    for episode in [each for path in paths for each in _read(*local(path), *how)]:
+    for episode in [each for path in paths for each in _read(local(path), *how)]:
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
@@ -110,13 +110,13 @@ def local(path: str | os.PathLike[str]) -> tuple[Path, Mapping[str, int]]:
 
 
 def _read(
-    path: Path,
-    part: Mapping[str, int],
+    where: tuple[Path, Mapping[str, int]],
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
     given: Mapping[str, Sequence[str]],
     instruction: Instruction | None,
 ) -> list[Episode]:
+    path, limits = where
     sources = {key: parts for key, parts in given.items() if key != TASK}
     words = instruction if TASK in given else None
     if TASK in given and words is None:
@@ -125,7 +125,7 @@ def _read(
     text = {words.tokens, words.mask} if words else set()
     seen = {key: spec for key, spec in observations.items() if key not in text}
     used = {part.partition(":")[0] for key in seen for part in sources.get(key, (key,))} | ({TASK} & set(given))
-    other, held, frames = _opened(path, part, sorted(used))
+    other, held, frames = _opened(path, limits, sorted(used))
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
@@ -166,11 +166,11 @@ def recorded_names(path: Path) -> tuple[list[str], bool]:
     return list(held.names), frames
 
 
-def _opened(path: Path, part: Mapping[str, int], wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
+def _opened(path: Path, limits: Mapping[str, int], wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
     """What a file is that is no ``.npz``, what it holds, and whether that is frames."""
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
     other = _other_format(path)
-    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted, **part), True))
+    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted, **limits), True))
 
 
 def _npz(path: Path) -> tuple[Frames, bool]:
