@@ -75,8 +75,6 @@ NAMES = [
     ("RobomimicImagePolicy", "a policy without diffusion"),
     ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("TEDiUnetLowdimPolicy", "Streaming Diffusion Policy.*is not compiled"),
-    ("KarrasUnetHybridImagePolicy", "a teacher of Consistency Policy.*EDMDenoiser"),
-    ("CTMPPUnetHybridImagePolicy", f"a student of Consistency Policy.*{OWN_MODULE}.*nothing can be reused"),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
 ]
 

@@ -10,8 +10,8 @@ import torch
 
 from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from ttscompile.frontends.diffusion_policy_images import MultiImageEncoder, View
-from ttscompile.frontends.dp3 import PointCloudEncoder, PointNet
 from ttscompile.frontends.resnet import group_norm
+from ttscompile.policies.dp3 import PointCloudEncoder, PointNet
 
 from . import hybrid
 from .hybrid import Array

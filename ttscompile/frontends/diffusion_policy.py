@@ -6,6 +6,7 @@ for all of them is here; each kind of policy is a row of ``_POLICIES``.
 """
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,23 @@ from torch import nn
 
 from ..core.spec import ChunkSpec, PolicySpec
 from ..errors import CheckpointError
-from . import diffusion_policy_transformer as transformer, diffusion_policy_unet as unet, dp3
+from . import diffusion_policy_transformer as transformer, diffusion_policy_unet as unet
 from .checkpoint import plain_config, read_checkpoint
 from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved, affine, choose_weights
 from .families import LoadOptions
 from .interpolation import Config
+from .loops import loops_of
 from .refusals import refuse_file, refuse_payload, refuse_policy
 from .scheduler import configured_loops
 from .settings import Settings
+
+_STUDENT = "CTMPPUnetHybridImagePolicy"
+
+
+def _beside(module: str, which: str) -> Callable[[Saved], Rebuilt]:
+    """A function of a policy beside those of the core, which is imported when it is called."""
+    return lambda saved: getattr(import_module(f"..policies.{module}", __package__), which)(saved)
+
 
 _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "DiffusionTransformerLowdimPolicy": transformer.low_dim,
@@ -28,8 +38,10 @@ _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "DiffusionUnetLowdimPolicy": unet.low_dim,
     "DiffusionUnetHybridImagePolicy": unet.hybrid,
     "DiffusionUnetImagePolicy": unet.images,
-    "DP3": dp3.full,
-    "SimpleDP3": dp3.simple,
+    "DP3": _beside("dp3", "full"),
+    "SimpleDP3": _beside("dp3", "simple"),
+    "KarrasUnetHybridImagePolicy": _beside("consistency_policy", "teacher"),
+    _STUDENT: _beside("consistency_policy", "student"),
 }
 """By the class name of the original policy."""
 
@@ -57,17 +69,22 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     name = str(config.require("policy._target_")).rpartition(".")[2]
     if name not in _POLICIES:
         refuse_policy(name)
-    weights, which = choose_weights(payload["state_dicts"], config.get("training.use_ema"))
+    # A student averages its weights beside them, whatever use_ema says, and evaluates those that it trains.
+    use_ema = config.get("training.use_ema") if name != _STUDENT else False
+    weights, which = choose_weights(payload["state_dicts"], use_ema)
     policy = config.require("policy")
     if not isinstance(policy.get("noise_scheduler"), dict):
-        raise CheckpointError("cfg.policy.noise_scheduler is missing; expected the settings of a diffusers scheduler.")
+        raise CheckpointError("cfg.policy.noise_scheduler is missing; expected the settings of a scheduler.")
     saved = Saved(config, Settings(policy, "cfg.policy."), weights)
     rebuilt = _POLICIES[name](saved)
     # The original slices action_pred[:, start : start + Ta], which ends with the horizon.
     stop = min(rebuilt.start + saved.settings.number("n_action_steps"), rebuilt.sample[0])
     step_arguments = {key: policy[key] for key in policy if key not in COMMON_KEYS | rebuilt.known}
     scheduler, steps = policy["noise_scheduler"], policy.get("num_inference_steps")
-    loops = configured_loops(scheduler, steps, options, step_arguments=step_arguments)
+    if rebuilt.make is None:
+        loops = configured_loops(scheduler, steps, options, step_arguments=step_arguments)
+    else:
+        loops = loops_of(rebuilt.make, options, str(scheduler.get("solver")))
     source = {"format": "diffusion_policy", "policy": name, "variant": rebuilt.variant, "weights": which}
     spec = PolicySpec(
         sample=rebuilt.sample,

@@ -18,6 +18,7 @@ from torch import nn
 from ..core.spec import Affine, ObservationSpec
 from ..errors import CheckpointError
 from .interpolation import Config
+from .loops import Make
 from .saved_weights import as_float32, require_weights
 from .settings import Settings, is_shape
 
@@ -142,6 +143,7 @@ class Rebuilt:
         action_dim: Da, the first of D channels.
         known: names of the settings of ``cfg.policy`` that were read, beside those that all have. The others are what
             the policy hands to every step of its scheduler.
+        make: its loop, where ``noise_scheduler`` is none of diffusers'.
     """
 
     module: nn.Module
@@ -151,6 +153,7 @@ class Rebuilt:
     start: int
     variant: str
     known: frozenset[str]
+    make: Make | None = None
 
 
 def read_shape_meta(settings: Settings, *types: str) -> tuple[int, Observed]:

@@ -69,16 +69,6 @@ POLICIES = (
         "A compiled policy denoises each chunk from one noise level, so this one is not compiled.",
     ),
     Refusal(
-        r"^karras",
-        "a teacher of Consistency Policy, a U-Net under EDM",
-        f"{_BUILD}: ttscompile.EDMDenoiser(network, sigmas, sigma_data) is the module, edm_table its sampler.",
-    ),
-    Refusal(
-        r"^ctmpp",
-        "a student of Consistency Policy, which evaluates its network once, or a few times",
-        f"{_BUILD}. In one evaluation nothing can be reused; eight bits and frames that are known remain.",
-    ),
-    Refusal(
         r"transformer|unet",
         "a diffusion policy with another observation encoder than those that are read",
         f"{_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",

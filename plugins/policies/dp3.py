@@ -14,11 +14,19 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..errors import CheckpointError
-from .diffusion_policy_parts import COMMON_KEYS, Observed, Rebuilt, Saved, Weights, read_shape_meta, require_room
-from .diffusion_policy_unet import DEFAULTS, behind_encoder
-from .saved_weights import require_weights
-from .settings import Settings
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.diffusion_policy_parts import (
+    COMMON_KEYS,
+    Observed,
+    Rebuilt,
+    Saved,
+    Weights,
+    read_shape_meta,
+    require_room,
+)
+from ttscompile.frontends.diffusion_policy_unet import DEFAULTS, behind_encoder
+from ttscompile.frontends.saved_weights import require_weights
+from ttscompile.frontends.settings import Settings
 
 POINTS, STATE, ROBOT = "point_cloud", "agent_pos", "imagin_robot"
 """Keys of the observation: the points seen, the robot's state, and points of the robot that are added to those seen."""
