@@ -132,9 +132,9 @@ def test_a_build_of_another_checkpoint_is_not_resumed(
     (directory / STATE).touch()
     monkeypatch.setattr(builder, "calibrate", lambda *_, **__: None)
     converting(seed=0)
-    ttscompile.build("policy.ckpt", directory, [], resume=True)
+    ttscompile.build("policy.ckpt", directory, ["calls.npz"], resume=True)
     converting(seed=1)
     with pytest.raises(CalibrationError, match="found another model. Leave --resume out"):
-        ttscompile.build("other.ckpt", directory, [], resume=True)
+        ttscompile.build("other.ckpt", directory, ["calls.npz"], resume=True)
     assert read_manifest(directory).model_identity == before
     assert [path.name for path in tmp_path.iterdir()] == ["compiled"], "nothing is left beside it"
