@@ -1,6 +1,6 @@
-"""Policies beside those of the core: action heads as their authors' code saved them, LeRobot's ``act``, and others.
+"""Policies beside those of the core, as their authors' code saved them; and LeRobot's ``act``, which has no loop.
 
-Each is one module with the network and ``load``, and one row: in ``ttscompile/frontends/families.py``, for a type of
-LeRobot's in ``frontends/lerobot.py``, or for a policy of Diffusion Policy's workspace in
-``frontends/diffusion_policy.py``. What the rest of a model gives a head is what the head observes.
+Each is one module with the network and its loading, and one row: in ``frontends/families.py``, for a class of Diffusion
+Policy's kind in ``diffusion_policy.py``, or for a type of LeRobot's in ``lerobot.py``. Of an action head the
+observations are what the rest of its model gives it.
 """

@@ -28,6 +28,7 @@ from ttscompile.frontends.scheduler import MOST_TIMESTEPS
 from ttscompile.frontends.settings import Settings, read_json
 
 from .dit_policy_tokens import CAMERA, PIXELS, STATE, Observed, Tokens, TokensConfig
+from .layers import ModulatedFinal
 from .loops import ddim_loops
 from .yaml_files import read_yaml
 
@@ -100,13 +101,6 @@ class _Time(nn.Module):
         return self.out_net(torch.cat([angle.cos(), angle.sin()], 1))  # type: ignore[no-any-return]
 
 
-class _Final(nn.Module):
-    def __init__(self, width: int, actions: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(width, actions)
-        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * width))
-
-
 class DiTPolicyHead(nn.Module):
     """``forward_dec(forward_enc(tokens))``; inputs ``sample [B, T, D]``, ``timestep [B]``, ``tokens [B, S, E]``."""
 
@@ -123,7 +117,7 @@ class DiTPolicyHead(nn.Module):
         self.decoder: Any = nn.Module()
         self.encoder.layers = nn.ModuleList(_Encoder(width, heads, hidden) for _ in range(layers))
         self.decoder.layers = nn.ModuleList(_Decoder(width, heads, hidden) for _ in range(layers))
-        self.eps_out = _Final(width, actions)
+        self.eps_out = ModulatedFinal(width, actions)
 
     def forward(self, sample: Tensor, timestep: Tensor, tokens: Tensor) -> Tensor:
         """See the class."""
@@ -179,20 +173,13 @@ def _weights(path: Path) -> dict[str, Tensor]:
     return as_float32({name: value for name, value in model.items() if not str(name).endswith(_UNREAD)}, f"{path}: ")
 
 
-def _part(settings: Settings, name: str) -> Settings:
-    part = settings.values.get(name)
-    if not isinstance(part, dict):
-        raise settings.refusal(name, "settings by name")
-    return Settings(part, f"{settings.where}{name}.", settings.remedy)
-
-
 def _tokens_config(settings: Settings) -> TokensConfig:
-    features = _part(settings, "features")
+    features = settings.part("features")
     features.choice("_target_", _RESNET_CLASS)
     network = f"resnet{features.number('size')}"
     if network not in DEPTHS:
         raise features.refusal("size", " or ".join(name.removeprefix("resnet") for name in DEPTHS))
-    norm = _part(features, "norm_cfg")
+    norm = features.part("norm_cfg")
     grouped = norm.choice("name", "group_norm", "diffusion_policy") == "group_norm"
     groups = norm.number("num_groups", 16, 64) if grouped else None
     if groups is not None and 64 % groups:  # of the narrowest layer
@@ -217,7 +204,7 @@ def _tokens_config(settings: Settings) -> TokensConfig:
 
 def _head_sizes(settings: Settings, tokens: TokensConfig) -> tuple[dict[str, int], int, int]:
     """Sizes of the layers, steps of a chunk, and numbers of an action."""
-    sizes = _part(settings, "noise_net_kwargs")
+    sizes = settings.part("noise_net_kwargs")
     sizes.require(activation="gelu")
     head = {
         "width": sizes.number("hidden_dim", 512, _MOST),

@@ -170,12 +170,9 @@ def config_files(path: Path) -> tuple[Path, Path]:
 
 def _lengths(settings: Settings) -> tuple[int, int]:
     """Steps of the sample, and those of them that are actions to come; the others are of the frames before the last."""
-    dataset = settings.values.get("dataset")
-    if not isinstance(dataset, dict):
-        raise settings.refusal("dataset", "settings by name")
+    own = settings.part("dataset")
     predicted = settings.number("num_pred_action", 1, _MOST_STEPS)
     wrapped = settings.number("wrap_grmg_data", 0, 2, least=0)
-    own = Settings(dataset, f"{settings.where}dataset.", settings.remedy)
     horizon = predicted + wrapped - 1 if wrapped else own.number("traj_length", most=_MOST_STEPS)
     if predicted > horizon:
         raise settings.refusal("num_pred_action", f"{horizon} at most, of dataset.traj_length")

@@ -136,10 +136,7 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
 def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointCloudEncoder:
     coloured = settings.flag("use_pc_color", False)
     settings.choice("pointnet_type", "pointnet")
-    values = settings.values.get("pointcloud_encoder_cfg")
-    cloud = Settings(values if isinstance(values, dict) else {}, f"{settings.where}pointcloud_encoder_cfg.")
-    if not isinstance(values, dict):
-        raise settings.refusal("pointcloud_encoder_cfg", "the settings of a PointNet")
+    cloud = settings.part("pointcloud_encoder_cfg")
     for key, axes in ((POINTS, 2), (STATE, 1), (ROBOT, 2)):
         if key == ROBOT and key not in observed:
             continue

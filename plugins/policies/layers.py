@@ -25,6 +25,15 @@ class TimestepEmbedder(nn.Module):
         return embedded
 
 
+class ModulatedFinal(nn.Module):
+    """The parameters of a last layer whose shift and scale depend on the condition; each head applies them its way."""
+
+    def __init__(self, width: int, actions: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(width, actions)
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * width))
+
+
 class TimmAttention(nn.Module):
     """timm's self-attention: one projection for query, key and value."""
 

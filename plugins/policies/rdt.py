@@ -12,7 +12,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -195,7 +194,7 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     where = directory / CONFIG
     settings = Settings(read_json(where), f"{where}: ", "Give the folder as RDT's save_pretrained wrote it.")
     config = read_config(settings)
-    scheduler = _part(settings, "noise_scheduler")
+    scheduler = settings.part("noise_scheduler")
     scheduler.require(prediction_type="sample")
     sampler = {
         "_target_": "DPMSolverMultistepScheduler",  # whatever the type: DDPM is of the training
@@ -220,7 +219,7 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
 
 def read_config(settings: Settings) -> RDTConfig:
     """Sizes and variant, of the entries that ``RDTRunner`` was made with."""
-    rdt = _part(settings, "rdt")
+    rdt = settings.part("rdt")
     width, heads = rdt.number("hidden_size", most=_MOST), rdt.number("num_heads", most=_MOST)
     if width % heads or width // heads < 2:  # the deviation of one number is none
         raise rdt.error(f"hidden_size is {width} with {heads} heads; expected a multiple of the heads, twice at least")
@@ -251,13 +250,6 @@ def observed(config: RDTConfig) -> dict[str, ObservationSpec]:
         "action_mask": ObservationSpec((1, config.actions), window=False, bounds=(0.0, 1.0)),
         "ctrl_freqs": ObservationSpec((1,), window=False, bounds=_USUAL_HZ),
     }
-
-
-def _part(settings: Settings, name: str) -> Settings:
-    entries: Any = settings.values.get(name)
-    if not isinstance(entries, dict):
-        raise settings.refusal(name, "its entries")
-    return Settings(entries, f"{settings.where}{name}.", settings.remedy)
 
 
 def _depth(settings: Settings, name: str) -> int:

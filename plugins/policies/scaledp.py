@@ -26,7 +26,7 @@ from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import MOST_TIMESTEPS
 from ttscompile.frontends.settings import Settings, read_json
 
-from .layers import TimmAttention, TimmMlp
+from .layers import ModulatedFinal, TimmAttention, TimmMlp
 from .loops import ddim_loops
 from .shards import read_part
 
@@ -79,13 +79,6 @@ class _Layer(nn.Module):
         return x + gate2[:, None] * self.mlp(_modulated(x, shift2, scale2))  # type: ignore[no-any-return]
 
 
-class _Final(nn.Module):
-    def __init__(self, width: int, actions: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(width, actions)
-        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * width))
-
-
 @dataclass(frozen=True)
 class ScaleDPConfig:
     """Sizes of a head.
@@ -127,7 +120,7 @@ class ScaleDPHead(nn.Module):
         self.cond_obs_emb = nn.Linear(features, width)
         self.pos_embed = nn.Parameter(torch.zeros(1, config.horizon, width))
         self.blocks = nn.ModuleList(_Layer(width, config.heads) for _ in range(config.layers))
-        self.final_layer = _Final(width, config.actions)
+        self.final_layer = ModulatedFinal(width, config.actions)
 
     def forward(self, sample: Tensor, timestep: Tensor, features: Tensor, state: Tensor) -> Tensor:
         """See the class."""

@@ -256,11 +256,7 @@ _CLOUD = {"in_channels": 3, "out_channels": 24, "use_layernorm": True, "final_no
         ("dp3", {"eta": 0.5}, r"cfg\.policy has settings that 3D Diffusion Policy does not know: eta"),
         ("dp3", {"use_up_condition": 1}, r"cfg\.policy\.use_up_condition is 1; expected true or false"),
         ("dp3", {"pointnet_type": "transformer"}, r"pointnet_type is 'transformer'; expected pointnet"),
-        (
-            "dp3",
-            {"pointcloud_encoder_cfg": None},
-            r"pointcloud_encoder_cfg is None; expected the settings of a PointNet",
-        ),
+        ("dp3", {"pointcloud_encoder_cfg": None}, r"pointcloud_encoder_cfg is None; expected settings by name"),
         (
             "dp3",
             {"pointcloud_encoder_cfg": _CLOUD | {"final_norm": "batch"}},

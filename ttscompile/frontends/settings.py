@@ -83,6 +83,13 @@ class Settings:
             raise self.refusal(name, f"[height, width]{limit} or null")
         return None if value is None else (value[0], value[1])
 
+    def part(self, name: str) -> "Settings":
+        """The entries of one of them."""
+        value = self.values.get(name)
+        if not isinstance(value, dict):
+            raise self.refusal(name, "settings by name")
+        return Settings(value, f"{self.where}{name}.", self.remedy)
+
     def require(self, **expected: Any) -> None:
         """Raise for an entry that is there, and says another variant than the one that is rebuilt."""
         for name, value in expected.items():

@@ -9,16 +9,15 @@ all that is run here. torchvision and pytorch3d need not be there::
 """
 
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock, patch
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 
 from .. import consistency
+from .make_unets import made
 from .torchvision_stand_in import put_in_place
 
 
@@ -31,16 +30,6 @@ def main() -> None:
     numbers = {f"{variant}.{key}": value for variant in consistency.VARIANTS for key, value in run(variant).items()}
     np.savez_compressed(path, **numbers)
     print(path, path.stat().st_size, "bytes")
-
-
-def made(settings: dict[str, Any]) -> Any:
-    """What ``hydra.utils.instantiate`` makes of an entry of the configuration."""
-    arguments = {
-        key: value if not isinstance(value, dict) else made(value) if "_target_" in value else OmegaConf.create(value)
-        for key, value in settings.items()
-    }
-    module, _, name = arguments.pop("_target_").rpartition(".")
-    return getattr(import_module(module), name)(**arguments)
 
 
 @torch.no_grad()
