@@ -57,8 +57,8 @@ def build(
     Args:
         checkpoint: see ``convert``.
         directory: where the artifact goes; see ``convert``.
-        trajectories: recorded episodes; see ``calibrate``. None: those that the policy was trained on, by their name
-            on the hub (``frontends.data_set``).
+        trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on,
+            of a data set on the hub (``frontends.data_set``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
             plan is then the nearest of those whose longest call keeps up.
         policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
@@ -87,7 +87,7 @@ def build(
         raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
     if not trajectories:
         trajectories = (recordings_of(checkpoint),)
-        explain("recordings_of", (f"{trajectories[0]}, which the policy was trained on",))
+        explain("recordings", (f"no recordings were given: {trajectories[0]}, which the policy was trained on",))
     how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, **of_checkpoint}
     _converted(checkpoint, Path(directory), resume, explain, how)
     if control_hz is not None:

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import ttscompile
 from tests.trajectories.data_sets import ENDS, as_lerobot, as_lerobot_with_videos
+from ttscompile import builder
 from ttscompile.cli import main
 from ttscompile.core.spec import ObservationSpec
-from ttscompile.errors import CalibrationError, CheckpointError, HubError
+from ttscompile.errors import CalibrationError, CheckpointError, HubError, TrajectoryError
 from ttscompile.frontends.data_set import recordings_of
 from ttscompile.trajectories import episodes, load_trajectories
 
 from .served import Hub
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*episodes are read:UserWarning")
 
 SPECS = {"top": ObservationSpec((2, 3, 16, 32)), "state": ObservationSpec((2, 5))}
 NAME = "hf://datasets/org/data"
@@ -87,15 +89,26 @@ def test_a_checkpoint_says_what_it_was_trained_on(tmp_path: Path) -> None:
 
 
 def test_build_says_from_what_it_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = list[tuple[str, ...]]()
-
-    def build(checkpoint: Path, directory: Path, trajectories: tuple[str, ...], **_: Any) -> None:
-        given.append(trajectories)
+    def stopped(*_: Any, **__: Any) -> None:
         raise CalibrationError("as far as this.")
 
-    monkeypatch.setattr(ttscompile, "build", build)
+    monkeypatch.setattr(builder, "convert", stopped)
     (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "org/data"}}))
     result = CliRunner().invoke(main, ["build", str(tmp_path), "-o", str(tmp_path / "compiled")])
-    assert (result.exit_code, given) == (2, [(NAME,)])
+    assert result.exit_code == 2
     told = " ".join(result.stderr.split())
-    assert f"no --trajectories: the first episodes of {NAME}, which the policy was trained on" in told
+    assert f"no recordings were given: {NAME}, which the policy was trained on" in told
+
+
+def test_how_many_are_read_is_told(hub: Hub, tmp_path: Path) -> None:
+    commit(hub, as_lerobot(tmp_path), 2)
+    with pytest.warns(UserWarning, match=f"{NAME}: its first 2 episodes are read"):
+        load_trajectories([NAME], {"state": ObservationSpec((2, 5))}, 2)
+
+
+def test_the_first_episode_needs_its_videos(hub: Hub, tmp_path: Path) -> None:
+    root = as_lerobot_with_videos(tmp_path, 2)
+    (root / "videos/chunk-000/top/episode_000000.mp4").unlink()
+    commit(hub, root, 2)
+    with pytest.raises(TrajectoryError, match="the first episode has no videos of top in the first files"):
+        load_trajectories([NAME], SPECS, 2)

@@ -22,7 +22,6 @@ from ttscompile.cli.summary import print_frontier
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.data_set import recordings_of
 from ttscompile.frontends.families import FAMILIES
 from ttscompile.report.summary import document
 
@@ -82,13 +81,12 @@ def build(
     require_recordings(trajectories)
     console = progress()
     warn_if_busy(console)
-    if not trajectories:
-        trajectories = (recordings_of(checkpoint),)
-        console.print(f"no --trajectories: the first episodes of {trajectories[0]}, which the policy was trained on")
     with only_results_on_stdout(), console.status("compiling") as status:
 
         def explain(stage: str, notes: tuple[str, ...]) -> None:
             status.update(f"compiling: after {stage}")
+            if stage == "recordings":
+                console.print(*notes)
             if stage == "write":
                 status.stop()  # the search has a bar of its own
 

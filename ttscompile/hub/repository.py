@@ -181,8 +181,8 @@ def fetch_checkpoint(text: str) -> Fetched:
         return _fetched(hub, name, text, folder.name, _of_checkpoint(name, text, files))
 
 
-def fetch_recording(text: str) -> Fetched:
-    """The first episodes of a LeRobot data set: data sets have up to terabytes, and a recording needs a few episodes.
+def fetch_recording(text: str) -> Path:
+    """The folder with the first episodes of a LeRobot data set: a recording needs few, and some have terabytes.
 
     Args:
         text: ``hf://datasets/org/name[@revision]``.
@@ -195,10 +195,10 @@ def fetch_recording(text: str) -> Fetched:
         raise HubError(f"{text:.200}: expected {DATA_SETS}ORGANISATION/NAME, and perhaps @REVISION after it.")
     name, hub = read_name(text.replace(DATA_SETS, HUB)), library()
     with told(text):
-        folder = _snapshot(hub, name.repository, name.revision, [*_ABOUT, *_FIRST_EPISODES], kind="dataset")
+        folder = _snapshot(hub, name.repository, name.revision, list(_FIRST_EPISODES), kind="dataset")
     if not (folder / "meta" / "info.json").is_file():
         raise HubError(f"{text}: there is no meta/info.json in it; expected a LeRobot data set.")
-    return Fetched(folder, name.at(folder.name).replace(HUB, DATA_SETS), _licence(folder / CARD))
+    return folder
 
 
 def _whole(name: HubName, kept: list[str]) -> bool:

@@ -90,7 +90,11 @@ def load_trajectories(
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
     how = observations, action_steps, sources or {}, instruction
-    for episode in [each for path in paths for each in _read(local(path), *how)]:
+    read = [(path, _read(path, *how)) for path in paths]
+    for path, found in read:
+        if on_hub(path):
+            warnings.warn(f"{path}: its first {len(found)} episodes are read.", stacklevel=2)
+    for episode in [each for _, found in read for each in found]:
         digest = hashlib.sha256()
         for _, array in sorted(episode.observations.items()):
             digest.update(np.ascontiguousarray(array).data)
@@ -102,21 +106,19 @@ def load_trajectories(
     return list(different.values())
 
 
-def local(path: str | os.PathLike[str]) -> tuple[Path, Mapping[str, int]]:
-    """Where a recording is on this machine, and how much of it is read."""
-    if not on_hub(path):
-        return Path(path), {}
-    return fetch_recording(os.fspath(path)).path, {"most": MOST_EPISODES}
+def local_path(path: str | os.PathLike[str]) -> Path:
+    """Where a recording is on this machine; of a data set on the hub the first episodes are downloaded."""
+    return fetch_recording(os.fspath(path)) if on_hub(path) else Path(path)
 
 
 def _read(
-    where: tuple[Path, Mapping[str, int]],
+    given_path: str | os.PathLike[str],
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
     given: Mapping[str, Sequence[str]],
     instruction: Instruction | None,
 ) -> list[Episode]:
-    path, limits = where
+    path, limits = local_path(given_path), {"most": MOST_EPISODES} if on_hub(given_path) else {}
     sources = {key: parts for key, parts in given.items() if key != TASK}
     words = instruction if TASK in given else None
     if TASK in given and words is None:

@@ -15,7 +15,7 @@ from ..core.spec import Affine, PolicySpec
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .episodes import Episode, load_trajectories, local, recorded_names
+from .episodes import Episode, load_trajectories, local_path, recorded_names
 from .frames import few, one_error
 from .lerobot_dataset import MAX_INFO
 
@@ -134,7 +134,7 @@ def examine_recordings(
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
-            for path in (local(each)[0] for each in paths):
+            for path in map(local_path, paths):
                 found += [*_names(path, spec, renamed), *_rate(path, spec)]
             steps = spec.chunk.stop - spec.chunk.start
             episodes = load_trajectories(paths, spec.observations, steps, renamed, spec.instruction)

@@ -76,7 +76,9 @@ def lerobot_recording(path: Path, most: int | None = None) -> Recording:
         first = episodes[order[ends - 1]].tolist()[:most]
         lacking = (i for i, n in enumerate(first) if not all(n in each and each[n][0].is_file() for each in files_of))
         ends = ends[: next(lacking, len(first))]
-        order = order[: ends[-1] if len(ends) else 0]
+        if not len(ends):
+            raise TrajectoryError(f"{path}: the first episode has no videos of {', '.join(videos)} in the first files.")
+        order = order[: ends[-1]]
     sorted_already = np.array_equal(order, np.arange(len(episodes)))
     return Recording([*names, *videos, *([TASK] if told else [])], read, ends, None if sorted_already else order)
 
