@@ -29,6 +29,7 @@ DIFFUSION_SAMPLERS = ("ddpm", "ddim", "dpmsolver++")
 SAMPLERS = (*DIFFUSION_SAMPLERS, *METHODS)
 SPACINGS = ("leading", "trailing", "linspace")
 DIFFUSION_OPTIONS = frozenset({"sampler", "steps", "spacing", "loops"})
+"""What can be asked of any policy with a denoising loop."""
 
 
 @dataclass(frozen=True)

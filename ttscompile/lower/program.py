@@ -159,7 +159,7 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
 
 
 class _Arguments(torch.nn.Module):
-    """Gives so many of its arguments. What is between is written by ``_write``: tracing it would take minutes."""
+    """Gives so many of its arguments. ``_write`` writes what is between: tracing that took most of a conversion."""
 
     def __init__(self, results: int) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ def _write(program: torch.export.ExportedProgram, graphs: list[Graph]) -> None:
             graph.erase_node(node)
     arguments, results = iter(list(graph.nodes)), list[torch.fx.Node]()
     for each in graphs:
-        given = dict(zip((*each.inputs, *each.constants), arguments, strict=False))
+        given = dict(zip((*each.inputs, *each.constants), arguments, strict=False))  # as many as it has
         results += _Writer(graph, each, given).results()
     graph.output(tuple(results))
     program.graph_module.recompile()
