@@ -38,7 +38,7 @@ def loss_of(policy: Any, obs: torch.Tensor, action: torch.Tensor) -> torch.Tenso
 
 @click.command()
 @recipe_options(steps=60000, save_every=10000)
-@click.option("--device", default="cuda", show_default=True, help="As torch calls it; a processor would take weeks.")
+@click.option("--device", default="cuda", show_default=True, help="A GPU, as torch calls it.")
 @click.option("--learning-rate", default=3e-4, show_default=True, type=click.FloatRange(0, min_open=True))
 @click.option("--dropout", default=0.1, show_default=True, type=click.FloatRange(0, 1), help="Of attention and layers.")
 def main(
@@ -52,6 +52,8 @@ def main(
     **run: Any,
 ) -> None:
     """Train, and write checkpoints into a folder."""
+    if not torch.cuda.is_available():
+        raise click.ClickException("torch finds no GPU here, and this takes weeks without one.")
     find_original(original)
     changes = {
         "task": {"name": "pusht_lowdim", "obs_dim": 20, "action_dim": 2, "keypoint_dim": 2},
