@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 from environments import environment_class
 from episodes import Episodes
@@ -33,8 +35,10 @@ class Processes:
 
     def map(self, work: Work, parts: Sequence[Part]) -> Iterator[list[Episode]]:
         """What comes of each part, in order."""
-        # A fork of a process that has threads of onnxruntime would wait for them for ever.
-        with ProcessPoolExecutor(self.count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        # A fork of a process that has threads of onnxruntime would wait for them for ever. Of what is warned about the
+        # same artifacts here, they say nothing again.
+        again: Any = {"initializer": warnings.simplefilter, "initargs": ("ignore", UserWarning)}
+        with ProcessPoolExecutor(self.count, multiprocessing.get_context("spawn"), **again) as pool:
             yield from pool.map(work.here, parts)
 
 

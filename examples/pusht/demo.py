@@ -12,11 +12,13 @@ hour on 2 cores; everything it makes is in ``build/pusht/POLICY``.
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -149,7 +151,8 @@ def time_steps(checkpoint: Path, artifact: Path, plan: str, calls: int) -> list[
 
 def time_alone(checkpoint: Path, artifact: Path, plan: str, calls: int) -> list[Step]:
     """``time_steps``, in a process that has done nothing else."""
-    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as process:
+    said: Any = {"initializer": warnings.simplefilter, "initargs": ("ignore", UserWarning)}  # by this process
+    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn"), **said) as process:
         return process.submit(time_steps, checkpoint, artifact, plan, calls).result()
 
 

@@ -22,7 +22,7 @@ from ttscompile.cli.summary import print_frontier
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.families import FAMILIES
+from ttscompile.frontends.families import GIVE
 from ttscompile.report.summary import document
 
 
@@ -76,7 +76,7 @@ def build(
     those keeps the deadline.
     """
     if not on_hub(checkpoint):
-        require_path(checkpoint, CheckpointError, f"Give {' or '.join(each.reads for each in FAMILIES)}.")
+        require_path(checkpoint, CheckpointError, GIVE)
     require_replaceable(directory)
     require_recordings(trajectories)
     console = progress()

@@ -17,7 +17,7 @@ from ttscompile.cli.types import NEW_FILE, PATH, PATH_OR_HUB
 from ttscompile.core.paths import on_hub, require_path
 from ttscompile.core.spec import FP32, PRECISIONS
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.families import FAMILIES, SAMPLERS
+from ttscompile.frontends.families import GIVE, SAMPLERS
 from ttscompile.report.facts import precision as told_precision
 from ttscompile.report.summary import document
 
@@ -80,7 +80,7 @@ def convert(
     """
     # Told now: importing the compiler, and with it torch, takes seconds.
     if not on_hub(checkpoint):
-        require_path(checkpoint, CheckpointError, f"Give {' or '.join(each.reads for each in FAMILIES)}.")
+        require_path(checkpoint, CheckpointError, GIVE)
     require_replaceable(directory)
     stages: list[dict[str, Any]] = []
     console = progress()

@@ -170,6 +170,9 @@ FAMILIES = (
     ),
 )
 
+GIVE = f"Give what the training saved, of one of these: {', '.join(each.title for each in FAMILIES)}."
+"""What to do about a path that leads nowhere."""
+
 FORMATS = ("auto", *(each.name for each in FAMILIES))
 
 
