@@ -5,6 +5,8 @@
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
     python examples/benchmark/large.py --smolvla --precision int4 --only convert --output DIR     # what it is made of
+    python examples/benchmark/large.py --pi0 --precision int4                   # LeRobot's pi0, whole
+    python examples/benchmark/large.py --groot --precision int4                 # LeRobot's GR00T N1.7, whole
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
 STEPS = 4
 
-WHOLE = ("smolvla", "evo1", "xvla", "rdt")
+WHOLE = ("smolvla", "pi0", "groot", "evo1", "xvla", "rdt")
 """Policies that are compiled from what is saved of them; LeRobot's are whole."""
 
 MOST_FILES = 3
@@ -125,14 +127,16 @@ def tell_sizes(directory: Path) -> None:
 def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     """Where a whole policy is saved, by which it is written unless it is there; and the instruction of evo1 alone."""
     import large_evo1
+    import large_groot
+    import large_pi0
     import large_rdt
     import large_smolvla
     import large_xvla
 
     directory = folder / name
     if not directory.exists():
-        kinds = {"smolvla": large_smolvla, "evo1": large_evo1, "xvla": large_xvla, "rdt": large_rdt}
-        kinds[name].save(directory)
+        own = [large_smolvla, large_pi0, large_groot, large_evo1, large_xvla, large_rdt]
+        dict(zip(WHOLE, own, strict=True))[name].save(directory)
     return directory, large_evo1.TASK if name == "evo1" else None
 
 
@@ -223,6 +227,8 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
     parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
+    parser.add_argument("--pi0", action="store_true", help="LeRobot's pi0, likewise")
+    parser.add_argument("--groot", action="store_true", help="LeRobot's groot, GR00T N1.7, likewise")
     parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
     parser.add_argument("--xvla", action="store_true", help="LeRobot's xvla, likewise")
     parser.add_argument("--rdt", action="store_true", help="RDT-170M, likewise")
@@ -230,7 +236,7 @@ def main() -> None:
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
-    parser.add_argument("--precision", default="int8", choices=["int8", "int4"], help="of SmolVLA, evo1 and xvla")
+    parser.add_argument("--precision", default="int8", choices=["int8", "int4"], help="of a whole policy")
     parser.add_argument("--only", choices=["convert", "run"], help="one of the two processes")
     options = parser.parse_args()
     convert_to = partial(convert_whole, precision=options.precision)

@@ -29,7 +29,6 @@ from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.runtimes.report import CallReport
 
-PRECISIONS = ("fp32", "int8")
 COMPARED = 3
 """Random observations that precisions are compared on: a dense call of a large policy takes seconds."""
 
@@ -83,9 +82,8 @@ class Times:
             seconds, flops = calls.seconds[left_out:], calls.flops[left_out:]
             total = statistics.median(map(sum, seconds))
             parts = ", ".join(f"{statistics.median(part):.2f}" for part in zip(*seconds, strict=True))
-            least = [
-                self._products[calls.precision].seconds(statistics.mean(part)) for part in zip(*flops, strict=True)
-            ]
+            product = self._products["fp32" if calls.precision == "fp32" else "int8"]  # four bits are summed as eight
+            least = [product.seconds(statistics.mean(part)) for part in zip(*flops, strict=True)]
             floor = f"floor {sum(least):.3f}: {', '.join(f'{part:.3f}' for part in least)}"
             print(f"{total:8.2f} s  {name}: {parts}; {floor}; {total / sum(least):.2f} times it", flush=True)
 
@@ -98,11 +96,11 @@ def compare(
     computed: int,
     rounds: int = 5,
 ) -> None:
-    """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in int8.
+    """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in fewer bits.
 
     Seconds are the processor's: all calls are on one thread, and the machine may be busy. Then it is told how far dense
-    actions in int8 are from those in fp32, with equal noise on some random observations, and how far other noise moves
-    these.
+    actions in fewer bits are from those in fp32, with equal noise on some random observations, and how far other noise
+    moves these.
 
     Args:
         folder: with the artifact.
@@ -120,7 +118,7 @@ def compare(
     for _ in range(rounds + 1):  # the first does not count
         times.next_round()
         expected, split = eager()
-        for precision in PRECISIONS:
+        for precision in ("fp32", lowered(artifact)):
             for name, plan in plans_of(artifact, precision, computed).items():
                 policy.forget_frames()  # every call sees the same observation
                 found = timed(policy, obs, noise, plan, times, precision, f"{name}, {precision}")
@@ -135,7 +133,7 @@ def compare(
 
 
 def tell_precision(artifact: Artifact, policy: CompiledPolicy) -> None:
-    """Print how far int8 moves dense actions, all parts together and each alone, and how far other noise does."""
+    """Print how far fewer bits move dense actions, all parts together and each alone, and how far other noise does."""
     record, exact = artifact.manifest.precision, artifact.plans["dense"]
     assert record is not None
     lower = dict.fromkeys(record.kept, record.name)
@@ -156,6 +154,13 @@ def tell_precision(artifact: Artifact, policy: CompiledPolicy) -> None:
             moved[name].append(float(np.abs(found - expected).mean()))
     told = (f"{name} {statistics.mean(values):.2g}" for name, values in moved.items())
     print(f"{record.told}, from fp32 on average: {'; '.join(told)}")
+
+
+def lowered(artifact: Artifact) -> str:
+    """The precision that an artifact has beside fp32."""
+    record = artifact.manifest.precision
+    assert record is not None
+    return record.name
 
 
 def plans_of(artifact: Artifact, precision: str, computed: int, tokens: TokenReuse | None = None) -> dict[str, Plan]:
@@ -187,7 +192,7 @@ def timed(
 
 
 def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> None:
-    """Calls in int8 with a new frame of every camera, in which only an arm moves: all tokens, and those that changed.
+    """Calls in fewer bits with new frames, in which only an arm moves: all tokens, and those that changed.
 
     Args:
         folder: with the artifact.
@@ -196,7 +201,8 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
         rounds: that are counted, of a frame for each plan.
     """
     artifact = load_artifact(folder / "compiled")
-    plans, reused = plans_of(artifact, "int8", computed), plans_of(artifact, "int8", computed, REUSE)
+    bits = lowered(artifact)
+    plans, reused = plans_of(artifact, bits, computed), plans_of(artifact, bits, computed, REUSE)
     whole, some = (open_policy(artifact, seed=0, plan=each["dense"]) for each in (plans, reused))
     times, rng = Times(Arithmetic(artifact)), np.random.default_rng(1)
     obs, noise = call(spec)
@@ -211,8 +217,8 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
             ages = reversed(range(obs[key].shape[1]))
             angles = [place + 0.05 * max(number - age, 0) for age in ages]
             obs[key] = np.stack([arm(background, angle) for angle in angles])[None]
-        expected = timed(whole, obs, noise, plan, times, "int8", f"{name}, int8, new frames, all tokens")
-        found = timed(some, obs, noise, reused[name], times, "int8", f"{name}, int8, new frames, some tokens")
+        expected = timed(whole, obs, noise, plan, times, bits, f"{name}, {bits}, new frames, all tokens")
+        found = timed(some, obs, noise, reused[name], times, bits, f"{name}, {bits}, new frames, some tokens")
         if number >= 2 * len(plans):  # the first is whole, and those that follow may be the first of their size
             assert some.last_report is not None
             frames = some.last_report.frames

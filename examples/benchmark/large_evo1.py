@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,15 +45,7 @@ def save(directory: Path) -> None:
     for each in (directory, model):
         each.mkdir(parents=True, exist_ok=True)
     write_json(model / "config.json", MODEL)
-    letters = {chr(code): code for code in range(32, 127)}
-    marks = [{"id": number, "content": text, "special": True} for text, number in _MARKS.items()]
-    flags = dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized"), False)
-    split = {"type": "Split", "pattern": {"Regex": "."}, "behavior": "Isolated", "invert": False}
-    words = {"type": "WordLevel", "vocab": {**letters, **_MARKS}, "unk_token": "?"}
-    tokenizer: dict[str, Any] = {"version": "1.0", "added_tokens": [{**mark, **flags} for mark in marks]}
-    tokenizer |= {"pre_tokenizer": split, "model": words}  # a letter is a token: this is nobody's text
-    tokenizer |= dict.fromkeys(("truncation", "padding", "normalizer", "post_processor", "decoder"))
-    write_json(model / "tokenizer.json", tokenizer)
+    save_letters(model, _MARKS)
     entries = {
         "type": "evo1",
         "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
@@ -68,6 +61,19 @@ def save(directory: Path) -> None:
     draw = torch.Generator().manual_seed(0)
     weights = {f"model.{name}": _weight(name, value.shape, draw) for name, value in shapes.items()}
     save_file(weights, directory / "model.safetensors")
+
+
+def save_letters(folder: Path, marks: Mapping[str, int]) -> None:
+    """A tokenizer of which each letter is a token, since this is nobody's text, and marks by their numbers."""
+    letters = {chr(code): code for code in range(32, 127)}
+    known = [{"id": number, "content": text, "special": True} for text, number in marks.items()]
+    flags = dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized"), False)
+    split = {"type": "Split", "pattern": {"Regex": "."}, "behavior": "Isolated", "invert": False}
+    words = {"type": "WordLevel", "vocab": {**letters, **marks}, "unk_token": "?"}
+    tokenizer: dict[str, Any] = {"version": "1.0", "added_tokens": [{**mark, **flags} for mark in known]}
+    tokenizer |= {"pre_tokenizer": split, "model": words}
+    tokenizer |= dict.fromkeys(("truncation", "padding", "normalizer", "post_processor", "decoder"))
+    write_json(folder / "tokenizer.json", tokenizer)
 
 
 def _weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:

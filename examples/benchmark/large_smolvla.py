@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -86,6 +86,20 @@ def random_weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.
     if len(shape) > 1:
         return torch.randn(shape, generator=draw) * shape[1:].numel() ** -0.5
     return torch.ones(shape) if "norm" in name and name.endswith("weight") else torch.zeros(shape)
+
+
+def save_drawn(path: Path, shapes: Mapping[str, torch.Size]) -> None:
+    """Write random weights one after the other, so that they need no memory that a machine may not have."""
+    header, end = dict[str, Any](), 0
+    for name, shape in shapes.items():
+        start, end = end, end + 4 * shape.numel()
+        header[name] = {"dtype": "F32", "shape": list(shape), "data_offsets": [start, end]}
+    content, draw = json.dumps(header).encode(), torch.Generator().manual_seed(0)
+    content += b" " * (-len(content) % 8)
+    with path.open("wb") as file:
+        file.write(len(content).to_bytes(8, "little") + content)
+        for name, shape in shapes.items():
+            random_weight(name, shape, draw).numpy().tofile(file)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 import click
 import numpy as np
 import torch
-from large_calls import PRECISIONS, plans_of
+from large_calls import lowered, plans_of
 from large_smolvla import CAMERAS, STATE, call
 from moving import REUSE, arm, picture
 from torch.nn import functional
@@ -171,7 +171,7 @@ def main(folder: Path, library: Path, model: Path, threads: int, rounds: int) ->
     for key in obs:
         if key.endswith("mask"):
             obs[key] = np.ones_like(obs[key])
-    plans = {name: plans_of(artifact, name, 2) for name in PRECISIONS}
+    plans = {name: plans_of(artifact, name, 2) for name in ("fp32", lowered(artifact))}
     policies = {name: open_policy(artifact, threads=threads, plan=own["dense"]) for name, own in plans.items()}
     few, reused = list(plans_of(artifact, "int8", 2, REUSE).items())[-1]
     reusing = open_policy(artifact, threads=threads, plan=reused)

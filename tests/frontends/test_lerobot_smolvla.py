@@ -247,7 +247,7 @@ def test_a_processor_or_a_language_model_that_is_missing(directory: Path, tmp_pa
 def test_a_policy_that_exceeds_the_memory_is_refused_before_work(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 5 * 2**20)
+    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 2**16)
     with pytest.raises(CheckpointError, match=r"million weights.* takes about 0\.0 GiB .*; this machine has 0\.0 GiB"):
         ttscompile.convert(directory, tmp_path / "out")
 

@@ -191,7 +191,7 @@ def test_damaged_and_hostile_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_machine_without_the_memory_is_told_before_anything_is_read(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 2**18)
+    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 2**12)
     path, numbers = save(tmp_path), sum(value.numel() for value in head_weights().values())
     assert 16 * numbers > 2**18
     with pytest.raises(CheckpointError, match=rf"{path}: .*million weights.*this machine has 0\.0 GiB"):

@@ -3,6 +3,10 @@
 ``docs/decisions.md`` has what that costs in time and in error, beside eight bits.
 """
 
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import numpy.typing as npt
 
@@ -24,8 +28,8 @@ _SHARES = np.array([0.8, 0.87, 0.94, 1, -0.83, -0.9, -0.97, -1.04], np.float32)
 _LEAST = 1e-12
 """Squared error of a block, in units of its largest number, that is rounding of float32."""
 
-_PART = 2**22
-"""Numbers that are rounded at once: a matrix may be a tenth of the memory."""
+_PART = 2**18
+"""Numbers that are rounded at once: what that takes stays in the processor's cache, where it is 1.8 times faster."""
 
 
 def pack(matrix: Array) -> tuple[npt.NDArray[np.uint8], Array]:
@@ -37,11 +41,17 @@ def pack(matrix: Array) -> tuple[npt.NDArray[np.uint8], Array]:
         uint8 ``[columns, blocks, BLOCK / 2]``, two numbers a byte, the first of them in the low half, each 8 more than
         it stands for; and the scales, float32 ``[columns, blocks]``. Rows that fill the last block are zeros.
     """
-    rows, columns = matrix.shape
-    count = max(1, _PART // rows)
-    parts = [_pack(_blocks(matrix[:, i : i + count])) for i in range(0, columns, count)]
-    packed, scales = (np.concatenate(each) for each in zip(*parts, strict=True))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # large operations of numpy's, which let others run
+        parts = pool.map(lambda columns: _pack(_blocks(matrix[:, columns])), columns_at_once(matrix))
+        packed, scales = (np.concatenate(each) for each in zip(*parts, strict=True))
     return packed, scales
+
+
+def columns_at_once(matrix: Array) -> Iterator[slice]:
+    """Columns that are rounded together: a matrix may be a tenth of the memory, and rounding takes several times it."""
+    rows, columns = matrix.shape
+    count = max(1, _PART // max(1, rows))
+    return (slice(i, i + count) for i in range(0, columns, count))
 
 
 def unpack(packed: npt.NDArray[np.uint8], scales: Array, rows: int) -> Array:

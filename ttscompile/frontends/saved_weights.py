@@ -14,8 +14,9 @@ from torch import nn
 from ..errors import CheckpointError
 from ..measure.machine import memory_bytes
 
-TIMES = 4
-"""Memory that compiling takes, as a multiple of the weights in float32, at most: see ``docs/decisions.md``."""
+BYTES, COPY = 2, 4
+"""Bytes that compiling takes at most for each weight, beside the mapped file, and for a copy of one that was not saved
+in float32: see ``docs/decisions.md``."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -46,21 +47,23 @@ def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
         return
     try:
         with safe_open(path, "np") as file:
-            names = [name for name in file.keys() if not left_out(name, without)]  # noqa: SIM118
-            numbers = sum(math.prod(file.get_slice(name).get_shape()) for name in names)
+            slices = [file.get_slice(name) for name in file.keys() if not left_out(name, without)]  # noqa: SIM118
+            sizes = [(math.prod(each.get_shape()), each.get_dtype() != "F32") for each in slices]
     except Exception:  # a damaged file, which its reader describes
         return
-    require_memory_for(path, numbers)
+    require_memory_for(path, sum(count for count, _ in sizes), sum(count for count, copied in sizes if copied))
 
 
-def require_memory_for(path: Path, numbers: int) -> None:
-    """The same of so many weights, which the file at ``path`` has."""
-    need, there = TIMES * 4 * numbers, memory_bytes()
+def require_memory_for(path: Path, numbers: int, copied: int | None = None) -> None:
+    """The same of so many weights, which the file at ``path`` has; ``copied`` are not float32, None for all of them."""
+    copied = numbers if copied is None else copied
+    need, there = BYTES * numbers + COPY * copied, memory_bytes()
     if need > there:
+        half = f", of which {copied / 1e6:,.0f} million are not in float32, and are copied" if copied else ""
         raise CheckpointError(
-            f"{path}: {numbers / 1e6:,.0f} million weights. Compiling them takes about {need / 2**30:.1f} GiB of"
-            f" memory, {TIMES} times what they have in float32; this machine has {there / 2**30:.1f} GiB. Convert on a"
-            " larger one: the artifact takes less than half of that to run."
+            f"{path}: {numbers / 1e6:,.0f} million weights{half}. Compiling them takes about {need / 2**30:.1f} GiB of"
+            f" memory beside the file; this machine has {there / 2**30:.1f} GiB. Convert on a larger one: in precision"
+            " 'int4' the artifact takes about a byte a weight to run."
         )
 
 
@@ -137,6 +140,7 @@ def require_weights(
         if value.shape != expected[name].shape:
             shapes = f"{tuple(value.shape)}; expected {tuple(expected[name].shape)}"
             raise CheckpointError(f"weight {name} has shape {shapes} from {source}.")
-        if name not in masks and not torch.isfinite(value).all():
+        # The extremes are no number where any is none; asking each number would take more memory than all of them have.
+        if name not in masks and value.numel() and not torch.isfinite(torch.stack(torch.aminmax(value))).all():
             count = int((~torch.isfinite(value)).sum())
             raise CheckpointError(f"weight {name} holds {count} values that are not finite; training diverged.")

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
-from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, pack
+from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, columns_at_once, pack
 from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
@@ -223,9 +223,13 @@ def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np
         int8 ``[rows, columns]`` in -127..127, and float32 ``[columns]``; their product is within half a scale of the
         matrix.
     """
-    largest = np.abs(matrix).max(axis=0)
-    scale = np.where(largest < LARGEST * np.finfo(np.float32).tiny, 1.0, largest / LARGEST).astype(np.float32)
-    return np.clip(np.rint(matrix / scale), -LARGEST, LARGEST).astype(np.int8), scale
+    integers, scale = np.empty_like(matrix, np.int8), np.empty(matrix.shape[1], np.float32)
+    for columns in columns_at_once(matrix):
+        part = matrix[:, columns]
+        largest = np.abs(part).max(axis=0)
+        scale[columns] = np.where(largest < LARGEST * np.finfo(np.float32).tiny, 1.0, largest / LARGEST)
+        integers[:, columns] = np.clip(np.rint(part / scale[columns]), -LARGEST, LARGEST)
+    return integers, scale
 
 
 def _matrices(model: ModelProto, known: Mapping[str, Array]) -> Matrices:

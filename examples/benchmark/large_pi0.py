@@ -1,0 +1,45 @@
+"""pi0 at its real size with random weights, for ``large.py``: 3.2 billion, in the files that lerobot saves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, save_drawn, write_json, write_processors
+
+from ttscompile.frontends.language_layers import LanguageConfig
+from ttscompile.frontends.pi import Pi, PiConfig
+from ttscompile.frontends.siglip import SiglipConfig
+
+GEMMA = LanguageConfig(width=2048, hidden=16384, layers=18, heads=8, groups=1, channels=256, gemma=True)
+EXPERT = LanguageConfig(width=1024, hidden=4096, layers=18, heads=8, groups=1, channels=256, gemma=True)
+VISION = SiglipConfig(
+    hidden_size=1152,
+    intermediate_size=4304,
+    num_hidden_layers=27,
+    num_attention_heads=16,
+    image_size=224,
+    patch_size=14,
+)
+"""PaliGemma's, in front of Gemma 2B; its expert has the width of Gemma 300M."""
+_PADDED = 32
+
+
+def save(directory: Path) -> None:
+    """What lerobot's ``save_pretrained`` writes of a pi0 with its default configuration, in float32."""
+    directory.mkdir(parents=True, exist_ok=True)
+    entries = {
+        "type": "pi0",
+        "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
+        "output_features": {ACTION: FEATURES[ACTION]},
+        "chunk_size": 50,
+        "num_inference_steps": 10,
+    }
+    write_json(directory / "config.json", entries)
+    write_processors(directory)
+    config = PiConfig(
+        vision=VISION, text=GEMMA, vocabulary=257152, expert=EXPERT, state=_PADDED, actions=_PADDED, periods=(4e-3, 4.0)
+    )
+    with torch.device("meta"):
+        shapes = {f"model.{name}": value.shape for name, value in Pi(config).state_dict().items()}
+    save_drawn(directory / "model.safetensors", shapes)
