@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.ir.evaluate import evaluate
-from ttscompile.ir.graph import Graph
+from ttscompile.ir.graph import GETITEM, Graph, Ref
 from ttscompile.ir.tokens import find_tokens
 
 
@@ -38,10 +38,19 @@ class LiteralTokens:
         values = {**self.weights, **{name: torch.from_numpy(row) for name in self.tower.inputs}}
         chosen = torch.zeros(self.stream.tokens, dtype=torch.bool)
         chosen[torch.as_tensor(computed)] = True
-        types = self.tower.types()
+        types, several = self.tower.types(), dict[str, Sequence[torch.Tensor]]()
         for node in self.tower.nodes:
-            alone = Graph({name: types[name] for name in node.refs()}, {}, (node,), (node.name,))
-            (value,) = evaluate(alone, {}, values)
+            if node.op == GETITEM:
+                source, place = node.args
+                assert isinstance(source, Ref)
+                assert isinstance(place, int)
+                value = several[source.name][place]
+            else:
+                alone = Graph({name: types[name] for name in node.refs()}, {}, (node,), (node.name,))
+                (value,) = evaluate(alone, {}, values)
+            if isinstance(value, list | tuple):  # each of which is masked where it is taken
+                several[node.name] = value
+                continue
             axis = self.stream.axes.get(node.name)
             if axis is not None and node.name in self.kept:
                 mask = chosen.reshape(-1, *[1] * (value.ndim - axis - 1))

@@ -15,6 +15,9 @@ from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.core.plan import Plan
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.internvl import Prompt
+from ttscompile.frontends.language_layers import LanguageConfig
+from ttscompile.frontends.qwen3_vl import Qwen3VL, Qwen3VLConfig, QwenVisionConfig
 from ttscompile.frontends.siglip import Siglip, SiglipConfig
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.flow import flow_matching_table
@@ -23,6 +26,8 @@ Array = npt.NDArray[Any]
 TO, SIDE, PATCH, WORDS = 2, 24, 4, 8
 CAMERAS = ("left", "right")
 STEPS, HORIZON, ACTIONS = 3, 6, 3
+SEEING = ("clip", "siglip", "qwen")
+"""Towers that are vision transformers."""
 
 
 class Tower(nn.Module):
@@ -40,14 +45,24 @@ class Tower(nn.Module):
 
 
 class Patches(nn.Module):
-    """``[N, 3, 24, 24]`` -> ``[N, 8]`` by a vision transformer of 36 patches; ``clip`` has a class token, too."""
+    """``[N, 3, 24, 24]`` -> ``[N, 8]`` by a vision transformer of 36 patches; ``clip`` has a class token, too.
+
+    ``qwen`` turns queries and keys by rows and columns, and gives squares of patches from two of its layers.
+    """
 
     def __init__(self, kind: str) -> None:
         super().__init__()
         sizes: Any = {"hidden_size": 64, "intermediate_size": 256, "num_hidden_layers": 3, "num_attention_heads": 2}
         clip = VisionConfig(**sizes, image_size=SIDE, patch_size=PATCH)
         siglip = SiglipConfig(**sizes, image_size=SIDE, patch_size=PATCH)
-        self.tower = ClipVision(clip) if kind == "clip" else Siglip(siglip, (SIDE, SIDE))
+        if kind == "qwen":
+            vision = QwenVisionConfig(**sizes, patch_size=PATCH, table=SIDE // PATCH, stacked=(1,))
+            text = LanguageConfig(width=32, hidden=32, layers=0, heads=1, groups=1, channels=32)
+            grids = ((SIDE // PATCH, SIDE // PATCH),)
+            whole = Qwen3VL(Qwen3VLConfig(vision, text, 1, (5, 5), 1e4, grids), Prompt((), 0))
+            self.tower: nn.Module = whole.visual
+        else:
+            self.tower = ClipVision(clip) if kind == "clip" else Siglip(siglip, (SIDE, SIDE))
         self.out = nn.Linear(64, 8)
         self.pooled = kind == "clip"
         with torch.no_grad():
@@ -63,13 +78,13 @@ class Eyes(nn.Module):
 
     ``each``: a tower for each camera; ``shared``: one looks at all of them in turn; ``stacked``: at all at once;
     ``mixed``: at the mean of the window's frames; ``channels``: at the window as one picture with more colours;
-    ``clip``, ``siglip``: one that is a vision transformer looks at all at once.
+    ``clip``, ``siglip``, ``qwen``: one that is a vision transformer looks at all at once.
     """
 
     def __init__(self, kind: str) -> None:
         super().__init__()
         self.kind = kind
-        sees = kind in ("clip", "siglip")
+        sees = kind in SEEING
         self.towers = nn.ModuleList(Patches(kind) if sees else Tower() for _ in range(2 if kind == "each" else 1))
         self.merge = nn.Conv2d(3 * TO, 3, 1)
 
@@ -80,7 +95,7 @@ class Eyes(nn.Module):
         if self.kind == "channels":
             return torch.cat([self.towers[0](self.merge(x.flatten(1, 2))) for x in images], -1)
         rows = [x.flatten(0, 1) for x in images]
-        if self.kind in ("stacked", "clip", "siglip"):
+        if self.kind in ("stacked", *SEEING):
             seen = self.towers[0](torch.stack(rows, 1).flatten(0, 1))
             return seen.reshape(-1, TO * len(images) * seen.shape[-1])
         own = [self.towers[i % len(self.towers)](x) for i, x in enumerate(rows)]

@@ -32,7 +32,7 @@ def compiled(kind: str) -> Program:
     return transform(*cameras.policy(kind))
 
 
-@pytest.mark.parametrize(("kind", "tokens", "fixed"), [("clip", 37, 1), ("siglip", 36, 0)])
+@pytest.mark.parametrize(("kind", "tokens", "fixed"), [("clip", 37, 1), ("siglip", 36, 0), ("qwen", 36, 0)])
 def test_some_tokens_give_what_they_literally_give(kind: str, tokens: int, fixed: int) -> None:
     program = compiled(kind)
     literal = LiteralTokens(program.pieces.towers[0], program.weights)
@@ -104,6 +104,8 @@ class Small(nn.Module):
         if self.change == "written out":
             mixed = torch.softmax(q @ k.transpose(1, 2), -1)[:, None] @ v[:, None]
         x = x + self.out(mixed[:, 0])
+        if self.change == "beside":
+            x = torch.cat([x[:, :8], x[:, 8:]], 1)
         if self.change == "averaged":
             x = x + self.out(x.mean(1, keepdim=True))
         for _ in range(0 if self.change == "shallow" else 20):  # else cutting patches is most of it
@@ -132,6 +134,7 @@ def found(change: str) -> object:
         ("masked", "tokens come together otherwise than by attention"),
         ("causal", "tokens come together otherwise than by attention"),
         ("written out", "tokens come together otherwise than by attention"),
+        ("beside", "tokens come together otherwise than by attention"),
         ("averaged", "tokens come together otherwise than by attention"),
         ("shallow", "is 40% of its FLOPs"),
     ],

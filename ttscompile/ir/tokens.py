@@ -18,7 +18,7 @@ LEAST_TOKENS = 16
 MOST_WHOLE = 0.25
 """Share of a tower's FLOPs that may be spent on what is computed for every new frame, whatever changed in it."""
 ATTENTION = "aten.scaled_dot_product_attention.default"
-_CONVOLUTION = "aten.conv2d.default"
+_CONVOLUTION, _CAT = "aten.conv2d.default", "aten.cat.default"
 
 Weights = Mapping[str, npt.NDArray[np.generic]]
 
@@ -156,8 +156,13 @@ def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Map
         inner = all(axes[name] == len(types[name].shape) - 2 for name in read)
         known = {name for name, _ in node.kwargs} <= {"scale"}
         return len(result) - 2 if plain and inner and known else None
+    behind = {len(types[name].shape) - axes[name] for name in read}
     if operation(node.op).elementwise:
-        behind = {len(types[name].shape) - axes[name] for name in read}
         return len(result) - behind.pop() if len(behind) == 1 else None
+    if node.op == _CAT:  # of channels, as where the halves of rotated queries are put beside each other
+        axis = axes[read[0]]
+        dim = node.args[1] if len(node.args) > 1 else 0
+        apart = isinstance(dim, int) and dim % len(result) != axis
+        return axis if apart and len(behind) == 1 and read == list(node.refs()) else None
     # The token's own row is to be the first factor, and nothing else.
     return axis_after(node, axes[read[0]], types) if read == list(node.refs())[:1] else None
