@@ -31,6 +31,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from memory import watched
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -47,20 +49,24 @@ MOST_NOTES = 8
 
 
 class Stages:
-    """Prints what each stage of a conversion took, and what all of them did."""
+    """Prints what each stage of a conversion took, and the most memory so far, and of that what no file backs."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: list[int]) -> None:
         self._start = self._last = time.perf_counter()
+        self._most = most
 
     def __call__(self, stage: str, notes: tuple[str, ...]) -> None:
         """A stage has ended."""
         now = time.perf_counter()
-        print(f"{now - self._last:7.1f} s  {peak():5.2f} GiB  {stage}: {'; '.join(notes[:MOST_NOTES])}", flush=True)
+        print(f"{now - self._last:7.1f} s  {self._memory()}  {stage}: {'; '.join(notes[:MOST_NOTES])}", flush=True)
         self._last = now
 
     def end(self) -> None:
         """All have."""
-        print(f"{time.perf_counter() - self._start:7.1f} s  {peak():5.2f} GiB  in all")
+        print(f"{time.perf_counter() - self._start:7.1f} s  {self._memory()}  in all")
+
+    def _memory(self) -> str:
+        return f"{peak():5.2f} GiB, {self._most[0] / 2**30:.2f} anonymous"
 
 
 def convert(folder: Path, network: nn.Module, horizon: int) -> None:
@@ -81,9 +87,10 @@ def convert(folder: Path, network: nn.Module, horizon: int) -> None:
         sampler=flow_matching_table(STEPS),
         chunk=ChunkSpec(ACTIONS, 0, horizon),
     )
-    stages = Stages()
-    ttscompile.compile_denoiser(network, spec, folder / "compiled", explain=stages)
-    stages.end()
+    with watched() as most:
+        stages = Stages(most)
+        ttscompile.compile_denoiser(network, spec, folder / "compiled", explain=stages)
+        stages.end()
 
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((1, OBSERVED), dtype=np.float32)
@@ -108,9 +115,10 @@ def convert_whole(folder: Path, name: str, precision: str = "int8") -> None:
 
     directory, task = saved(folder, name)
     print(f"{peak():5.2f} GiB before compiling")
-    stages = Stages()
-    ttscompile.convert(directory, folder / "compiled", precision=precision, task=task, explain=stages)
-    stages.end()
+    with watched() as most:
+        stages = Stages(most)
+        ttscompile.convert(directory, folder / "compiled", precision=precision, task=task, explain=stages)
+        stages.end()
     tell_sizes(folder / "compiled")
 
 
@@ -125,7 +133,7 @@ def tell_sizes(directory: Path) -> None:
 
 
 def saved(folder: Path, name: str) -> tuple[Path, str | None]:
-    """Where a whole policy is saved, by which it is written unless it is there; and the instruction of evo1 alone."""
+    """Where a whole policy is saved, which is written unless it is there; and the instruction that is compiled in."""
     import large_evo1
     import large_groot
     import large_pi0
@@ -137,7 +145,7 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     if not directory.exists():
         own = [large_smolvla, large_pi0, large_groot, large_evo1, large_xvla, large_rdt]
         dict(zip(WHOLE, own, strict=True))[name].save(directory)
-    return directory, large_evo1.TASK if name == "evo1" else None
+    return directory, large_evo1.TASK if name in ("evo1", "groot") else None
 
 
 def convert_clip(folder: Path) -> None:
@@ -148,9 +156,10 @@ def convert_clip(folder: Path) -> None:
 
     module, spec = large_clip.policy()
     print(f"{peak():5.2f} GiB before compiling")
-    stages = Stages()
-    ttscompile.compile_denoiser(module, spec, folder / "compiled", precision="int8", explain=stages)
-    stages.end()
+    with watched() as most:
+        stages = Stages(most)
+        ttscompile.compile_denoiser(module, spec, folder / "compiled", precision="int8", explain=stages)
+        stages.end()
 
 
 def run_whole(folder: Path, rounds: int, name: str) -> None:

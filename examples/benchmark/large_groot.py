@@ -12,7 +12,6 @@ from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, save_drawn, write_js
 from safetensors.torch import save_file
 
 Shapes = Iterator[tuple[str, torch.Size]]
-TASK = "put the red cup on the shelf"
 BASE, BACKBONE = "GR00T-N1.7-3B", "Cosmos-Reason2-2B"
 _MARKS = ("<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>")
 _FIRST_MARK, _IMAGE_TOKEN = 151643, 151655
