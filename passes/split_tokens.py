@@ -3,16 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import groupby
+from itertools import accumulate, groupby
+
+import numpy as np
 
 from ttscompile.ir.binding import bindings, input_bindings, join
+from ttscompile.ir.dataflow import reachable_from, reaching
 from ttscompile.ir.graph import Argument, Graph, Node, Ref, TensorType
 from ttscompile.ir.operations import Movement, axis_after, operation
-from ttscompile.ir.program import Binding, Cut
+from ttscompile.ir.program import Binding, Captured, Cut
 
 from .base import Pass, PassResult
 
-_CAT, _LINEAR = "aten.cat.default", "aten.linear.default"
+_CAT, _LINEAR, _SLICE = "aten.cat.default", "aten.linear.default", "aten.slice.Tensor"
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class _Splitter:
         type_ = _resized(self.types[name], axis, size)
         part = f"{node.name}.slice{index}"
         args = (Ref(name), axis, start, start + size)
-        self.nodes.append(Node(part, "aten.slice.Tensor", args, (), (type_,), node.source))
+        self.nodes.append(Node(part, _SLICE, args, (), (type_,), node.source))
         self.types[part], self.bindings[part] = type_, self.bindings[name]
         return part
 
@@ -237,6 +240,66 @@ class SplitFeatures(Pass[Cut, Cut]):
         return PassResult(replace(program, prologue=replace(prologue, nodes=tuple(nodes))), (note,))
 
 
+class SplitStem(Pass[Captured, Captured]):
+    """Let what a linear layer reads beside the sample meet its columns of the weight outside of the loop.
+
+    Actions and their time are concatenated so in flow matching, in pi0 say. Before::
+
+        %wide = aten.expand.default(%time, [B, 50, 720])
+        %f    = aten.cat.default([%actions, %wide], 2)
+        %h    = aten.linear.default(%f, %w, %b)                  # in the loop
+
+    After::
+
+        %h.part0 = aten.linear.default(%actions, %w[:, :720], %b)
+        %h.part1 = aten.linear.default(%time, %w[:, 720:])       # of one row: a table in the artifact
+        %h       = aten.add.Tensor(%h.part0, %h.part1)
+
+    The result differs from the original by rounding only.
+    """
+
+    def call(self, program: Captured) -> PassResult[Captured]:
+        """Split in the denoiser."""
+        graph, sample = program.denoiser, program.spec.sample_argument
+        loop, producers, types = reachable_from(graph, [sample]), graph.producers(), graph.types()
+        nodes, notes, constants, weights = list[Node](), list[str](), dict(graph.constants), dict(program.weights)
+        for node in graph.nodes:
+            parts = _features(node, producers, types) if node.op == _LINEAR and node.name in loop else []
+            moving = [i for i, part in enumerate(parts) if part in loop]
+            if len(parts) < 2 or len(moving) != 1 or list(node.refs())[1] not in constants:
+                nodes.append(node)
+                continue
+            own = [part if part in loop else _narrow(part, producers, types) for part in parts]
+            for made in _sum(node, own, types, *moving):
+                if made.op != _SLICE:
+                    nodes.append(made)
+                    continue
+                # A constant of its own: what the loop reads of the prologue it reads a step at a time.
+                weight, _, start, end = made.args
+                assert isinstance(weight, Ref)
+                constants[made.name] = made.type
+                weights[made.name] = np.ascontiguousarray(program.weights[weight.name][:, start:end])
+            notes.append(f"%{node.name} ({node.source or 'source unknown'}): one of {len(parts)} parts is in the loop")
+        if not notes:
+            return PassResult(program)
+        split = replace(graph, nodes=tuple(nodes))
+        live = reaching(split, graph.outputs)  # without what was concatenated
+        left = {name: type_ for name, type_ in constants.items() if name in live}
+        split = replace(split, constants=left, nodes=tuple(node for node in nodes if node.name in live))
+        kept = {name: value for name, value in weights.items() if name in left}
+        return PassResult(replace(program, denoiser=split, weights=kept), tuple(notes))
+
+
+def _narrow(part: str, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> str:
+    """What was repeated along other axes than the last to make a value; itself where it is not known."""
+    node = producers.get(part)
+    if node is None or node.op != "aten.expand.default":
+        return part
+    (source,) = node.refs()
+    before = types[source].shape
+    return source if len(before) == len(node.type.shape) and before[-1] == node.type.shape[-1] else part
+
+
 def _features(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> list[str]:
     """The features that a linear layer reads, if they are concatenated along its last axis; else none."""
     source, weight = node.args[0], node.args[1]
@@ -260,25 +323,31 @@ def _joined(cat: Node, types: Mapping[str, TensorType]) -> tuple[list[str], int]
     return names if alike else [], axis % len(cat.type.shape)
 
 
-def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType]) -> list[Node]:
+def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType], first: int = 0) -> list[Node]:
+    """The sum of what each part makes with its columns; it begins with ``first``, which has all rows and the bias."""
     weight = node.args[1]
     assert isinstance(weight, Ref)
     matrix, nodes = types[weight.name], list[Node]()
+    ends = list(accumulate(_width(types[part]) for part in parts))
 
     def emit(name: str, op: str, args: tuple[Argument, ...], type_: TensorType) -> Ref:
         nodes.append(Node(name, op, args, (), (type_,), node.source))
         return Ref(name)
 
-    start, total = 0, Ref("")
-    for index, part in enumerate(parts):
-        size = types[part].shape[-1]
-        assert isinstance(size, int)
-        cut = (weight, 1, start, start + size)
-        columns = emit(f"{node.name}.columns{index}", "aten.slice.Tensor", cut, _resized(matrix, 1, size))
+    order, total = [first, *(i for i in range(len(parts)) if i != first)], Ref("")
+    for place, index in enumerate(order):
+        part, size = parts[index], _width(types[parts[index]])
+        cut = (weight, 1, ends[index] - size, ends[index])
+        columns = emit(f"{node.name}.columns{index}", _SLICE, cut, _resized(matrix, 1, size))
         made = TensorType((*types[part].shape[:-1], matrix.shape[0]), node.type.dtype)
-        args = (Ref(part), columns, *(node.args[2:] if index == 0 else ()))  # the bias once
+        args = (Ref(part), columns, *(() if place else node.args[2:]))  # the bias once
         linear = emit(f"{node.name}.part{index}", _LINEAR, args, made)
-        name = node.name if index == len(parts) - 1 else f"{node.name}.sum{index}"
-        total = emit(name, "aten.add.Tensor", (total, linear), node.type) if index else linear
-        start += size
+        name = node.name if place == len(parts) - 1 else f"{node.name}.sum{place}"
+        total = emit(name, "aten.add.Tensor", (total, linear), node.type) if place else linear
     return nodes
+
+
+def _width(type_: TensorType) -> int:
+    size = type_.shape[-1]
+    assert isinstance(size, int)
+    return size

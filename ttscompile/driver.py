@@ -47,7 +47,7 @@ from .passes.partition import Partition
 from .passes.regroup_sums import RegroupSums
 from .passes.reuse_tokens import ReuseTokens
 from .passes.split_frames import SplitFrames
-from .passes.split_tokens import SplitFeatures, SplitTokens
+from .passes.split_tokens import SplitFeatures, SplitStem, SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
 from .verification.record_golden import record_original
@@ -272,7 +272,7 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = lambda 
     dense = (graph_flops(whole) - once) * spec.sampler.steps + once
     captured = Captured(spec, graph, weights, dense_flops=dense, once_flops=once)
     verify(captured)
-    for simplify in (CleanUp[Captured](), CutCopies(), WidenAttention(), RegroupSums()):
+    for simplify in (CleanUp[Captured](), CutCopies(), WidenAttention(), SplitStem(), RegroupSums()):
         captured = _run(simplify, captured, explain)
     captured, table = _find_blocks(captured, explain)
     cut = _run(Partition(table.blocks), captured, explain)
