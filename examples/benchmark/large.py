@@ -180,7 +180,7 @@ def run_whole(folder: Path, rounds: int, name: str) -> None:
 
 def _vision(module: nn.Module) -> nn.Module:
     """The image encoder of a vision-language-action model; of RDT the adaptor of its tokens."""
-    names = ("vision_model", "vision_tower", "encoder.image")
+    names = ("vision_model", "vision_tower", "visual", "encoder.image")
     return next(one for name, one in module.named_modules() if name.endswith(names))
 
 
