@@ -83,8 +83,9 @@ _TEXT = "model.vlm_with_expert.vlm.model.text_model"
 
 def random_weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
     """Such that the numbers in the network neither vanish nor explode."""
-    if len(shape) > 1:
-        return torch.randn(shape, generator=draw) * shape[1:].numel() ** -0.5
+    if len(shape) > 1:  # GR00T's, of all embodiments, are [kinds, before, after]
+        read = shape[1] if name.endswith(".W") else shape[1:].numel()
+        return torch.randn(shape, generator=draw) * read**-0.5
     return torch.ones(shape) if "norm" in name and name.endswith("weight") else torch.zeros(shape)
 
 
