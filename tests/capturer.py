@@ -30,10 +30,10 @@ def captured_once(directory: Path) -> Iterator[None]:
 
     ``capture`` compares each with the module, as always. Traced every time are a module that nobody can pickle, for a
     lambda or a local class in it, those of processes that a test starts, and of a test that watches
-    ``torch.export.export``.
+    torch's own ``_export``.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    trace, convert, watched = export._traced, export._Converter, torch.export.export
+    trace, convert, watched = export._traced, export._Converter, torch.export._trace._export
 
     class Converter:
         """In place of the compiler's; what is given to the tracer is given to it."""
@@ -42,7 +42,7 @@ def captured_once(directory: Path) -> Iterator[None]:
             self.module, self.how = module, (spec, streams)
 
         def convert(self) -> tuple[Graph, export.Weights]:
-            key = structure(self.module, *self.how) if torch.export.export is watched else None
+            key = structure(self.module, *self.how) if torch.export._trace._export is watched else None
             if key is None:
                 return convert(*trace(self.module, *self.how)).convert()
             held = registered(self.module)

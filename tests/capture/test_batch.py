@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tests.passes.specs import toy_spec
-from ttscompile.capture.batch import unify_batch
+from ttscompile.capture.batch import RARE, unify_batch
 from ttscompile.capture.export import capture
 from ttscompile.errors import CaptureError
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
@@ -43,7 +44,7 @@ def test_what_depends_on_the_batch_otherwise_is_refused() -> None:
 class Branches(nn.Module):
     """Does something else for many streams."""
 
-    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+    def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
         y = sample.chunk(len(sample), 0)[0] if len(sample) > 5 else sample
         return y.expand(sample.shape) * obs[:, :1, None]
 
@@ -51,3 +52,33 @@ class Branches(nn.Module):
 def test_a_module_that_looks_at_the_number_of_streams_is_refused() -> None:
     with pytest.raises(CaptureError):
         capture(Branches(), toy_spec())
+
+
+class Odd(nn.Module):
+    """Has as many hidden numbers as ``RARE``, and twice as many, and computes with what is given."""
+
+    def __init__(self, then: Callable[[Tensor], Tensor] = torch.tanh) -> None:
+        super().__init__()
+        self.up, self.down, self.then = nn.Linear(2, 2 * RARE), nn.Linear(RARE, 2), then
+
+    def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
+        return self.down(self.then(self.up(sample).unflatten(-1, (RARE, 2)).sum(-1)))
+
+
+@pytest.mark.parametrize(
+    "then", [torch.tanh, lambda h: h.clamp(max=3 * RARE), lambda h: h[..., -RARE:], lambda h: torch.fmod(h, RARE)]
+)
+def test_a_number_of_the_network_may_be_the_batch_size_of_the_capture(then: Callable[[Tensor], Tensor]) -> None:
+    found, _ = capture(Odd(then), toy_spec())
+    assert {size for node in found.nodes for size in node.type.shape} == {Batch(), 4, 2, RARE, 2 * RARE}
+    numbers = {argument for node in found.nodes for argument in node.args if isinstance(argument, int | Batch)}
+    assert not any(isinstance(number, Batch) for number in numbers)
+
+
+def test_a_number_that_changes_no_shape_is_no_batch() -> None:
+    class Clamped(nn.Module):
+        def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
+            return sample.clamp(max=RARE) + 0 * obs[:, :1, None]
+
+    (clamp,) = (node for node in capture(Clamped(), toy_spec())[0].nodes if "clamp" in node.op)
+    assert RARE in (*clamp.args, *dict(clamp.kwargs).values())

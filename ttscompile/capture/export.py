@@ -1,6 +1,6 @@
 """Capture one evaluation of a denoiser as a graph: ``torch.export``, ATen level, weights lifted, batch symbolic.
 
-It is captured with two batch sizes, and ``batch`` finds the batch among the numbers.
+It is captured with a batch size that is rare among numbers, and ``batch`` finds the batch; in doubt, with two.
 """
 
 import logging
@@ -9,7 +9,8 @@ import re
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
 
@@ -17,15 +18,16 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.export._trace
+import torch.export.exported_program as decompose
 from torch import Tensor, nn
 from torch.export.graph_signature import InputKind, OutputKind
 
 from ..core.spec import PolicySpec
 from ..errors import CaptureError
 from ..frontends.encoded import sharing_copy
-from ..ir.evaluate import evaluator, without_stack_traces
-from ..ir.graph import GETITEM, Argument, Enum, Graph, Node, Ref, TensorType
-from .batch import BATCHES, REMEDY, unify_batch
+from ..ir.evaluate import Evaluator, evaluator, resolve_op
+from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
+from .batch import BATCHES, RARE, REMEDY, unify_batch
 
 _TORCH = PurePath(torch.__file__).parent
 _ADVICE = re.compile(r"\s*\n(?:Caused by: \(|For more information, run with|The error above occurred when calling)")
@@ -55,8 +57,17 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
             or what the module computes for a stream depends on the others, or on how many there are.
     """
     module = sharing_copy(module)
-    (left, weights), (right, others) = (_Converter(*_traced(module, spec, n)).convert() for n in BATCHES)
-    graph = unify_batch(left, right)
+    with suppress(CaptureError):  # if a number of the network is a multiple of this batch; or two say what is wrong
+        return _captured(module, spec, (RARE,))
+    return _captured(module, spec, BATCHES)
+
+
+def _captured(module: nn.Module, spec: PolicySpec, batches: tuple[int, ...]) -> tuple[Graph, Weights]:
+    (left, weights), *more = (_Converter(*_traced(module, spec, n)).convert() for n in batches)
+    right, others = more[0] if more else (left, weights)
+    graph = unify_batch(left, right, (batches[0], batches[-1]))
+    if not more:
+        _require_sizes(graph)
     found, expected = graph.types()[graph.outputs[0]], graph.inputs[spec.sample_argument]
     if found != expected:
         raise CaptureError(f"the module returns {found}; expected the type of its sample, {expected}.")
@@ -65,6 +76,28 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
         raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}")
     _require_streams_alike(module, spec, graph, weights)
     return graph, weights
+
+
+def _require_sizes(graph: Graph) -> None:
+    """Refuse a graph in which a number may be no size and was taken for one; a size that is none has a wrong shape."""
+    for node in graph.nodes:
+        if node.op != GETITEM and not node.op.startswith("aten.arange."):
+            kinds = {each.name: str(each.type) for each in resolve_op(node)._schema.arguments}
+            given = [*zip(kinds, node.args, strict=False), *node.kwargs]
+            if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
+                raise CaptureError(f"{node} computes with a multiple of {RARE}, which may be the batch size.{REMEDY}")
+    single = [node for node in graph.nodes if len(node.types) == 1]
+    run = Evaluator(
+        replace(graph, outputs=tuple(node.name for node in single)), _of_two(graph.constants), torch.device("meta")
+    )
+    for node, value in zip(single, run(_of_two(graph.inputs)), strict=True):
+        if tuple(value.shape) != node.type.at(2):
+            raise CaptureError(f"{node} has the shape {tuple(value.shape)} for two streams.{REMEDY}")
+
+
+def _of_two(types: Mapping[str, TensorType]) -> dict[str, torch.Tensor]:
+    """Without values."""
+    return {n: torch.empty(t.at(2), dtype=getattr(torch, t.dtype), device="meta") for n, t in types.items()}
 
 
 def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, weights: Weights) -> None:
@@ -110,9 +143,10 @@ def _traced(
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
             # and about recurrent layers, which list their weights anew when they are copied
             warnings.filterwarnings("ignore", message=".*_flat_weights.*", category=UserWarning)
-            exported = torch.export.export(module, (), kwargs=given, strict=False)
-            with without_stack_traces():  # each operation keeps the one that it was captured with
-                return exported.run_decompositions(dict(AS_CAT)), examples
+            # what torch.export.export and then run_decompositions give, which trace the module and trace it again
+            table, _ = decompose._split_decomp_table_to_cia_and_python_decomp(dict(AS_CAT))
+            with decompose._override_composite_implicit_decomp(table):
+                return torch.export._trace._export(module, (), given, strict=False), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
         place = _innermost("".join(traceback.format_tb(error.__traceback__)))
         called = ", ".join(f"{name} {tuple(value.shape)} {value.dtype}" for name, value in examples.items())
@@ -156,6 +190,8 @@ def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[
 
 
 def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
+    if streams == RARE:  # memory that nobody writes to takes none
+        return {name: one.new_empty(streams, *one.shape[1:]) for name, one in _examples(spec, 1).items()}
     generator = torch.Generator().manual_seed(0)
     sample = torch.randn(streams, *spec.sample, generator=generator)
     timestep = torch.from_numpy(spec.sampler.timesteps)[:1].repeat(streams)
@@ -222,7 +258,7 @@ class _Converter:
             op = GETITEM
         elif isinstance(target, torch._ops.OpOverload) and target.namespace == "aten":
             # Values have no strides here: a view of whatever layout is a reshape.
-            op = _RESHAPE if target in _VIEWS else str(target)
+            op = _RESHAPE if target in _VIEWS else str(target).replace("lift_fresh_copy", "clone")  # of torch.tensor(1)
         else:
             raise CaptureError(
                 f"%{fx_node.name} ({_source(fx_node)}) calls {target}, which is no ATen operation."
