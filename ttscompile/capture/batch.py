@@ -1,9 +1,9 @@
 """The batch as a symbol, found among the numbers of a graph, or of two that were captured with different batch sizes.
 
 torch.export can reason about a symbolic batch, and gives up where it cannot prove something that is true:
-``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove. A size that is ``5 * c`` in one
-graph and ``7 * c`` in the other is ``c * B``; one that is equal in both is a number; anything else is refused. One graph is
-enough where every ``107 * c`` is ``c * B``, which the caller checks.
+``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove. A size that is ``5 * c`` in
+one graph and ``7 * c`` in the other is ``c * B``; one that is equal in both is a number; anything else is refused. One
+graph is enough where every ``107 * c`` is ``c * B``, which the caller checks.
 """
 
 from ..errors import CaptureError
