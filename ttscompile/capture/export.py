@@ -87,16 +87,13 @@ def _require_sizes(graph: Graph) -> None:
             if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
                 raise CaptureError(f"{node} computes with a multiple of {RARE}, which may be the batch size.{REMEDY}")
     single = [node for node in graph.nodes if len(node.types) == 1]
-    run = Evaluator(
-        replace(graph, outputs=tuple(node.name for node in single)), _of_two(graph.constants), torch.device("meta")
-    )
+    run = Evaluator(replace(graph, outputs=tuple(node.name for node in single)), _of_two(graph.constants), "meta")
     for node, value in zip(single, run(_of_two(graph.inputs)), strict=True):
         if tuple(value.shape) != node.type.at(2):
             raise CaptureError(f"{node} has the shape {tuple(value.shape)} for two streams.{REMEDY}")
 
 
 def _of_two(types: Mapping[str, TensorType]) -> dict[str, torch.Tensor]:
-    """Without values."""
     return {n: torch.empty(t.at(2), dtype=getattr(torch, t.dtype), device="meta") for n, t in types.items()}
 
 
