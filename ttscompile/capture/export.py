@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.export._trace
-import torch.export.exported_program as decompose
 from torch import Tensor, nn
+from torch.export import _trace, exported_program as decompose
 from torch.export.graph_signature import InputKind, OutputKind
 
 from ..core.spec import PolicySpec
@@ -82,7 +81,7 @@ def _require_sizes(graph: Graph) -> None:
     """Refuse a graph in which a number may be no size and was taken for one; a size that is none has a wrong shape."""
     for node in graph.nodes:
         if node.op != GETITEM and not node.op.startswith("aten.arange."):
-            kinds = {each.name: str(each.type) for each in resolve_op(node)._schema.arguments}
+            kinds = {a.name: str(a.type) for a in resolve_op(node)._schema.arguments}  # type: ignore[attr-defined]
             given = [*zip(kinds, node.args, strict=False), *node.kwargs]
             if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
                 raise CaptureError(f"{node} computes with a multiple of {RARE}, which may be the batch size.{REMEDY}")
@@ -143,7 +142,7 @@ def _traced(
             # what torch.export.export and then run_decompositions give, which trace the module and trace it again
             table, _ = decompose._split_decomp_table_to_cia_and_python_decomp(dict(AS_CAT))
             with decompose._override_composite_implicit_decomp(table):
-                return torch.export._trace._export(module, (), given, strict=False), examples
+                return _trace._export(module, (), given, strict=False), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
         place = _innermost("".join(traceback.format_tb(error.__traceback__)))
         called = ", ".join(f"{name} {tuple(value.shape)} {value.dtype}" for name, value in examples.items())
@@ -159,7 +158,7 @@ def _traced(
 @contextmanager
 def _one_message() -> Iterator[None]:
     """What fails is told by the error: torch.export logs its traceback too, and prints the graph as far as it came."""
-    logger, names = logging.getLogger("torch"), vars(torch.export._trace)
+    logger, names = logging.getLogger("torch"), vars(_trace)
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # what TORCH_LOGS asks for has a level of its own
     names["print"] = lambda *_, **__: None
