@@ -70,12 +70,12 @@ def test_the_columns_of_the_sample_alone_stay_in_the_loop(kind: str, parts: int)
     assert_equal_but_for_rounding(*values, counted.terms)
     assert SplitStem()(result.program).program is result.program
 
-    program = transform(module, before.spec)
-    stem = program.pieces.loop["stem"].graph
+    pieces = transform(module, before.spec).pieces
+    stem = pieces.loop["stem"].graph
     shapes = {name: type_.shape for name, type_ in stem.constants.items()}
     assert (WIDTH, WIDTH) in shapes.values(), "the columns that the sample meets"
     assert all(size[-1:] != (parts * WIDTH,) for size in shapes.values())
-    (table,) = program.pieces.tables.values()
+    (table,) = pieces.tables.values()
     assert table.shape == (3, 1, 1, WIDTH), "the time's part has one row a step, not one an action"
 
 

@@ -1,96 +1,80 @@
-"""The batch as a symbol, found among the numbers of a graph, or of two that were captured with different batch sizes.
+"""The batch as a symbol, found among the numbers of a graph that was captured with a batch size rare among them.
 
 torch.export can reason about a symbolic batch, and gives up where it cannot prove something that is true:
-``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove. A size that is ``5 * c`` in
-one graph and ``7 * c`` in the other is ``c * B``; one that is equal in both is a number; anything else is refused. One
-graph is enough where every ``107 * c`` is ``c * B``, which the caller checks.
+``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove: ``107 * c`` is ``c * B``. A
+network may have such a number of its own, so all shapes are then computed for two streams, and have to be those that
+follow. Where they are not, another number is tried.
 """
 
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+
 from ..errors import CaptureError
-from ..ir.graph import Argument, Batch, Graph, Node, Size, TensorType
+from ..ir.evaluate import Evaluator, resolve_op
+from ..ir.graph import GETITEM, Argument, Batch, Graph, Node, Size, TensorType
 
-BATCHES = (5, 7)
-"""Batch sizes to capture with: primes that are no divisors of what networks are made of."""
-
-RARE = 107
-"""Batch size to capture with at first: few numbers of networks are a multiple of it."""
-
-
-def unify_batch(left: Graph, right: Graph, batches: tuple[int, int] = BATCHES) -> Graph:
-    """One graph for every batch size.
-
-    Args:
-        left: captured with a batch of ``batches[0]``.
-        right: the same module captured with a batch of ``batches[1]``; ``left`` itself for ``(RARE, RARE)``.
-
-    Raises:
-        CaptureError: they differ in more than the batch size; names the first node that does.
-    """
-    inputs = {name: _type(name, type_, right.inputs[name], batches) for name, type_ in left.inputs.items()}
-    if left.constants != right.constants:
-        raise CaptureError(f"the module makes constants that depend on the batch size.{REMEDY}")
-    if len(left.nodes) != len(right.nodes) or left.outputs != right.outputs:
-        counts = f"{len(left.nodes)} operations for a batch of {batches[0]} and {len(right.nodes)} for {batches[1]}"
-        raise CaptureError(f"the module takes {counts}.{REMEDY}")
-    nodes = tuple(_node(a, b, batches) for a, b in zip(left.nodes, right.nodes, strict=True))
-    return Graph(inputs, left.constants, nodes, left.outputs)
-
+BATCHES = (107, 109)
+"""Batch sizes to capture with, the second if the first does not do: few numbers of networks are a multiple of one."""
 
 REMEDY = " Every stream of a batch must be computed alike, whatever their number: no loop or branch on the batch size."
 
 
-def _node(left: Node, right: Node, batches: tuple[int, int]) -> Node:
-    where = f"%{left.name} ({left.source})"
-    if (left.name, left.op) != (right.name, right.op):
-        raise CaptureError(f"{where} is {left.op} for a batch of {batches[0]} and {right.op} for another.{REMEDY}")
-    if len(left.types) != len(right.types):
-        raise CaptureError(f"{where} gives {len(left.types)} values or {len(right.types)}, by the batch size.{REMEDY}")
-    return Node(
-        left.name,
-        left.op,
-        _arguments(where, left.args, right.args, batches),
-        tuple(
-            (key, _argument(where, a, b, batches)) for (key, a), (_, b) in zip(left.kwargs, right.kwargs, strict=True)
-        ),
-        tuple(_type(where, a, b, batches) for a, b in zip(left.types, right.types, strict=True)),
-        left.source,
-    )
+def with_batch(graph: Graph, batch: int) -> Graph:
+    """The graph for every batch size, of one that was captured with this one.
+
+    Raises:
+        CaptureError: a size is no multiple of the batch size, or a multiple of it may be something else; names the
+            first node at which that is seen.
+    """
+    inputs = {name: _type(type_, batch) for name, type_ in graph.inputs.items()}
+    found = replace(graph, inputs=inputs, nodes=tuple(_node(node, batch) for node in graph.nodes))
+    _require_sizes(found, graph, batch)
+    return found
 
 
-def _arguments(
-    where: str, left: tuple[Argument, ...], right: tuple[Argument, ...], batches: tuple[int, int]
-) -> tuple[Argument, ...]:
-    if len(left) != len(right):
-        raise CaptureError(f"{where} has {len(left)} arguments or {len(right)}, by the batch size.{REMEDY}")
-    return tuple(_argument(where, a, b, batches) for a, b in zip(left, right, strict=True))
+def _node(node: Node, batch: int) -> Node:
+    args = tuple(_argument(each, batch) for each in node.args)
+    named = tuple((name, _argument(each, batch)) for name, each in node.kwargs)
+    return replace(node, args=args, kwargs=named, types=tuple(_type(each, batch) for each in node.types))
 
 
-def _argument(where: str, left: Argument, right: Argument, batches: tuple[int, int]) -> Argument:
-    if isinstance(left, tuple) and isinstance(right, tuple):
-        return _arguments(where, left, right, batches)
-    if type(left) is int and type(right) is int:
-        return _size(where, left, right, batches)
-    if left != right:
-        raise CaptureError(f"{where} has the argument {left} or {right}, by the batch size.{REMEDY}")
-    return left
+def _argument(argument: Argument, batch: int) -> Argument:
+    if isinstance(argument, tuple):
+        return tuple(_argument(each, batch) for each in argument)
+    return _size(argument, batch) if type(argument) is int else argument
 
 
-def _type(where: str, left: TensorType, right: TensorType, batches: tuple[int, int]) -> TensorType:
-    if len(left.shape) != len(right.shape) or left.dtype != right.dtype:
-        raise CaptureError(f"{where} is {left} or {right}, by the batch size.{REMEDY}")
-    sizes = (_size(where, a, b, batches) for a, b in zip(left.shape, right.shape, strict=True))
-    return TensorType(tuple(sizes), left.dtype)
+def _type(type_: TensorType, batch: int) -> TensorType:
+    return replace(type_, shape=tuple(_size(size, batch) for size in type_.shape))
 
 
-def _size(where: str, left: Size, right: Size, batches: tuple[int, int]) -> Size:
-    assert isinstance(left, int)
-    assert isinstance(right, int)
-    multiple = left // batches[0]
-    if multiple and (left, right) == (multiple * batches[0], multiple * batches[1]):  # negative: from the end
-        return Batch(multiple)
-    if left != right:
-        raise CaptureError(
-            f"a size at {where} is {left} for a batch of {batches[0]} and {right} for {batches[1]}, which is not a"
-            " multiple of the batch size. Only the batch may vary; write the other sizes as numbers."
-        )
-    return left
+def _size(size: Size, batch: int) -> Size:
+    assert isinstance(size, int)
+    return Batch(size // batch) if size and not size % batch else size  # negative: from the end
+
+
+def _require_sizes(graph: Graph, captured: Graph, batch: int) -> None:
+    """Refuse a graph in which a number may be no size and was taken for one; a size that is none has a wrong shape."""
+    for node in graph.nodes:
+        if node.op != GETITEM and not node.op.startswith("aten.arange."):
+            kinds = {a.name: str(a.type) for a in resolve_op(node)._schema.arguments}  # type: ignore[attr-defined]
+            given = [*zip(kinds, node.args, strict=False), *node.kwargs]
+            if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
+                raise CaptureError(
+                    f"%{node.name} ({node.source}) computes with a multiple of {batch}, the batch size.{REMEDY}"
+                )
+    single = [(node, before) for node, before in zip(graph.nodes, captured.nodes, strict=True) if len(node.types) == 1]
+    run = Evaluator(replace(graph, outputs=tuple(node.name for node, _ in single)), _of_two(graph.constants), "meta")
+    for (node, before), value in zip(single, run(_of_two(graph.inputs)), strict=True):
+        if tuple(value.shape) != node.type.at(2):
+            raise CaptureError(
+                f"a size at %{node.name} ({node.source}) is not a multiple of the batch size: it has the shape"
+                f" {tuple(before.type.shape)} for {batch} streams and {tuple(value.shape)} for 2. Only the batch may"
+                " vary; write the other sizes as numbers."
+            )
+
+
+def _of_two(types: Mapping[str, TensorType]) -> dict[str, torch.Tensor]:
+    return {n: torch.empty(t.at(2), dtype=getattr(torch, t.dtype), device="meta") for n, t in types.items()}

@@ -1,6 +1,6 @@
 """Capture one evaluation of a denoiser as a graph: ``torch.export``, ATen level, weights lifted, batch symbolic.
 
-It is captured with a batch size that is rare among numbers, and ``batch`` finds the batch; in doubt, with two.
+It is captured with a batch size that is rare among numbers, and ``batch`` finds the batch.
 """
 
 import logging
@@ -10,7 +10,6 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
 
@@ -24,9 +23,9 @@ from torch.export.graph_signature import InputKind, OutputKind
 from ..core.spec import PolicySpec
 from ..errors import CaptureError
 from ..frontends.encoded import sharing_copy
-from ..ir.evaluate import Evaluator, evaluator, resolve_op
-from ..ir.graph import GETITEM, Argument, Batch, Enum, Graph, Node, Ref, TensorType
-from .batch import BATCHES, RARE, REMEDY, unify_batch
+from ..ir.evaluate import evaluator
+from ..ir.graph import GETITEM, Argument, Enum, Graph, Node, Ref, TensorType
+from .batch import BATCHES, REMEDY, with_batch
 
 _TORCH = PurePath(torch.__file__).parent
 _ADVICE = re.compile(r"\s*\n(?:Caused by: \(|For more information, run with|The error above occurred when calling)")
@@ -56,44 +55,19 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
             or what the module computes for a stream depends on the others, or on how many there are.
     """
     module = sharing_copy(module)
-    with suppress(CaptureError):  # if a number of the network is a multiple of this batch; or two say what is wrong
-        return _captured(module, spec, (RARE,))
-    return _captured(module, spec, BATCHES)
+    with suppress(CaptureError):  # a number of the network may be a multiple of this batch
+        return _captured(module, spec, BATCHES[0])
+    return _captured(module, spec, BATCHES[1])
 
 
-def _captured(module: nn.Module, spec: PolicySpec, batches: tuple[int, ...]) -> tuple[Graph, Weights]:
-    (left, weights), *more = (_Converter(*_traced(module, spec, n)).convert() for n in batches)
-    right, others = more[0] if more else (left, weights)
-    graph = unify_batch(left, right, (batches[0], batches[-1]))
-    if not more:
-        _require_sizes(graph)
+def _captured(module: nn.Module, spec: PolicySpec, batch: int) -> tuple[Graph, Weights]:
+    graph, weights = _Converter(*_traced(module, spec, batch)).convert()
+    graph = with_batch(graph, batch)
     found, expected = graph.types()[graph.outputs[0]], graph.inputs[spec.sample_argument]
     if found != expected:
         raise CaptureError(f"the module returns {found}; expected the type of its sample, {expected}.")
-    own = {name: value for name, value in weights.items() if value.ctypes.data != others[name].ctypes.data}
-    if differ := [name for name, value in own.items() if not np.array_equal(value, others[name], equal_nan=True)]:
-        raise CaptureError(f"the module makes constants of the batch size: {', '.join(differ)}.{REMEDY}")
     _require_streams_alike(module, spec, graph, weights)
     return graph, weights
-
-
-def _require_sizes(graph: Graph) -> None:
-    """Refuse a graph in which a number may be no size and was taken for one; a size that is none has a wrong shape."""
-    for node in graph.nodes:
-        if node.op != GETITEM and not node.op.startswith("aten.arange."):
-            kinds = {a.name: str(a.type) for a in resolve_op(node)._schema.arguments}  # type: ignore[attr-defined]
-            given = [*zip(kinds, node.args, strict=False), *node.kwargs]
-            if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
-                raise CaptureError(f"{node} computes with a multiple of {RARE}, which may be the batch size.{REMEDY}")
-    single = [node for node in graph.nodes if len(node.types) == 1]
-    run = Evaluator(replace(graph, outputs=tuple(node.name for node in single)), _of_two(graph.constants), "meta")
-    for node, value in zip(single, run(_of_two(graph.inputs)), strict=True):
-        if tuple(value.shape) != node.type.at(2):
-            raise CaptureError(f"{node} has the shape {tuple(value.shape)} for two streams.{REMEDY}")
-
-
-def _of_two(types: Mapping[str, TensorType]) -> dict[str, torch.Tensor]:
-    return {n: torch.empty(t.at(2), dtype=getattr(torch, t.dtype), device="meta") for n, t in types.items()}
 
 
 def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, weights: Weights) -> None:
@@ -186,7 +160,7 @@ def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[
 
 
 def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
-    if streams == RARE:  # memory that nobody writes to takes none
+    if streams in BATCHES:  # memory that nobody writes to takes none
         return {name: one.new_empty(streams, *one.shape[1:]) for name, one in _examples(spec, 1).items()}
     generator = torch.Generator().manual_seed(0)
     sample = torch.randn(streams, *spec.sample, generator=generator)
