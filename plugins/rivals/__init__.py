@@ -1,12 +1,9 @@
 """What calibration is compared with: strategies that others have published, each a row of ``RIVALS``.
 
 ``static`` has strategies that follow a rule; ``fixed`` what all of one interval share; ``online`` what those share that
-decide during a call; ``slopes`` has the gradients that ``gates`` follows. This module alone imports no torch, so that
-the command line can list them. Nothing that calibrates by default imports the others.
-
-TaylorSeer (arXiv 2503.06923) is not here. It adds ``r(o) + (k - o) * (r(o) - r(p)) / (o - p)``, a combination of two
-computed residuals with a weight that grows with the step. A cell of the lattice adds one computed residual; neither a
-plan, nor an artifact, nor the runtimes' sums of reused residuals could say or hold more without a fifth source.
+decide during a call, and ``deciding`` lets them decide there; ``slopes`` has the gradients that ``gates`` follows. This
+module alone imports no torch, so that the command line can list them. Nothing that calibrates by default imports the
+others.
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ RIVALS = (
         "rivals.static:deepcache",
         least=lambda steps, blocks: blocks + (steps - 1) * min(2, blocks),  # the first and the last block of every step
     ),
-    Strategy("sag", "Sparse ActionGen (arXiv 2601.12894)", "rivals.gates:sag"),
+    Strategy("sag", "Sparse ActionGen (arXiv 2601.12894)", "rivals.sag:sag", uses_pruner=True),
     Strategy("dip-go", "DiP-GO (arXiv 2410.16942)", "rivals.gates:dip_go"),
     Strategy(
         "l2c",
@@ -51,5 +48,6 @@ RIVALS = (
         "rivals.online:dbcache",
         least=lambda steps, blocks: blocks + steps - 1,  # the first block of every step after step 0
     ),
+    Strategy("taylorseer", "TaylorSeer (arXiv 2503.06923), of the network's output", "rivals.taylorseer:TaylorSeer"),
 )
 """Names and modules; ``calibrate --strategy`` takes the names."""

@@ -1,13 +1,11 @@
 """Learned gates, then frozen: every cell has a score, learned by gradient; the cells with the highest are computed.
 
-- ``sag``: cells that are not computed read FORWARD, the residual of the last computed block of their kind. Source:
-  Sparse ActionGen (arXiv 2601.12894). There a network makes the gates from the observation; here they are frozen.
-- ``dip-go``: they read TIMESTEP, their own last residual. Source: Zhu et al., DiP-GO: A Diffusion Pruner via Few-step
-  Gradient Optimization, NeurIPS 2024 (arXiv 2410.16942).
+- ``dip-go``: cells that are not computed read TIMESTEP, their own last residual. Source: Zhu et al., DiP-GO: A
+  Diffusion Pruner via Few-step Gradient Optimization, NeurIPS 2024 (arXiv 2410.16942).
 - ``l2c``: the same, and every other step is computed whole, so that no residual is older than one step. Source: Ma et
   al., Learning-to-Cache, NeurIPS 2024 (arXiv 2406.01733).
 
-All three minimise the error of the executed actions plus a sparsity loss, with hard gates whose gradient is passed
+Both minimise the error of the executed actions plus a sparsity loss, with hard gates whose gradient is passed
 straight through, and find the threshold for the target by bisection. Here the threshold is the score of the last cell
 that the budget has room for, so the budget is kept throughout, without a weight for the sparsity loss. It begins with
 more cells than the budget and shrinks, as the sparsity loss does in the papers.
@@ -127,6 +125,5 @@ class Gates(NothingAfter):
         return plan.reshape(self._fixed.shape)
 
 
-sag = partial(Gates, reuse=Source.FORWARD)
 dip_go = partial(Gates, reuse=Source.TIMESTEP)
 l2c = partial(Gates, reuse=Source.TIMESTEP, whole=2)

@@ -1,7 +1,7 @@
 """Strategies that choose a criterion: it looks at each step and says which blocks are worth computing.
 
 A criterion is a few numbers, which the record of a calibration holds as JSON. Calibration asks it once a step, between
-two parts of the blocks; the runtimes execute one plan that it has decided::
+two parts of the blocks; the runtimes execute one plan that it has decided, and ``deciding`` asks it in the call::
 
     stem -> blocks 0..always-1, computed -> decide(k, feature) -> the other blocks, all computed or all reused -> tail
 
@@ -19,8 +19,8 @@ learn from, the one with the lowest error on all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import islice, pairwise, repeat
 from typing import Any
 
@@ -88,6 +88,26 @@ class Criterion:
     def record(self) -> dict[str, Any]:
         """As JSON."""
         return {**asdict(self), "polynomial": list(self.polynomial)}
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Criterion:
+        """The criterion that ``record`` gave, from the notes of a calibration.
+
+        Raises:
+            ArtifactError: members that a criterion does not have, or lacks; or values of another type.
+        """
+        kinds = {one.name: type(getattr(_EXAMPLE, one.name)) for one in fields(cls)}
+        given = {name: tuple(one) if isinstance(one, list) else one for name, one in record.items()}
+        numbers = given.get("polynomial")
+        plain = isinstance(numbers, tuple) and all(type(one) in (int, float) for one in numbers)
+        if {name: type(one) for name, one in given.items()} != kinds or not plain:
+            expected = ", ".join(f"{name}: {kind.__name__}" for name, kind in kinds.items())
+            raise ArtifactError(f"the record of a criterion has {expected}; found {record!r:.300}. Calibrate again.")
+        return cls(**given)
+
+
+_EXAMPLE = Criterion("", 0, 0.0, (0.0,), False, 1, False)
+"""Whose members have the types that a record's have."""
 
 
 class Decisions:

@@ -40,7 +40,7 @@ SHRINKING = 0.3
 """Share of the updates during which more is computed than the budget has."""
 
 FIRST = 2.0, 1.0
-"""Logits at first: of COMPUTE at the steps of that schedule, of TIMESTEP everywhere. The others are 0."""
+"""Logits at first: of COMPUTE at the steps of that schedule, of TIMESTEP everywhere (``reused``). The others are 0."""
 
 APART = 1e-3
 """Deviation of the logits of COMPUTE at first: no two cells are equal."""
@@ -75,11 +75,12 @@ class Paper(NothingAfter):
     Args:
         task: see ``Task``; its calls may be windows of consecutive ones. Without them nothing can be read of an earlier
             call, and without constants of the pruner one plan is trained for all observations.
-        sources: what cells may read that are not computed, beside TIMESTEP: what reads ROLLOUT in the first call of an
-            episode reads TIMESTEP instead.
+        sources: what cells may read that are not computed, beside ``reused``: what reads ROLLOUT in the first call of
+            an episode reads TIMESTEP instead.
         observes: whether the head reads the observation. Else one plan is trained for all calls.
         begin: the steps from which it departs, within the budget; None for the best of a family, and for more at first.
         updates: at most; None for ``UPDATES``.
+        reused: what cells read at first that are not computed.
 
     Attributes:
         loss: error of the best head so far on calls that it was not trained on, at the budget.
@@ -96,11 +97,12 @@ class Paper(NothingAfter):
         observes: bool = True,
         begin: Sequence[int] | None = None,
         updates: int | None = None,
+        reused: Source = Source.TIMESTEP,
     ) -> None:
         if updates is not None:
             self.intervals = updates
         self._task, self._observes = task, observes and has_head(task.pruner)
-        self._sources, self._begin = sources, begin
+        self._sources, self._begin, self._reused = sources, begin, reused
         practised, compared = _divided(task)
         self._practised, self._compared = (task.executor.select(task.calls, one) for one in (practised, compared))
         self._practice: Practice | None = None
@@ -185,9 +187,9 @@ class Paper(NothingAfter):
         base = np.zeros((model.steps, model.blocks, len(Source)))
         base[list(begin), :, Source.COMPUTE] = FIRST[0]
         base[..., Source.COMPUTE] += APART * draw.standard_normal(base.shape[:2])
-        base[..., Source.TIMESTEP] = FIRST[1]
+        base[..., self._reused] = FIRST[1]
         alone = {Source.ROLLOUT} if self._task.calls.window == 1 else set[Source]()
-        for source in {Source.FORWARD, Source.ROLLOUT} - (set(self._sources) - alone):
+        for source in set(Source) - {Source.COMPUTE, self._reused} - (set(self._sources) - alone):
             base[..., source] = FORBIDDEN
         return base.astype(np.float32)
 

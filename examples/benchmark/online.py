@@ -1,0 +1,227 @@
+"""Does it pay to decide during the call? Published criteria as they are, and frozen into a plan, by error and time.
+
+    python examples/benchmark/online.py compiled/ --trajectories calls.npz --sparsities 0.8,0.9
+
+A criterion (TeaCache, DBCache) is fitted to recorded calls for each share of reused cells. Then it answers held-out
+calls twice: it decides at each step what to compute (``ttscompile.rivals.deciding``), and as the one plan that
+calibration freezes it into. Beside these stand what other strategies find for the same shares, and the plans of the
+artifact. All take turns on one thread of onnxruntime, so a reader may compare errors at equal milliseconds. Errors are
+against the original with the same noise, so the loop has to be the original's. Nothing is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import click
+import numpy as np
+import numpy.typing as npt
+from searches import plan_of
+from strategies import default_sparsities
+
+from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.calibration.budget import cells_of, goal_of
+from ttscompile.calibration.calls import load_episodes
+from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.state import StateFile
+from ttscompile.calibration.strategies import NAMES
+from ttscompile.calibration.task import Found, Task
+from ttscompile.calibration.trials import Trials
+from ttscompile.cli.options import count_option, json_option, names_option
+from ttscompile.cli.output import print_json, results_console, run, say, table
+from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
+from ttscompile.cli.types import Number
+from ttscompile.core.lattice import PlanArray, Source
+from ttscompile.core.plan import Plan
+from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.errors import CalibrationError
+from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.timer import Timer
+from ttscompile.rivals.deciding import Deciding
+from ttscompile.rivals.online import Criterion
+from ttscompile.runtimes.open import open_runtime
+from ttscompile.runtimes.random_calls import Observation
+
+TOGETHER = 32
+"""Calls that are answered at once where nothing is timed."""
+
+WARM_UP = 2
+
+Answer = Callable[[Observation, Noise], tuple[FloatArray, PlanArray]]
+"""Denoised samples, and the cells that they took."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to answer a call.
+
+    Attributes:
+        name: of the strategy and the share of reused cells, or of the artifact's plan.
+        decides: ``online``, ``frozen``, or nothing where there is nothing to decide.
+        cells: computed in a call, mean and most.
+        error: mean absolute difference of the executed actions from the original's, in their units.
+        ms: median of a call.
+        quartiles: of the times.
+    """
+
+    name: str
+    decides: str
+    cells: tuple[float, int]
+    error: float
+    ms: float
+    quartiles: tuple[float, float]
+
+
+class Contestants:
+    """Whoever answers, by name and by when it decides."""
+
+    def __init__(self, artifact: Artifact, base: Plan) -> None:
+        self._artifact, self._base = artifact, base
+        self.answers: dict[tuple[str, str], Answer] = {}
+
+    def add_plan(self, name: str, decides: str, plan: Plan) -> None:
+        """A plan, which its own runtime executes, each call as the first of an episode."""
+        runtime = open_runtime(self._artifact, plan=plan)
+
+        def answer(obs: Observation, noise: Noise) -> tuple[FloatArray, PlanArray]:
+            sample, report = runtime.predict(obs, noise, plan)
+            runtime.reset()
+            return sample, report.plan
+
+        self.answers[name, decides] = answer
+
+    def add_found(self, name: str, found: Found) -> None:
+        """What a strategy found; its criterion, too, if it has one."""
+        criterion = found.notes.get("criterion")
+        plan = replace(self._base, cells=found.schedule, correction=found.correction, repair=True)
+        self.add_plan(name, "frozen" if criterion else "", plan)
+        if criterion:
+            deciding = Deciding(self._artifact, self._base, Criterion.of_record(criterion))
+
+            def answer(obs: Observation, noise: Noise) -> tuple[FloatArray, PlanArray]:
+                deciding.forget_frames()
+                return deciding.predict(obs, noise)
+
+            self.answers[name, "online"] = answer
+
+
+def measured(trials: Trials, contestants: Contestants, rounds: int) -> list[Row]:
+    """Errors on all held-out calls, and times of so many."""
+    answers, sample = list(contestants.answers.values()), trials.held_out
+    spec = view_of(trials.artifact, trials.base).manifest.spec
+    asked = [(int(s), int(row), draw) for s, row in sample.calls for draw in range(sample.draws)]
+    want = sample.answers.reshape(-1, *spec.sample)
+
+    def call(some: Sequence[tuple[int, int, int]]) -> tuple[Observation, Noise]:
+        obs = trials.observation([(int(sample.stretches[s, 0]), row) for s, row, _ in some])
+        return obs, trials.noise(spec, [trials.key(sample.part, *one) for one in some])
+
+    errors: list[list[npt.NDArray[np.float64]]] = [[] for _ in answers]
+    cells: list[list[npt.NDArray[np.int64]]] = [[] for _ in answers]
+    chunk, scale = spec.chunk, 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+    for begin in range(0, len(asked), TOGETHER):
+        given = call(asked[begin : begin + TOGETHER])
+        for answer, wrong, counted in zip(answers, errors, cells, strict=True):
+            found, plans = answer(*given)
+            off = np.abs(found - want[begin : begin + TOGETHER]).astype(np.float64)
+            wrong.append((off[:, chunk.start : chunk.stop, : chunk.action_dim] / scale).mean((1, 2)))
+            counted.append((plans == Source.COMPUTE).sum((1, 2)))
+    timer = Timer(len(answers), WARM_UP)
+    for number in range(WARM_UP + rounds):
+        given = call([asked[number % len(asked)]])
+        for i in timer.round():
+            timer.time(i, partial(answers[i], *given))
+    return [
+        Row(
+            name,
+            decides,
+            (float(np.concatenate(c).mean()), int(np.concatenate(c).max())),
+            float(np.concatenate(e).mean()),
+            t.median,
+            t.quartiles,
+        )
+        for (name, decides), e, c, t in zip(contestants.answers, errors, cells, timer.times, strict=True)
+    ]
+
+
+@click.command(cls=SectionedCommand)
+@click.argument("directory", type=click.Path(exists=True, path_type=Path))
+@trajectories_options()
+@names_option(
+    "--strategies", NAMES, default="teacache,dbcache,taylorseer,interval,tts", help="Have each of these find plans."
+)
+@click.option("--sparsities", help="Shares of reused cells, such as 0.8,0.9.")
+@count_option("--calls", "Judge on so many held-out observations, at most.", default=32)
+@count_option("--learned-calls", "Learn from so many calls, at most.", default=256, least=2)
+@count_option("--rounds", "Time so many calls of each.", default=24)
+@click.option("--max-minutes", type=Number(0, 1e6), default=1.0, show_default=True, help="Of each search, about.")
+@count_option("--seed", "Of the split, the noise and the searches.", default=0, least=0)
+@json_option
+def main(
+    directory: Path,
+    trajectories: tuple[Path, ...],
+    sources: Sources,
+    strategies: tuple[str, ...],
+    sparsities: str | None,
+    calls: int,
+    learned_calls: int,
+    rounds: int,
+    max_minutes: float,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Hold criteria that decide during a call against the plans that they are frozen into, in DIRECTORY's policy."""
+    artifact = load_artifact(directory)
+    episodes = load_episodes(artifact.manifest.spec, trajectories, sources)
+    with Bar(shown=True) as bar:
+        limits = (learned_calls, learned_calls)
+        trials = Trials.of(
+            artifact, episodes, StateFile(None, {}), seed=seed, observations=calls, limits=limits, bar=bar
+        )
+        manifest = trials.executor.view.manifest
+        own = trials.artifact.manifest.spec.sampler
+        if not manifest.spec.sampler.takes_noise_as(own):
+            raise CalibrationError(
+                f"{directory}: its loop is {manifest.spec.sampler.name} of {manifest.steps} steps, the original's"
+                f" {own.name} of {own.steps}: noise cannot be paired. Convert without --sampler and --steps."
+            )
+        asked = [float(one) for one in sparsities.split(",")] if sparsities else default_sparsities(manifest.steps)
+        contestants, task = Contestants(artifact, trials.base), Task.of(trials.executor, trials.calls, 0, seed)
+        for name, plan in artifact.plans.items():
+            contestants.add_plan(f"the artifact's {name}", "online" if plan.pruned else "", plan)
+        left_out = []
+        for share in asked:
+            cells = cells_of(goal_of(target_sparsity=share), manifest, False)
+            for name in strategies:
+                bar.stage(f"{name} {share:g}", 1, 0)
+                try:
+                    found, _ = plan_of(name, replace(task, budget=cells, pruner={}), seconds=60 * max_minutes)
+                    contestants.add_found(f"{name} {share:g}", found)
+                except CalibrationError as error:
+                    left_out.append(f"{name} {share:g}: {error}")
+        rows = sorted(measured(trials, contestants, rounds), key=lambda one: one.ms)
+    if as_json:
+        print_json({"rows": [asdict(one) for one in rows], "left_out": left_out, "machine": fingerprint()})
+        return
+    output, made = results_console(), table("plan", "decides", "cells", "most", "error", "ms a call", "quartiles")
+    for one in rows:
+        spread = f"{one.quartiles[0]:.1f} .. {one.quartiles[1]:.1f}"
+        made.add_row(
+            one.name, one.decides, f"{one.cells[0]:.0f}", str(one.cells[1]), f"{one.error:.3g}", f"{one.ms:.1f}", spread
+        )
+    output.print(made)
+    say(output, *left_out, one_line(fingerprint()))
+    say(
+        output,
+        "Error: mean absolute difference of the executed actions, in their units, from those of the original with the"
+        f" same noise; {len(trials.held_out.calls)} observations of episodes that nothing was learned from, with"
+        f" {trials.held_out.draws} draws of noise each.",
+    )
+
+
+if __name__ == "__main__":
+    run(main)

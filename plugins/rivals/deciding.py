@@ -1,0 +1,106 @@
+"""A criterion that decides during the call, on the product's own sessions: what ``online`` freezes, as it is published.
+
+No plan says so. A plan is settled before a call, and a runtime lowers it to instructions; here each step is asked for
+what the steps before it gave. So this is no runtime, and no runtime has a branch for it: it drives the workspace of the
+onnxruntime backend step by step, and is there to be held against the plan that a criterion was frozen into, by error
+and by milliseconds (``examples/benchmark/online.py``).
+
+Deciding has a price beside the criterion's own arithmetic. The feature of a step is known only after its stem, so that
+steps without a computed block cannot be passed in one go, as those of a plan are; and where blocks come first, a step
+that is computed whole cannot be one session.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ttscompile.artifact.load import Artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.core.lattice import BoolArray, PlanArray, Source
+from ttscompile.core.plan import Plan
+from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.runtimes.backend import Call
+from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
+from ttscompile.runtimes.onnxruntime.sessions import Sessions
+from ttscompile.runtimes.onnxruntime.workspace import Workspace
+
+from .online import Criterion, Decisions
+
+
+class Deciding:
+    """Calls of an artifact whose cells a criterion decides step by step.
+
+    Args:
+        plan: whose loop, weights and precision the calls have; its cells and its correction are not read.
+        threads: of arithmetic.
+
+    Raises:
+        RuntimeUnavailableError: onnxruntime is missing.
+        IllegalPlanError: the plan names what the artifact lacks.
+    """
+
+    def __init__(self, artifact: Artifact, plan: Plan, criterion: Criterion, threads: int = 1) -> None:
+        view = view_of(artifact, plan)
+        self._spec, self._criterion = view.manifest.spec, criterion
+        self._shape = view.manifest.steps, len(view.manifest.blocks)
+        self._axis = view.manifest.blocks[0].type.batch_axis or 0
+        self._backend = OnnxBackend(view, Sessions(threads), {})
+        Decisions(criterion, *self._shape, 1)  # refused before the first call
+
+    def forget_frames(self) -> None:
+        """Forget all frames, so that the next call computes every one of its own."""
+        self._backend.frames.forget()
+
+    def predict(self, obs: Mapping[str, FloatArray], noise: Noise) -> tuple[FloatArray, PlanArray]:
+        """One call. Streams decide for themselves; a block is computed for all of them where one of them computes it.
+
+        Args:
+            obs: normalised observations by key, ``[B, ...]`` each.
+            noise: of the loop; see ``Runtime.predict``.
+
+        Returns:
+            The denoised sample, float32 ``[B, T, D]``, and what was decided, int8 ``[B, K, blocks]``.
+        """
+        streams, backend = len(noise.initial), self._backend
+        steps, blocks = self._shape
+        backend.prepare(streams, None if self._criterion.always else ())  # with sessions of single blocks, or without
+        nothing = np.zeros(self._shape, np.bool_)
+        obs = {**obs, **self._spec.committed(streams, 0)}
+        backend.start(Call(obs, noise, None, None, nothing, np.broadcast_to(nothing, (streams, *self._shape))))
+        work = backend.workspace
+        assert work is not None  # ``prepare``
+        decisions, rows = Decisions(self._criterion, steps, blocks, streams), list[PlanArray]()
+        work.begin()
+        for k in range(steps):
+            rows.append(self._step(work, k, decisions))
+            work.advance(k)
+        return work.result(), np.stack(rows, 1)
+
+    def _step(self, work: Workspace, k: int, decisions: Decisions) -> PlanArray:
+        """The blocks of step k, and what was decided about them."""
+        first, blocks = range(self._criterion.always), len(work.current)
+        np.copyto(work.stream, work.fresh)
+        _run(work, k, first)
+        feature = work.current[: len(first)].sum(0) if first else work.fresh
+        row = decisions.decide(k, np.moveaxis(feature, self._axis, 0))
+        reused: BoolArray = row[:, -1] != Source.COMPUTE
+        kept = work.current.copy() if reused.any() and not reused.all() else work.current
+        if not reused.all() and first:
+            _run(work, k, range(len(first), blocks))
+        elif not reused.all():
+            work.run_dense(k)
+        if kept is not work.current:
+            np.moveaxis(work.current, 1 + self._axis, 0)[reused] = np.moveaxis(kept, 1 + self._axis, 0)[reused]
+        if reused.any():
+            total = work.fresh + work.current.sum(0)
+            np.moveaxis(work.stream, self._axis, 0)[reused] = np.moveaxis(total, self._axis, 0)[reused]
+        return row
+
+
+def _run(work: Workspace, k: int, blocks: Sequence[int]) -> None:
+    """Compute these blocks, one after the other, for all streams."""
+    for b in blocks:
+        work.run(k, b)
+        np.add(work.stream, work.current[b], out=work.stream)
