@@ -54,8 +54,7 @@ MAY_IMPORT = {
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
 RIVALS_READ = {
-    f"ttscompile.calibration.{name}"
-    for name in ("calls", "execute", "pruner.paper", "step_counts", "strategy", "task")
+    f"ttscompile.calibration.{name}" for name in ("calls", "execute", "pruner.paper", "step_counts", "strategy", "task")
 }
 """What rivals know of calibration: what a strategy is given, what it may compare, and how a head is trained."""
 

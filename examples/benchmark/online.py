@@ -5,8 +5,8 @@
 A criterion (TeaCache, DBCache) is fitted to recorded calls for each share of reused cells. Then it answers held-out
 calls twice: it decides at each step what to compute (``ttscompile.rivals.deciding``), and as the one plan that
 calibration freezes it into. Beside these stand what other strategies find for the same shares, and the plans of the
-artifact. All take turns on one thread of onnxruntime, so a reader may compare errors at equal milliseconds. Errors are
-against the original with the same noise, so the loop has to be the original's. Nothing is written.
+artifact. All take turns on one thread of onnxruntime, so that errors can be compared at equal milliseconds. Errors are
+against the same loop with every step computed, and the same noise. Nothing is written.
 """
 
 from __future__ import annotations
@@ -15,41 +15,55 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from time import process_time
+from typing import Any
 
 import click
 import numpy as np
 import numpy.typing as npt
+import torch
 from searches import plan_of
 from strategies import default_sparsities
 
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.budget import cells_of, goal_of
-from ttscompile.calibration.calls import load_episodes
+from ttscompile.calibration.calls import (
+    FRACTION,
+    draw_noise,
+    load_episodes,
+    observed,
+    prepare_calls,
+    sample_calls,
+    split_episodes,
+)
+from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.strategies import NAMES
+from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.trials import Trials
+from ttscompile.calibration.trials import base_of
 from ttscompile.cli.options import count_option, json_option, names_option
 from ttscompile.cli.output import print_json, results_console, run, say, table
 from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 from ttscompile.cli.types import Number
 from ttscompile.core.lattice import PlanArray, Source
-from ttscompile.core.plan import Plan
-from ttscompile.core.spec import FloatArray, Noise
+from ttscompile.core.plan import DENSE, FULL, Plan
+from ttscompile.core.spec import FloatArray, Noise, PolicySpec
 from ttscompile.errors import CalibrationError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.timer import Timer
 from ttscompile.rivals.deciding import Deciding
 from ttscompile.rivals.online import Criterion
 from ttscompile.runtimes.open import open_runtime
-from ttscompile.runtimes.random_calls import Observation
+from ttscompile.runtimes.random_calls import Observation, normalized
 
 TOGETHER = 32
 """Calls that are answered at once where nothing is timed."""
 
 WARM_UP = 2
+
+Array = npt.NDArray[Any]
 
 Answer = Callable[[Observation, Noise], tuple[FloatArray, PlanArray]]
 """Denoised samples, and the cells that they took."""
@@ -64,7 +78,7 @@ class Row:
         decides: ``online``, ``frozen``, or nothing where there is nothing to decide.
         cells: computed in a call, mean and most.
         error: mean absolute difference of the executed actions from the original's, in their units.
-        ms: median of a call.
+        ms: of the processor, median of a call.
         quartiles: of the times.
     """
 
@@ -76,14 +90,33 @@ class Row:
     quartiles: tuple[float, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Calls of episodes that nothing was learned from: normalised observations, and the noise of each."""
+
+    obs: Observation
+    noise: Noise
+
+    def calls(self, numbers: Sequence[int]) -> tuple[Observation, Noise]:
+        """Some of them."""
+        chosen = list(numbers)
+        steps = None if self.noise.steps is None else self.noise.steps[:, chosen]
+        return {key: one[chosen] for key, one in self.obs.items()}, Noise(self.noise.initial[chosen], steps)
+
+
 class Contestants:
-    """Whoever answers, by name and by when it decides."""
+    """Whoever answers, by name and by when it decides.
+
+    Attributes:
+        truth: answers with every cell of the loop computed.
+    """
 
     def __init__(self, artifact: Artifact, base: Plan) -> None:
         self._artifact, self._base = artifact, base
         self.answers: dict[tuple[str, str], Answer] = {}
+        self.truth = self.add_plan("every step", "", base)
 
-    def add_plan(self, name: str, decides: str, plan: Plan) -> None:
+    def add_plan(self, name: str, decides: str, plan: Plan) -> Answer:
         """A plan, which its own runtime executes, each call as the first of an episode."""
         runtime = open_runtime(self._artifact, plan=plan)
 
@@ -93,6 +126,7 @@ class Contestants:
             return sample, report.plan
 
         self.answers[name, decides] = answer
+        return answer
 
     def add_found(self, name: str, found: Found) -> None:
         """What a strategy found; its criterion, too, if it has one."""
@@ -109,43 +143,33 @@ class Contestants:
             self.answers[name, "online"] = answer
 
 
-def measured(trials: Trials, contestants: Contestants, rounds: int) -> list[Row]:
-    """Errors on all held-out calls, and times of so many."""
-    answers, sample = list(contestants.answers.values()), trials.held_out
-    spec = view_of(trials.artifact, trials.base).manifest.spec
-    asked = [(int(s), int(row), draw) for s, row in sample.calls for draw in range(sample.draws)]
-    want = sample.answers.reshape(-1, *spec.sample)
-
-    def call(some: Sequence[tuple[int, int, int]]) -> tuple[Observation, Noise]:
-        obs = trials.observation([(int(sample.stretches[s, 0]), row) for s, row, _ in some])
-        return obs, trials.noise(spec, [trials.key(sample.part, *one) for one in some])
-
-    errors: list[list[npt.NDArray[np.float64]]] = [[] for _ in answers]
-    cells: list[list[npt.NDArray[np.int64]]] = [[] for _ in answers]
+def measured(contestants: Contestants, spec: PolicySpec, judged: Judged, rounds: int) -> list[Row]:
+    """Errors on all calls, and times of so many."""
+    answers, count = list(contestants.answers.values()), len(judged.noise.initial)
+    errors: list[list[Array]] = [[] for _ in answers]
+    cells: list[list[Array]] = [[] for _ in answers]
     chunk, scale = spec.chunk, 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
-    for begin in range(0, len(asked), TOGETHER):
-        given = call(asked[begin : begin + TOGETHER])
+    part = (slice(None), slice(chunk.start, chunk.stop), slice(chunk.action_dim))
+    for begin in range(0, count, TOGETHER):
+        given = judged.calls(range(begin, min(begin + TOGETHER, count)))
+        want, _ = contestants.truth(*given)
         for answer, wrong, counted in zip(answers, errors, cells, strict=True):
             found, plans = answer(*given)
-            off = np.abs(found - want[begin : begin + TOGETHER]).astype(np.float64)
-            wrong.append((off[:, chunk.start : chunk.stop, : chunk.action_dim] / scale).mean((1, 2)))
+            off = np.abs(found - want).astype(np.float64)[part] / scale
+            wrong.append(off.mean((1, 2)))
             counted.append((plans == Source.COMPUTE).sum((1, 2)))
-    timer = Timer(len(answers), WARM_UP)
+    timer = Timer(len(answers), WARM_UP, process_time)  # one thread computes
     for number in range(WARM_UP + rounds):
-        given = call([asked[number % len(asked)]])
+        given = judged.calls([number % count])
         for i in timer.round():
             timer.time(i, partial(answers[i], *given))
-    return [
-        Row(
-            name,
-            decides,
-            (float(np.concatenate(c).mean()), int(np.concatenate(c).max())),
-            float(np.concatenate(e).mean()),
-            t.median,
-            t.quartiles,
-        )
-        for (name, decides), e, c, t in zip(contestants.answers, errors, cells, timer.times, strict=True)
-    ]
+    rows = []
+    for (name, decides), off, counts, took in zip(contestants.answers, errors, cells, timer.times, strict=True):
+        computed = np.concatenate(counts)
+        error = float(np.concatenate(off).mean())
+        many = float(computed.mean()), int(computed.max())
+        rows.append(Row(name, decides, many, error, took.median, took.quartiles))
+    return rows
 
 
 @click.command(cls=SectionedCommand)
@@ -155,7 +179,7 @@ def measured(trials: Trials, contestants: Contestants, rounds: int) -> list[Row]
     "--strategies", NAMES, default="teacache,dbcache,taylorseer,interval,tts", help="Have each of these find plans."
 )
 @click.option("--sparsities", help="Shares of reused cells, such as 0.8,0.9.")
-@count_option("--calls", "Judge on so many held-out observations, at most.", default=32)
+@count_option("--calls", "Judge on so many held-out calls, at most.", default=128)
 @count_option("--learned-calls", "Learn from so many calls, at most.", default=256, least=2)
 @count_option("--rounds", "Time so many calls of each.", default=24)
 @click.option("--max-minutes", type=Number(0, 1e6), default=1.0, show_default=True, help="Of each search, about.")
@@ -176,23 +200,25 @@ def main(
 ) -> None:
     """Hold criteria that decide during a call against the plans that they are frozen into, in DIRECTORY's policy."""
     artifact = load_artifact(directory)
-    episodes = load_episodes(artifact.manifest.spec, trajectories, sources)
+    base = base_of(artifact).exact
+    view = view_of(artifact, base)
+    manifest, spec = view.manifest, view.manifest.spec
+    episodes = load_episodes(spec, trajectories, sources)
+    split, executor = split_episodes(len(episodes), FRACTION, seed), Executor(view)
     with Bar(shown=True) as bar:
-        limits = (learned_calls, learned_calls)
-        trials = Trials.of(
-            artifact, episodes, StateFile(None, {}), seed=seed, observations=calls, limits=limits, bar=bar
-        )
-        manifest = trials.executor.view.manifest
-        own = trials.artifact.manifest.spec.sampler
-        if not manifest.spec.sampler.takes_noise_as(own):
-            raise CalibrationError(
-                f"{directory}: its loop is {manifest.spec.sampler.name} of {manifest.steps} steps, the original's"
-                f" {own.name} of {own.steps}: noise cannot be paired. Convert without --sampler and --steps."
-            )
+        drawn = sample_calls(episodes, split.calibration, learned_calls, seed, REPEATS)
+        learned = prepare_calls(executor.model, spec, episodes, drawn, (seed, 15))
+        bar.stage("calls to learn from", learned.count, 0)
+        learned = replace(learned, path=torch.cat(list(dense_rounds(executor, learned))))
+        places = sample_calls(episodes, split.validation, calls, seed, REPEATS)
+        initial, steps = draw_noise(spec, len(places), (seed, 16))
+        noise = Noise(initial.numpy(), None if steps is None else steps.numpy())
+        judged = Judged(normalized(spec, observed(spec, episodes, places)), noise)
         asked = [float(one) for one in sparsities.split(",")] if sparsities else default_sparsities(manifest.steps)
-        contestants, task = Contestants(artifact, trials.base), Task.of(trials.executor, trials.calls, 0, seed)
+        contestants, task = Contestants(artifact, base), Task.of(executor, learned, 0, seed)
         for name, plan in artifact.plans.items():
-            contestants.add_plan(f"the artifact's {name}", "online" if plan.pruned else "", plan)
+            if plan.loop == base.loop and name not in (DENSE, FULL):
+                contestants.add_plan(f"the artifact's {name}", "online" if plan.pruned else "", plan)
         left_out = []
         for share in asked:
             cells = cells_of(goal_of(target_sparsity=share), manifest, False)
@@ -203,7 +229,7 @@ def main(
                     contestants.add_found(f"{name} {share:g}", found)
                 except CalibrationError as error:
                     left_out.append(f"{name} {share:g}: {error}")
-        rows = sorted(measured(trials, contestants, rounds), key=lambda one: one.ms)
+        rows = sorted(measured(contestants, spec, judged, rounds), key=lambda one: one.ms)
     if as_json:
         print_json({"rows": [asdict(one) for one in rows], "left_out": left_out, "machine": fingerprint()})
         return
@@ -217,9 +243,9 @@ def main(
     say(output, *left_out, one_line(fingerprint()))
     say(
         output,
-        "Error: mean absolute difference of the executed actions, in their units, from those of the original with the"
-        f" same noise; {len(trials.held_out.calls)} observations of episodes that nothing was learned from, with"
-        f" {trials.held_out.draws} draws of noise each.",
+        f"Error: mean absolute difference of the executed actions, in their units, from those of {base.loop!r} with"
+        f" every step computed and the same noise; {len(places)} calls of episodes that nothing was learned from."
+        " Times are of the processor, so that a busy machine changes them less.",
     )
 
 

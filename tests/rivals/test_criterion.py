@@ -97,3 +97,31 @@ def test_numbers_that_cannot_be_are_refused(change: dict[str, Any], named: str) 
 def test_a_policy_with_nothing_left_to_decide_is_refused() -> None:
     with pytest.raises(IllegalPlanError, match="first 1 blocks at every step; the policy has 1"):
         Decisions(DBCACHE, 10, 1, 2)
+
+
+def test_a_record_is_read_as_it_was_written() -> None:
+    for rule in (TEACACHE, DBCACHE):
+        assert Criterion.of_record(json.loads(json.dumps(rule.record()))) == rule
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"threshold": "0.5"},
+        {"threshold": True},
+        {"always": 1.0},
+        {"polynomial": 1.0},
+        {"polynomial": ["1", 0]},
+        {"polynomial": [[1.0]]},
+        {"more": 1},
+        {"closes": None},
+        {"warmup": 10**400},
+        {"threshold": float("nan")},
+    ],
+)
+def test_a_hostile_record_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ArtifactError, match=r"Calibrate again\."):
+        Criterion.of_record({**TEACACHE.record(), **change} if change != {"warmup": 10**400} else {"warmup": 10**400})
+    lacking = {name: one for name, one in TEACACHE.record().items() if name != "warmup"}
+    with pytest.raises(ArtifactError, match="the record of a criterion has name: str, always: int"):
+        Criterion.of_record(lacking)

@@ -1,0 +1,78 @@
+"""Ways to fill a cell, on a small policy: by hand where that is possible, and what the script prints."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sources
+import torch
+from click.testing import CliRunner
+
+from tests.calibration import policies
+from tests.calibration.tasks import make_task
+from tests.once import Once
+from ttscompile.calibration.calls import Actions
+from ttscompile.core.lattice import uniform_plan
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return policies.record(tmp_path_factory.mktemp("calls") / "calls.npz")
+
+
+@pytest.fixture(scope="module")
+def study(once: Once, recorded: Path) -> sources.Study:
+    task = make_task(policies.compiled(once), recorded)
+    spec = task.executor.view.manifest.spec
+    return sources.Study(task.executor, Actions(spec), task.calls, task.calls, 0)
+
+
+def test_forecasts_of_first_and_second_order_by_hand(study: sources.Study) -> None:
+    kept = [(6, torch.tensor(36.0)), (4, torch.tensor(16.0)), (2, torch.tensor(4.0))]  # squares
+    assert [study.forecast(order)(7, 0, torch.tensor(0.0), kept)[0].item() for order in (0, 1)] == [36, 46]
+    # slopes 10 and 6, their difference by two steps 2: 36 + 10 + 2 / 2
+    assert study.forecast(2)(7, 0, torch.tensor(0.0), kept)[0].item() == 47
+    assert study.forecast(2)(7, 0, torch.tensor(0.0), kept[:1])[0].item() == 36
+
+
+def test_reuse_is_that_of_the_lattice(study: sources.Study) -> None:
+    found = study.filled(study.judged, sources.even(10, 4), study.reused)
+    assert found.cells == 24
+    expected = study.executor.run(uniform_plan(10, 6, 4), study.judged)
+    torch.testing.assert_close(found.samples, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_all_tokens_and_a_threshold_of_nothing_are_the_original(study: sources.Study) -> None:
+    dense = study.executor.run_dense(study.judged)[:, -1]
+    for found in (study.some_tokens((0,), study.tokens), study.gated(study.judged, -1.0, study.reused)):
+        assert found.cells == pytest.approx(60)
+        torch.testing.assert_close(found.samples, dense, rtol=1e-4, atol=1e-5)
+
+
+def test_a_threshold_keeps_the_cells(study: sources.Study) -> None:
+    threshold = study.threshold(24, study.reused)
+    assert 6 <= study.gated(study.learned, threshold, study.reused).cells <= 24
+    assert study.gated(study.learned, 0.8 * threshold, study.reused).cells > 20
+
+
+def test_maps_are_the_best_linear_ones(study: sources.Study) -> None:
+    matrix, shift = study.maps[0]
+    assert (len(study.maps), matrix.shape, shift.shape) == (6, (32, 32), (32,))
+    assert study.row("none", study.filled(study.judged, (0,), study.reused), 100.0).flops > 6 / 60
+
+
+@pytest.mark.slow
+def test_the_script_prints_a_row_for_each_way(once: Once, recorded: Path) -> None:
+    asked = [str(policies.compiled(once)), "-t", str(recorded), "--computed-steps", "3", "--calls", "8"]
+    made = CliRunner().invoke(sources.main, [*asked, "--json"])
+    assert made.exit_code == 0, made.output
+    rows = json.loads(made.stdout)["rows"]
+    assert len(rows) == 9
+    assert all(np.isfinite([row["error"], row["flops"]]).all() for row in rows)
+    assert all(row["cells"] < 24 for row in rows)
+    assert "forecast of the output" in CliRunner().invoke(sources.main, asked).stdout
+    refused = CliRunner().invoke(sources.main, [*asked[:3], "--computed-steps", "10"])
+    assert "between 2 and 9" in str(refused.exception)
