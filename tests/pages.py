@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import sys
 from pathlib import Path
@@ -9,6 +10,16 @@ from types import ModuleType
 
 ROOT = Path(__file__).resolve().parents[1]
 EXTENDING = ROOT / "docs" / "extending"
+
+
+def there(name: str) -> bool:
+    """Whether ``tests/file.py::test_name`` is a test."""
+    file, _, function = name.partition("::")
+    path = ROOT / file
+    if not path.is_file():
+        return False
+    made = ast.walk(ast.parse(path.read_text()))
+    return any(isinstance(node, ast.FunctionDef) and node.name == function for node in made)
 
 
 def load(path: Path, name: str) -> ModuleType:

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import re
-from pathlib import Path
 
 import pytest
 
+from tests.pages import ROOT, there
 from ttscompile.cli import main
 
-ROOT = Path(__file__).resolve().parents[1]
 TABLE = [line for line in (ROOT / "docs" / "needs.md").read_text().splitlines() if line.startswith("| ")]
 ROWS = [line.split(" | ") for line in TABLE[2:]]
-
-
-def there(name: str) -> bool:
-    """Whether ``tests/file.py::test_name`` is a test."""
-    file, _, function = name.partition("::")
-    path = ROOT / file
-    if not path.is_file():
-        return False
-    made = ast.walk(ast.parse(path.read_text()))
-    return any(isinstance(node, ast.FunctionDef) and node.name == function for node in made)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][2:30])

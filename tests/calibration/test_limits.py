@@ -100,7 +100,7 @@ def test_a_limit_holds_within_an_interval(
         found, _, stopped = search_plan(search, clock)
         assert np.count_nonzero(found.schedule == Source.COMPUTE) <= 34
         assert (stopped == "time limit") == (name not in ("interval", "deepcache"))  # which have one candidate
-    more = name in FITTED or strategy_of(name).consecutive
+    more = name in FITTED or strategy_of(name).uses_pruner
     assert clock.now <= limit + (2 + more) * 480
 
 
