@@ -54,6 +54,8 @@ from ttscompile.rivals.taylorseer import correction_for
 PROBES = 12
 """Of a threshold."""
 
+WAYS = ("forecast", "linear", "gate", "tokens")
+
 Steps = tuple[int, ...]
 
 Linear = tuple[Tensor, Tensor]
@@ -239,26 +241,30 @@ def even(steps: int, count: int) -> Steps:
     return tuple(np.flatnonzero((uniform_plan(steps, 1, count) == Source.COMPUTE)[:, 0]).tolist())
 
 
-def rows_of(study: Study, count: int) -> list[Row]:
-    """All ways with as many computed cells as so many whole steps have."""
+def rows_of(study: Study, count: int, only: Sequence[str] = WAYS) -> list[Row]:
+    """Ways with as many computed cells as so many whole steps have."""
     whole, judged, cells = even(study.steps, count), study.judged, count * study.blocks
-    found = [study.row("reused (TIMESTEP)", study.filled(judged, whole, study.reused))]
-    for order in (1, 2)[: count - 1]:
-        done = study.filled(judged, whole, study.forecast(order))
-        found.append(study.row(f"forecast of each block, order {order}", done))
-    plan = uniform_plan(study.steps, study.blocks, count)
-    corrected = study.executor.corrected(correction_for(study.task, whole))
-    found.append(study.row("forecast of the output, a correction", Filled(corrected.run(plan, judged), cells)))
     product = 2.0 * study.tokens * study.width**2
-    found.append(study.row("linear in the input", study.filled(judged, whole, study.linear), product))
-    for name, otherwise, beside in (("reused", study.reused, 0.0), ("linear", study.linear, product)):
-        done = study.gated(judged, study.threshold(cells, otherwise), otherwise)
-        found.append(study.row(f"FastCache's gate, else {name}", done, beside))
-    for fewer in range(count - 1, 0, -1):
-        tokens = -(-(count - fewer) * study.tokens // (study.steps - fewer))  # rounded up
-        done = study.some_tokens(even(study.steps, fewer), tokens)
-        whole_steps = f"{fewer} whole step{'s' * (fewer > 1)}"
-        found.append(study.row(f"{whole_steps}, and the best {tokens} of {study.tokens} tokens", done))
+    found = [study.row("reused (TIMESTEP)", study.filled(judged, whole, study.reused))]
+    if "forecast" in only:
+        for order in (1, 2)[: count - 1]:
+            done = study.filled(judged, whole, study.forecast(order))
+            found.append(study.row(f"forecast of each block, order {order}", done))
+        plan = uniform_plan(study.steps, study.blocks, count)
+        corrected = study.executor.corrected(correction_for(study.task, whole))
+        found.append(study.row("forecast of the output, a correction", Filled(corrected.run(plan, judged), cells)))
+    if "linear" in only:
+        found.append(study.row("linear in the input", study.filled(judged, whole, study.linear), product))
+    if "gate" in only:
+        for name, otherwise, beside in (("reused", study.reused, 0.0), ("linear", study.linear, product)):
+            done = study.gated(judged, study.threshold(cells, otherwise), otherwise)
+            found.append(study.row(f"FastCache's gate, else {name}", done, beside))
+    if "tokens" in only:
+        for fewer in range(count - 1, 0, -1):
+            tokens = -(-(count - fewer) * study.tokens // (study.steps - fewer))  # rounded up
+            done = study.some_tokens(even(study.steps, fewer), tokens)
+            whole_steps = f"{fewer} whole step{'s' * (fewer > 1)}"
+            found.append(study.row(f"{whole_steps}, and the best {tokens} of {study.tokens} tokens", done))
     return found
 
 
@@ -267,6 +273,7 @@ def rows_of(study: Study, count: int) -> list[Row]:
 @trajectories_options()
 @click.option("--computed-steps", default=3, help="Whose cells a call may compute.")
 @click.option("--calls", default=96, help="To judge on, and as many to learn from, at most.")
+@click.option("--only", type=click.Choice(WAYS), multiple=True, default=WAYS, help="These ways.")
 @click.option("--seed", default=0, help="Of the division of the episodes, the calls and the noise.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def main(
@@ -275,6 +282,7 @@ def main(
     sources: Sources,
     computed_steps: int,
     calls: int,
+    only: Sequence[str],
     seed: int,
     as_json: bool,
 ) -> None:
@@ -294,7 +302,8 @@ def main(
             chosen = sample_calls(episodes, numbers, calls, seed, REPEATS)
             drawn = prepare_calls(executor.model, spec, episodes, chosen, (seed, 17, stage))
             parts.append(answered(executor, drawn, "dense calls", bar.tell))
-        rows = rows_of(Study(executor, Actions(spec), *parts, seed), computed_steps)
+        learned, judged = parts
+        rows = rows_of(Study(executor, Actions(spec), learned, judged, seed), computed_steps, only)
     if as_json:
         print_json({"rows": [asdict(one) for one in rows]})
         return
@@ -305,7 +314,7 @@ def main(
     say(
         output,
         "Error: mean absolute difference of the executed actions, in their units, from those of the same loop with"
-        f" every step computed and the same noise; {parts[1].count} calls of episodes that nothing was learned from."
+        f" every step computed and the same noise; {judged.count} calls of episodes that nothing was learned from."
         " FLOPs: of blocks, and of what fills the other cells, as a share of those of a dense call.",
     )
 

@@ -97,7 +97,7 @@ class Criterion:
             ArtifactError: members that a criterion does not have, or lacks; or values of another type.
         """
         kinds = {one.name: type(getattr(_EXAMPLE, one.name)) for one in fields(cls)}
-        given = {name: tuple(one) if isinstance(one, list) else one for name, one in record.items()}
+        given: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one for name, one in record.items()}
         numbers = given.get("polynomial")
         plain = isinstance(numbers, tuple) and all(type(one) in (int, float) for one in numbers)
         if {name: type(one) for name, one in given.items()} != kinds or not plain:
