@@ -67,7 +67,8 @@ def test_the_columns_of_the_sample_alone_stay_in_the_loop(kind: str, parts: int)
         weights = {name: torch.from_numpy(np.array(value)) for name, value in program.weights.items()}
         with Counted() as counted:
             values += evaluate(program.denoiser, weights, inputs)
-    assert_equal_but_for_rounding(*values, counted.terms)
+    one, other = values
+    assert_equal_but_for_rounding(one, other, counted.terms)
     assert SplitStem()(result.program).program is result.program
 
     pieces = transform(module, before.spec).pieces
