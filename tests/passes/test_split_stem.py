@@ -62,7 +62,7 @@ def test_the_columns_of_the_sample_alone_stay_in_the_loop(kind: str, parts: int)
     assert result.notes[0].endswith(f"one of {parts} parts is in the loop")
     assert "mix.weight" not in result.program.weights
     inputs = {"sample": torch.randn(2, HORIZON, 4), "timestep": torch.rand(2), "obs": torch.randn(2, 6)}
-    values = []
+    values = list[Tensor]()
     for program in (before, result.program):
         weights = {name: torch.from_numpy(np.array(value)) for name, value in program.weights.items()}
         with Counted() as counted:
