@@ -37,6 +37,7 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
         "CogACT",
         "ends with .pt",
     ),
+    ({"model": {"nn_model.fc1.0.model.0.weight": W}}, "of Diffusion BC without its schedule", "Model_Cond_Di"),
     (
         {"nets": {"nets": {"policy.noise_pred_net.blocks.0.attn.qkv.weight": W}}},
         "a first stage of DexVLA's ScaleDP",

@@ -160,6 +160,14 @@ FAMILIES = (
         module=".policies.cogact",
     ),
     Family(
+        name="diffusion_bc",
+        title="Diffusion BC",
+        reads="a state_dict of Diffusion BC, a Model_Cond_Diffusion's, in a file",
+        kind="file",
+        detect=lambda path: path.is_file() and _begins_with(path, b"mab_over_sqrtmab"),
+        module=".policies.diffusion_bc",
+    ),
+    Family(
         name="diffusion_policy",
         title="Diffusion Policy",
         reads="a .ckpt file of Diffusion Policy",

@@ -20,6 +20,7 @@ _BUILD = "Build the network with the code that trained it and use ttscompile.com
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
 _DITA = "Give the .pth file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
+_DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
@@ -119,6 +120,7 @@ STATES = (
     Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
+    Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
     Refusal(r"(^|\.)(noise|time)_net\.", "a checkpoint of DiT-Policy", "Put its agent_config.yaml beside it."),
     Refusal(
