@@ -30,6 +30,7 @@ NOT_RUN = {
     "ttscompile convert rdt-1b/": "RDT-1B's directory: tests/policies converts a small one",
     "ttscompile convert CogACT-Base/": "CogACT's checkpoint: the same of a small one",
     "ttscompile convert authors/": "what others' code saved: tests/policies writes the same, and converts it",
+    "ttscompile convert hybridvla/": "HybridVLA's checkpoint: tests/policies converts a small one",
     "ttscompile convert claw.pt": "Diffusion BC's weights: the same of small ones",
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
     "MUJOCO_GL=osmesa python": "in MuJoCo: tests/examples/test_environments.py has its worlds",

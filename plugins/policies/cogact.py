@@ -7,37 +7,30 @@ Guidance doubles the batch, with the cognition token and with the learned none. 
 checkpoint. Token 0 is the sum of timestep and condition.
 """
 
-import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ttscompile.core.spec import Affine, ChunkSpec, ObservationSpec, PolicySpec, Switch
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.saved_weights import as_float32, filled, names_of
+from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import configured_loops
-from ttscompile.frontends.settings import Settings, read_json
 
 from .last_step import changed, clipped
 from .layers import TimestepEmbedder, TimmAttention, TimmMlp
+from .quantiles import GRIPPER, read_statistics
 
 MODELS = {"DiT-S": (384, 6, 4), "DiT-B": (768, 12, 12), "DiT-L": (1024, 24, 16)}
 """Width, layers and heads of the action models; the shapes of the weights tell the first two."""
 GUIDANCE, STEPS = 1.5, 10
-STATISTICS = "dataset_statistics.json"
 _TRAINED = {"num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2", "clip_sample": False}
-_GRIPPER = 6
-"""The number of an action that the original makes 0 or 1."""
 _UNREAD = "history_embedder."
-_LEAST_WIDTH = 1e-8
 
 
 class _Layer(nn.Module):
@@ -115,7 +108,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     settings = {"_target_": "DDIMScheduler", **_TRAINED}
     loops = configured_loops(settings, STEPS, options, where=f"{path}: the sampler")
     loops = changed(loops, lambda table: clipped(table, 1.0))  # predict_action clips what the loop gives
-    own = _statistics(path, actions)
+    own = read_statistics(path, actions, (GRIPPER,) if actions > GRIPPER else ())
     spec = PolicySpec(
         sample=(horizon, actions),
         observations={"cognition": ObservationSpec((1, cognition), window=False)},
@@ -155,51 +148,3 @@ def _sizes(weights: Mapping[str, Tensor], path: Path) -> tuple[int, int, int, in
     (tokens, width), (_, actions), (_, cognition) = shapes
     layers = {name.split(".")[1] for name in weights if name.startswith("blocks.")}
     return width, len(layers), tokens - 1, actions, cognition
-
-
-@dataclass(frozen=True)
-class _Statistics:
-    """How actions leave -1..1, and whose statistics say so."""
-
-    name: str
-    normalizer: Affine | None
-    switches: tuple[Switch, ...]
-
-
-def _statistics(path: Path, actions: int) -> _Statistics:
-    """Those of the one data set that the policy was trained on; else actions stay in -1..1, with a warning."""
-    where = path.absolute().parents[1] / STATISTICS
-    sets = read_json(where) if where.is_file() else {}
-    gripper = (Switch(_GRIPPER, 0.5, 0.0, 1.0),) if actions > _GRIPPER else ()
-    if len(sets) != 1:
-        there = f"holds {len(sets)} data sets ({names_of(sorted(sets))})" if where.is_file() else "is not there"
-        warnings.warn(
-            f"{where} {there}: actions stay in -1..1, as the network makes them. For those of a robot, put a file there"
-            " that holds its data set alone, and convert again.",
-            stacklevel=4,
-        )
-        return _Statistics("none", None, gripper)
-    name, entry = next(iter(sets.items()))
-    inner = entry.get("action") if isinstance(entry, dict) else None
-    entries = inner if isinstance(inner, dict) else {}
-    settings = Settings(entries, f"{where}: {name:.80}.action.", "Copy the file again.")
-    low, high = (_vector(settings, key, actions) for key in ("q01", "q99"))
-    mask = settings.values.get("mask", [True] * actions)
-    if not (isinstance(mask, list) and len(mask) == actions and all(type(one) is bool for one in mask)):
-        raise settings.refusal("mask", f"{actions} times true or false")
-    width = high - low
-    width[width == 0] = _LEAST_WIDTH  # one that never changed stays what it was
-    scale, offset = np.where(mask, 2 / width, 1.0), np.where(mask, -2 * low / width - 1, 0.0)
-    if gripper and mask[_GRIPPER]:
-        closed, opened = ((end + 1) / 2 * float(width[_GRIPPER]) + float(low[_GRIPPER]) for end in (0, 1))
-        gripper = (Switch(_GRIPPER, 0.5, closed, opened),)
-    return _Statistics(name, Affine(scale, offset), gripper)
-
-
-def _vector(settings: Settings, name: str, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    value: Any = settings.values.get(name)
-    if isinstance(value, list) and len(value) == count and all(type(one) in (int, float) for one in value):
-        found = np.array(value, np.float64)
-        if np.isfinite(found).all():
-            return found
-    raise settings.refusal(name, f"{count} finite numbers")

@@ -29,7 +29,7 @@ W = torch.zeros(2)
 OWN_MODULE = r"compile_denoiser\(module, spec\)"
 
 PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
-    ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "inside its language"),
+    ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "file of its folder ch"),
     ({"parameter": {"blocks.0.weight": W}}, "Dita", r"\.hydra/config\.yaml that its training wrote"),
     ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "config.json, and model"),
     (

@@ -160,6 +160,14 @@ FAMILIES = (
         module=".policies.cogact",
     ),
     Family(
+        name="hybrid_vla",
+        title="HybridVLA",
+        reads="a .pt file of HybridVLA that was trained with use_diff",
+        kind="file",
+        detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"proprio_embedder"),
+        module=".policies.hybrid_vla",
+    ),
+    Family(
         name="diffusion_bc",
         title="Diffusion BC",
         reads="a state_dict of Diffusion BC, a Model_Cond_Diffusion's, in a file",

@@ -29,7 +29,7 @@ def run(folder: Path) -> dict[str, Arrays]:
     """Of each variant a prediction at two timesteps, and the actions of ``sample`` and of ``sample_extra``."""
     sys.path.insert(0, str(folder / "code"))
     models: Any = importlib.import_module("models")
-    arrays = {}
+    arrays: Arrays = {}
     for variant in bc.VARIANTS:
         arrays |= {f"{variant}.{name}": value for name, value in of(models, variant).items()}
     for steps in sorted({sizes.timesteps for sizes in bc.VARIANTS.values()}):

@@ -1,0 +1,99 @@
+"""Statistics of a data set as OpenVLA's descendants save them: quantiles, and which numbers are left as they are."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ttscompile.core.spec import Affine, Switch
+from ttscompile.frontends.saved_weights import names_of
+from ttscompile.frontends.settings import Settings, read_json
+
+STATISTICS = "dataset_statistics.json"
+GRIPPER = 6
+"""The number of an arm's action that the originals make 0 or 1."""
+_LEAST_WIDTH = 1e-8
+
+Vector = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Range:
+    """What becomes -1..1: numbers between two quantiles, but for those that stay what they are."""
+
+    low: Vector
+    high: Vector
+    mask: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How actions leave -1..1, and whose statistics say so.
+
+    Attributes:
+        state: the range of what the robot's state was; None where it is not asked for, or not there.
+    """
+
+    name: str
+    normalizer: Affine | None
+    switches: tuple[Switch, ...]
+    state: Range | None = None
+
+
+def read_statistics(path: Path, actions: int, grippers: tuple[int, ...], state: int | None = None) -> Statistics:
+    """Those of the one data set that the policy was trained on; else actions stay in -1..1, with a warning.
+
+    Args:
+        path: of a checkpoint in a folder ``checkpoints``, beside which they are.
+        actions: numbers of an action.
+        grippers: which of them are 0 from -1 on, and 1 from 0.5 on.
+        state: numbers of the robot's state, whose range is wanted, too.
+    """
+    where = path.absolute().parents[1] / STATISTICS
+    sets = read_json(where) if where.is_file() else {}
+    switches = tuple(Switch(channel, 0.5, 0.0, 1.0) for channel in grippers)
+    if len(sets) != 1:
+        there = f"holds {len(sets)} data sets ({names_of(sorted(sets))})" if where.is_file() else "is not there"
+        given = "" if state is None else " The state has to be given as the network sees it."
+        warnings.warn(
+            f"{where} {there}: actions stay in -1..1, as the network makes them.{given} For those of a robot, put a"
+            " file there that holds its data set alone, and convert again.",
+            stacklevel=4,
+        )
+        return Statistics("none", None, switches)
+    name, entry = next(iter(sets.items()))
+    own = _range(where, name, entry, "action", actions)
+    width = own.high - own.low
+    width[width == 0] = _LEAST_WIDTH  # one that never changed stays what it was
+    normalizer = Affine(np.where(own.mask, 2 / width, 1.0), np.where(own.mask, -2 * own.low / width - 1, 0.0))
+    for place, channel in enumerate(grippers):
+        if own.mask[channel]:
+            closed, opened = ((end + 1) / 2 * float(width[channel]) + float(own.low[channel]) for end in (0, 1))
+            switches = (*switches[:place], Switch(channel, 0.5, closed, opened), *switches[place + 1 :])
+    return Statistics(
+        name, normalizer, switches, None if state is None else _range(where, name, entry, "proprio", state)
+    )
+
+
+def _range(where: Path, name: str, entry: Any, part: str, count: int) -> Range:
+    inner = entry.get(part) if isinstance(entry, dict) else None
+    settings = Settings(
+        inner if isinstance(inner, dict) else {}, f"{where}: {name:.80}.{part}.", "Copy the file again."
+    )
+    low, high = (_vector(settings, key, count) for key in ("q01", "q99"))
+    mask = settings.values.get("mask", [True] * count)
+    if not (isinstance(mask, list) and len(mask) == count and all(type(one) is bool for one in mask)):
+        raise settings.refusal("mask", f"{count} times true or false")
+    return Range(low, high, np.array(mask))
+
+
+def _vector(settings: Settings, name: str, count: int) -> Vector:
+    value: Any = settings.values.get(name)
+    if isinstance(value, list) and len(value) == count and all(type(one) in (int, float) for one in value):
+        found = np.array(value, np.float64)
+        if np.isfinite(found).all():
+            return found
+    raise settings.refusal(name, f"{count} finite numbers")
