@@ -37,6 +37,13 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
         "CogACT",
         "ends with .pt",
     ),
+    ({"gating_network._layers.0.weight": W, "joint_cmps._gpt.a": W}, "a policy of VDD", "There is no denoising loop"),
+    (
+        {"itr": 9, "model": {"actor_ft.mlp_mean.layers.0.l1.weight": W, "actor.a": W}},
+        "a policy of DPPO",
+        "actor before",
+    ),
+    ({"epoch": 9, "model": {"network.time_mlp.1.weight": W}, "ema": {}}, "a policy of DPPO", OWN_MODULE),
     ({"model": {"nn_model.fc1.0.model.0.weight": W}}, "of Diffusion BC without its schedule", "Model_Cond_Di"),
     (
         {"nets": {"nets": {"policy.noise_pred_net.blocks.0.attn.qkv.weight": W}}},
@@ -75,7 +82,7 @@ NAMES = [
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
     ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
-    ("TEDiUnetLowdimPolicy", "Streaming Diffusion Policy.*is not compiled"),
+    ("TEDiUnetHybridImagePolicy", "Streaming Diffusion Policy on images.*The one on states, TEDiUnetLowdimPolicy, is"),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
 ]
 

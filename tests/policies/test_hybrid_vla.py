@@ -82,8 +82,8 @@ def test_the_language_model_reads_the_prefix_once(tmp_path: Path) -> None:
 
 def test_what_the_network_is_told_of_the_state(tmp_path: Path) -> None:
     """Its quantiles become -1 and 1, and nothing is beyond; the gripper stays as it is."""
-    module, _ = load_checkpoint_policy(tiny.save(tmp_path))
-    seen = []
+    module: Any = load_checkpoint_policy(tiny.save(tmp_path))[0]
+    seen: list[np.ndarray] = []
     hook = module.proprio_embedder.register_forward_pre_hook(lambda _, given: seen.append(given[0].numpy()))
     with torch.inference_mode():
         module(torch.zeros(2, 1, 7), torch.tensor([9, 9]), **as_seen(load_checkpoint_policy(tiny.save(tmp_path))[1]))
@@ -110,7 +110,7 @@ def test_without_statistics_actions_stay_as_the_network_makes_them(tmp_path: Pat
             module, spec = load_checkpoint_policy(tiny.save(tmp_path, statistics=statistics))
         assert spec.chunk.normalizer is None
         assert spec.source["statistics"] == "none"
-        assert not module.mask.any()
+        assert not dict(module.named_buffers())["mask"].any()
 
 
 def test_a_policy_of_two_arms_has_two_grippers(tmp_path: Path) -> None:

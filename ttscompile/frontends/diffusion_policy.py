@@ -42,6 +42,7 @@ _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "SimpleDP3": _beside("dp3", "simple"),
     "KarrasUnetHybridImagePolicy": _beside("consistency_policy", "teacher"),
     _STUDENT: _beside("consistency_policy", "student"),
+    "TEDiUnetLowdimPolicy": _beside("streaming", "low_dim"),
 }
 """By the class name of the original policy."""
 

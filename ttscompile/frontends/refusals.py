@@ -21,6 +21,7 @@ _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language 
 _DITA = "Give the .pth file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
+_DPPO = f"{_BUILD}. Of one that is fine-tuned, the module takes actor_ft in the last steps, and actor before them."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
@@ -66,8 +67,8 @@ POLICIES = (
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
     Refusal(
         r"^tedi",
-        "Streaming Diffusion Policy, whose buffer of actions, with a noise level each, goes on from call to call",
-        "A compiled policy denoises each chunk from one noise level, so this one is not compiled.",
+        "Streaming Diffusion Policy on images, which is not rebuilt here",
+        "The one on states, TEDiUnetLowdimPolicy, is.",
     ),
     Refusal(
         r"transformer|unet",
@@ -120,6 +121,10 @@ STATES = (
     Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
+    Refusal(
+        r"^(joint_cmps|gating_network)\.", "a policy of VDD, a mixture of experts of one evaluation each", _NO_LOOP
+    ),
+    Refusal(r"^(actor_ft|network)\.(time_embedding|time_mlp|mlp_mean)\.", "a policy of DPPO", _DPPO),
     Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
     Refusal(r"(^|\.)(noise|time)_net\.", "a checkpoint of DiT-Policy", "Put its agent_config.yaml beside it."),

@@ -71,6 +71,7 @@ class _Llama(nn.Module):
 
     def __init__(self, sizes: Any) -> None:
         super().__init__()
+        turns: dict[str, Any] = {"rope_theta": 10000.0}
         config = LlamaConfig(
             vocab_size=32064,
             hidden_size=sizes.width,
@@ -79,7 +80,7 @@ class _Llama(nn.Module):
             num_attention_heads=sizes.width // 128,
             num_key_value_heads=sizes.groups,
             rms_norm_eps=1e-5,
-            rope_theta=10000.0,
+            **turns,
         )
         self.llm, self.tokenizer, self.embed_dim = LlamaForCausalLM(config), _Tokenizer(), sizes.width
 
