@@ -145,8 +145,9 @@ class StreamingDenoiser(nn.Module):
         predicted = self.model(x, timestep, global_cond=obs.flatten(1))
         clean = of.x_to_clean[timestep] * x + of.predicted_to_clean[timestep] * predicted
         clean = clean.clamp(-1, 1) if self.clips else clean
-        mean: torch.Tensor = of.clean_to_mean[timestep] * clean + of.x_to_mean[timestep] * x
-        return mean / of.next_unit[timestep]
+        mean = of.clean_to_mean[timestep] * clean + of.x_to_mean[timestep] * x
+        following: torch.Tensor = mean / of.next_unit[timestep]
+        return following
 
 
 def low_dim(saved: Saved) -> Rebuilt:

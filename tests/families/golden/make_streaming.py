@@ -20,7 +20,11 @@ from tests.policies import streams
 
 from .originals import Arrays, generator
 
-_ABSENT = ("robomimic", "diffusion_policy.dataset.pusht_dataset", "diffusion_policy.common.robomimic_config_util")
+_ABSENT: tuple[str, ...] = (
+    "robomimic",
+    "diffusion_policy.dataset.pusht_dataset",
+    "diffusion_policy.common.robomimic_config_util",
+)
 _ABSENT += (
     "diffusion_policy.model.vision",
     "diffusion_policy.model.vision.crop_randomizer",
