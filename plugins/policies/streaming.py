@@ -11,10 +11,11 @@ What a call leaves is given to the next one as an observation: ``buffer``, the `
 executed of this one has none. After a first chunk the original calls the clean steps before the next one as noisy as
 that is, and leaves them clean; so it is here.
 
-Source: ``TEDiUnetLowdimPolicy`` and ``DDPMTEDiScheduler`` of Streaming-Diffusion-Policy/streaming_diffusion_policy
-(Høeg et al., arXiv 2406.04806).
+Source: ``TEDiUnetLowdimPolicy``, ``TEDIUnetHybridImagePolicy`` and ``DDPMTEDiScheduler`` of
+Streaming-Diffusion-Policy/streaming_diffusion_policy (Høeg et al., arXiv 2406.04806).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ from torch.nn import functional
 from ttscompile.core.spec import ObservationSpec, SamplerTable
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from ttscompile.frontends.diffusion_policy_hybrid import ENCODER_KEYS, build_encoder
 from ttscompile.frontends.diffusion_policy_parts import (
     COMMON_KEYS,
     Rebuilt,
@@ -35,9 +37,14 @@ from ttscompile.frontends.diffusion_policy_parts import (
     affine,
     load_network,
     network_settings,
+    network_weights,
+    observation_specs,
+    read_shape_meta,
     require_room,
     require_sizes,
 )
+from ttscompile.frontends.diffusion_policy_unet import DEFAULTS
+from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import MOST_STEPS
 from ttscompile.frontends.settings import Settings
@@ -48,8 +55,11 @@ _SIZES = frozenset({"input_dim", "local_cond_dim", "global_cond_dim", "diffusion
 _SIZES |= {"kernel_size", "n_groups", "cond_predict_scale"}
 _TRAINING = frozenset({"chunk_wise_weight", *(f"temporally_{how}" for how in ("constant_weight", "random_weights"))})
 _TRAINING |= {"temporally_increasing_weight"}
-_READ = frozenset({"obs_dim", "action_dim", "model", "buffer_init", "obs_as_global_cond", "obs_as_local_cond"})
-_READ |= {"pred_action_steps_only", "oa_step_convention"}
+_READ = frozenset({"obs_dim", "action_dim", "model", "obs_as_local_cond", "pred_action_steps_only"})
+_READ |= {"oa_step_convention"}
+_NETWORK_OF_IMAGES: Mapping[str, Any] = {**DEFAULTS, "cond_predict_scale": True}
+_BUFFER = ("buffer", "begins")
+"""What is observed of the call before."""
 _RENAMED = {"model.diffusion_step_encoder.3.": 1, "model.diffusion_step_encoder.5.": 3}
 """Layers of the timesteps' encoder, which the original has behind two that only turn their arguments."""
 _MOST_HORIZON = 4096
@@ -150,17 +160,79 @@ class StreamingDenoiser(nn.Module):
         return following
 
 
+class _Observed(nn.Module):
+    """All that a policy on images observes as one row, ``[B, To * width + T * Da + 1]``."""
+
+    def __init__(self, encoder: nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        others = {key: value for key, value in observations.items() if key not in _BUFFER}
+        return torch.cat([self.encoder(others).flatten(1), *(observations[key].flatten(1) for key in _BUFFER)], 1)
+
+
+class _OfRow(nn.Module):
+    """The denoiser of such a row."""
+
+    def __init__(self, denoiser: nn.Module, sizes: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.denoiser, self.sizes = denoiser, sizes
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
+        obs, buffer, begins = row.split(self.sizes, -1)
+        return self.denoiser(sample, timestep, obs, buffer.unflatten(-1, sample.shape[1:]), begins)  # type: ignore[no-any-return]
+
+
 def low_dim(saved: Saved) -> Rebuilt:
     """``TEDiUnetLowdimPolicy``."""
-    settings = saved.settings
-    settings.require(obs_as_local_cond=False, pred_action_steps_only=False, oa_step_convention=True)
-    if not settings.flag("obs_as_global_cond", False):
+    saved.settings.require(obs_as_local_cond=False, pred_action_steps_only=False, oa_step_convention=True)
+    obs_dim, action_dim, observed, horizon = saved.sizes("obs_dim", "action_dim", "n_obs_steps", "horizon")
+    values = network_settings(saved.config, _NETWORK, _SIZES | {"horizon"})
+    own = values.pop("horizon", 16)
+    if own != horizon:
+        raise CheckpointError(f"cfg.policy.model.horizon is {own!r:.80}; expected {horizon}, the policy's.")
+    if values.get("input_dim") is None:
+        raise CheckpointError("cfg.policy.model.input_dim is missing; it is needed to rebuild the network.")
+    config = UNetConfig(**{name: value for name, value in values.items() if name in _SIZES})
+    expected = {"input_dim": action_dim, "global_cond_dim": obs_dim * observed, "local_cond_dim": None}
+    require_sizes(config, expected, f"action_dim = {action_dim} and {observed} times obs_dim = {obs_dim}")
+    specs = {"obs": ObservationSpec((observed, obs_dim), affine(saved.weights, "obs", obs_dim))}
+    return _rebuilt(saved, config, action_dim, specs, None, _READ)
+
+
+def on_images(saved: Saved) -> Rebuilt:
+    """``TEDIUnetHybridImagePolicy``, with robomimic's encoder."""
+    action_dim, observed = read_shape_meta(saved.settings, "low_dim", "rgb")
+    if taken := sorted(observed.keys() & set(_BUFFER)):
+        raise saved.settings.error(
+            f"shape_meta.obs names {taken[0]}, which stands for the buffer here; expected others"
+        )
+    encoder = build_encoder(saved.settings, observed, saved.weights)
+    (steps,) = saved.sizes("n_obs_steps")
+    network = {name: saved.policy.get(name, default) for name, default in _NETWORK_OF_IMAGES.items()}
+    config = UNetConfig(input_dim=action_dim, global_cond_dim=encoder.width * steps, **network)
+    specs = observation_specs(observed, steps, saved.weights)
+    return _rebuilt(saved, config, action_dim, specs, encoder, ENCODER_KEYS | frozenset(network))
+
+
+def _rebuilt(
+    saved: Saved,
+    config: UNetConfig,
+    action_dim: int,
+    specs: dict[str, ObservationSpec],
+    encoder: nn.Module | None,
+    read: frozenset[str],
+) -> Rebuilt:
+    """The policy; ``read`` are its settings that were read already."""
+    settings, known = saved.settings, read | _TRAINING | {"obs_as_global_cond", "buffer_init"}
+    if not settings.flag("obs_as_global_cond", encoder is not None):
         raise settings.error("obs_as_global_cond is false; expected true: its inpainting is not rebuilt")
     if settings.values.get("buffer_init", "zero") not in ("zero", "constant"):  # alike where nothing is inpainted
         raise settings.refusal("buffer_init", "zero or constant: the first call of an episode would have other steps")
-    if unknown := sorted(set(saved.policy) - {*_READ, *_TRAINING, *COMMON_KEYS}):
+    if unknown := sorted(set(saved.policy) - {*known, *COMMON_KEYS}):
         raise CheckpointError(f"cfg.policy has settings that are not known: {', '.join(unknown)}. {_CHANGED}")
-    obs_dim, action_dim, observed, executed = saved.sizes("obs_dim", "action_dim", "n_obs_steps", "n_action_steps")
+    observed, executed = saved.sizes("n_obs_steps", "n_action_steps")
     horizon, scheduler = settings.number("horizon", most=_MOST_HORIZON), _scheduler(saved)
     buffer = Buffer(horizon, observed, executed, int(scheduler.config.num_train_timesteps))
     if buffer.chunks < 1 or buffer.timesteps % buffer.chunks:
@@ -169,34 +241,24 @@ def low_dim(saved: Saved) -> Rebuilt:
             f"horizon = {horizon} holds {told}; expected one chunk at least, and timesteps that they divide: else calls"
             " take different numbers of steps"
         )
-    module = StreamingDenoiser(_network(saved, buffer, obs_dim, action_dim), buffer, scheduler)
-    actions = affine(saved.weights, "action", action_dim)
+    module: nn.Module = StreamingDenoiser(_network(saved, buffer, config), buffer, scheduler)
+    if encoder is not None:
+        sizes = (config.global_cond_dim or 0, horizon * action_dim, 1)
+        module = EncodedDenoiser(_Observed(encoder), _OfRow(module, sizes))
+    buffered = ObservationSpec((horizon, action_dim), affine(saved.weights, "action", action_dim), window=False)
     return Rebuilt(
         module,
-        {
-            "obs": ObservationSpec((observed, obs_dim), affine(saved.weights, "obs", obs_dim)),
-            "buffer": ObservationSpec((horizon, action_dim), actions, window=False),
-            "begins": ObservationSpec((1,), bounds=(0.0, 1.0)),
-        },
+        specs | dict(zip(_BUFFER, (buffered, ObservationSpec((1,), bounds=(0.0, 1.0))), strict=True)),
         (horizon, action_dim),
         action_dim,
         observed - 1,
         "streaming",
-        frozenset({*_READ, *_TRAINING}),
+        known,
         lambda options: _loop(buffer, options),
     )
 
 
-def _network(saved: Saved, buffer: Buffer, obs_dim: int, action_dim: int) -> ConditionalUnet1D:
-    values = network_settings(saved.config, _NETWORK, _SIZES | {"horizon"})
-    own = values.pop("horizon", 16)
-    if own != buffer.horizon:
-        raise CheckpointError(f"cfg.policy.model.horizon is {own!r:.80}; expected {buffer.horizon}, the policy's.")
-    if values.get("input_dim") is None:
-        raise CheckpointError("cfg.policy.model.input_dim is missing; it is needed to rebuild the network.")
-    config = UNetConfig(**{name: value for name, value in values.items() if name in _SIZES})
-    expected = {"input_dim": action_dim, "global_cond_dim": obs_dim * buffer.observed, "local_cond_dim": None}
-    require_sizes(config, expected, f"action_dim = {action_dim} and {buffer.observed} times obs_dim = {obs_dim}")
+def _network(saved: Saved, buffer: Buffer, config: UNetConfig) -> ConditionalUnet1D:
     if buffer.horizon % config.divisor:
         raise saved.settings.error(f"horizon is {buffer.horizon}; expected a multiple of {config.divisor}")
     width, dims = config.diffusion_step_embed_dim, config.down_dims
@@ -204,7 +266,8 @@ def _network(saved: Saved, buffer: Buffer, obs_dim: int, action_dim: int) -> Con
         "diffusion_step_embed_dim or horizon": 4 * width * width * buffer.horizon,
         "down_dims or kernel_size": config.kernel_size * sum(n * n for n in dims),
     }
-    require_room(needed, saved.weights)
+    weights = {_renamed(name): value for name, value in network_weights(saved.weights).items()}
+    require_room(needed, weights)
     network = ConditionalUnet1D(config)
     network.diffusion_step_encoder = nn.Sequential(
         _Levels(buffer.levels(), width),
@@ -212,7 +275,7 @@ def _network(saved: Saved, buffer: Buffer, obs_dim: int, action_dim: int) -> Con
         nn.Mish(),
         nn.Linear(4 * width, width),
     )
-    load_network(network, {_renamed(name): value for name, value in saved.weights.items()})
+    load_network(network, weights)
     return network
 
 

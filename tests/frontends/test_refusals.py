@@ -82,7 +82,6 @@ NAMES = [
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
     ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
-    ("TEDiUnetHybridImagePolicy", "Streaming Diffusion Policy on images.*The one on states, TEDiUnetLowdimPolicy, is"),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
 ]
 

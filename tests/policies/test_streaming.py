@@ -15,9 +15,9 @@ from tests.rounding import PROMISED
 from ttscompile.cli import main
 from ttscompile.errors import CheckpointError, ObservationError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.policies.streaming import Buffer
+from ttscompile.policies.streaming import Buffer, StreamingDenoiser
 
 from . import streams
 
@@ -38,7 +38,7 @@ def calls(
     for number, observed in enumerate(streams.observations(variant)):
         noise = ttscompile.Noise(initial, np.stack([next(drawn) for _ in range(spec.sampler.steps)]))
         begins = np.full((streams.STREAMS, 1), number == 0, np.float32)
-        buffer = act({"obs": observed, "buffer": buffer, "begins": begins}, noise)
+        buffer = act({**observed, "buffer": buffer, "begins": begins}, noise)
         yield buffer
         assert noise.steps is not None
         new, _ = next(drawn), next(drawn)  # the original draws noise for the steps before the chunk, and drops it
@@ -75,14 +75,15 @@ def test_the_network_is_told_the_timestep_of_every_position(variant: str, tmp_pa
     made, numbers = streams.configuration(variant)["policy"], streams.expected(variant)
     buffer = Buffer(made["horizon"], made["n_obs_steps"], made["n_action_steps"], made["num_inference_steps"])
     assert (numbers["told"] == np.tile(buffer.levels(), (streams.CALLS, 1))).all()
-    module: Any
     module, spec = load_checkpoint_policy(streams.save(tmp_path / "policy.ckpt", variant))
     seen: list[Any] = []
-    module.model.register_forward_hook(lambda model, args, out: seen.append(out))
-    observed = spec.observations["obs"].normalized(streams.observations(variant)[0])
-    noise = torch.from_numpy(streams.draws(variant)[0])
+    denoiser = next(each for each in module.modules() if isinstance(each, StreamingDenoiser))
+    denoiser.model.register_forward_hook(lambda model, args, out: seen.append(out))
+    noise = streams.draws(variant)[0]
+    first = streams.observations(variant)[0] | {"buffer": noise, "begins": np.ones((2, 1), np.float32)}
+    given = {key: torch.from_numpy(each.normalized(first[key])) for key, each in spec.observations.items()}
     with torch.inference_mode():
-        module(noise, torch.zeros(2, dtype=torch.int64), torch.from_numpy(observed), noise, torch.ones(2, 1))
+        evaluation(module, spec, given)(torch.from_numpy(noise), torch.zeros(2, dtype=torch.int64))
     assert np.abs(seen[0].numpy() - numbers["first_out"]).max() < PROMISED * np.ptp(numbers["first_out"])
 
 
@@ -96,9 +97,10 @@ def test_a_buffer_by_hand() -> None:
 
 
 @pytest.mark.slow
-def test_one_command_compiles_a_policy_that_goes_on_from_call_to_call(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("variant", "what"), [("two_chunks", "low-dimensional"), ("images", "robomimic's encoder")])
+def test_one_command_compiles_a_policy_that_goes_on_from_call_to_call(variant: str, what: str, tmp_path: Path) -> None:
     """In both runtimes; its row of the support table."""
-    variant, compiled = "two_chunks", tmp_path / "compiled"
+    compiled = tmp_path / "compiled"
     path = streams.save(tmp_path / "policy.ckpt", variant)
     result = CliRunner().invoke(main, ["convert", str(path), "-o", str(compiled)])
     assert result.exit_code == 0, result.output
@@ -112,11 +114,10 @@ def test_one_command_compiles_a_policy_that_goes_on_from_call_to_call(tmp_path: 
 
         assert_same(variant, spec, calls(variant, spec, act))
     assert policy.info.prefix_refusal is not None
-    observed = {"obs": streams.observations(variant)[0]}
     with pytest.raises(ObservationError, match="buffer"):
-        policy.predict_action(observed)
+        policy.predict_action(streams.observations(variant)[0])
     record(
-        "Streaming Diffusion Policy, low-dimensional",
+        f"Streaming Diffusion Policy, {what}",
         "actions that the original gave, call after call, 1e-5 of the range",
         "streaming 5",
         ttscompile.convert(path, tmp_path / "again"),
@@ -145,7 +146,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"n_action_steps": 2}, r"horizon = 8 holds 3 chunks of n_action_steps = 2, and 10 timesteps; expected"),
     ({"n_action_steps": 8}, "horizon = 8 holds 0 chunks of n_action_steps = 8"),
     ({"horizon": 12, "n_action_steps": 5}, r"model\.horizon is 8; expected 12, the policy's"),
-    ({"horizon": 10**6}, "horizon is 1000000; expected a positive whole number, 4096 at most"),
+    (
+        {"horizon": 10**6, "model": {"horizon": 10**6}},
+        "policy.horizon is 1000000; expected a positive whole number, 4096 at most",
+    ),
     ({"model": {"input_dim": 4}}, r"model\.input_dim is 4; expected 3 with action_dim = 3"),
     ({"model": {"input_dim": None}}, r"model\.input_dim is missing"),
     ({"model": {"more": 1}}, r"cfg\.policy\.model has settings that ConditionalUnet1D does not know: more"),
@@ -162,3 +166,19 @@ def test_what_is_no_such_policy_is_refused(changes: dict[str, Any], message: str
     with pytest.raises(CheckpointError, match=message) as caught:
         load_checkpoint_policy(path)
     assert str(path) in str(caught.value)
+
+
+def test_what_is_no_such_policy_on_images_is_refused(tmp_path: Path) -> None:
+    pos = {"shape": [4]}
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"obs_as_global_cond": False}, "obs_as_global_cond is false"),
+        (
+            {"shape_meta": {"obs": {"buffer": pos}, "action": {"shape": [3]}}},
+            "shape_meta.obs names buffer, which stands",
+        ),
+        ({"down_dims": [16, 24, 32]}, r"missing model\.down_modules\.1\.2"),
+        ({"more": 1}, "has settings that are not known: more"),
+    ]
+    for changes, message in cases:
+        with pytest.raises(CheckpointError, match=message):
+            load_checkpoint_policy(streams.save(tmp_path / "policy.ckpt", "images", **changes))

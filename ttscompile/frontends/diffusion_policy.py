@@ -43,6 +43,7 @@ _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "KarrasUnetHybridImagePolicy": _beside("consistency_policy", "teacher"),
     _STUDENT: _beside("consistency_policy", "student"),
     "TEDiUnetLowdimPolicy": _beside("streaming", "low_dim"),
+    "TEDIUnetHybridImagePolicy": _beside("streaming", "on_images"),
 }
 """By the class name of the original policy."""
 

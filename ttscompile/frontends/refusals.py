@@ -66,11 +66,6 @@ class Refusal:
 POLICIES = (
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
     Refusal(
-        r"^tedi",
-        "Streaming Diffusion Policy on images, which is not rebuilt here",
-        "The one on states, TEDiUnetLowdimPolicy, is.",
-    ),
-    Refusal(
         r"transformer|unet",
         "a diffusion policy with another observation encoder than those that are read",
         f"{_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",

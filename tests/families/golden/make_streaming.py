@@ -1,9 +1,10 @@
 """Run Streaming Diffusion Policy on seeded weights, call after call, and write what it gives: ``streaming.npz``.
 
-Not run by the tests. Needs a clone of Streaming-Diffusion-Policy/streaming_diffusion_policy (922271e), and einops::
+Not run by the tests. Needs a clone of Streaming-Diffusion-Policy/streaming_diffusion_policy (922271e), omegaconf,
+ARISE-Initiative/robomimic v0.2.0 importable, and einops::
 
     pip install --no-deps --target einops einops==0.8.2
-    PYTHONPATH=einops python -m tests.families.golden.make_streaming path/to/streaming_diffusion_policy
+    PYTHONPATH=einops:path/to/robomimic python -m tests.families.golden.make_streaming path/to/the/clone
 """
 
 import importlib
@@ -16,29 +17,20 @@ import diffusers.utils
 import numpy as np
 import torch
 
+from tests.frontends.golden.torchvision_stand_in import put_in_place
 from tests.policies import streams
 
 from .originals import Arrays, generator
 
-_ABSENT: tuple[str, ...] = (
-    "robomimic",
-    "diffusion_policy.dataset.pusht_dataset",
-    "diffusion_policy.common.robomimic_config_util",
-)
-_ABSENT += (
-    "diffusion_policy.model.vision",
-    "diffusion_policy.model.vision.crop_randomizer",
-    "numcodecs",
-    "diffusion_policy.common.pytorch_util",
-    "zarr",
-)
-_ABSENT += tuple(f"robomimic.{name}" for name in ("algo", "algo.algo", "utils", "utils.obs_utils", "models"))
-_ABSENT += ("robomimic.models.base_nets", "robomimic.utils.file_utils")
+_ABSENT = ("zarr", "numcodecs", "diffusion_policy.dataset", "diffusion_policy.dataset.pusht_dataset")
 
 
 def made(settings: dict[str, Any]) -> Any:
     """What ``hydra.utils.instantiate`` makes of an entry of the configuration."""
-    arguments = {name: made(value) if isinstance(value, dict) else value for name, value in settings.items()}
+    arguments = {
+        name: made(value) if isinstance(value, dict) and "_target_" in value else value
+        for name, value in settings.items()
+    }
     module, _, name = arguments.pop("_target_").rpartition(".")
     return getattr(importlib.import_module(module), name)(**arguments)
 
@@ -46,7 +38,8 @@ def made(settings: dict[str, Any]) -> Any:
 def run(folder: Path) -> dict[str, Arrays]:
     """Of each variant the actions of three consecutive calls, and what its network was told and gave at first."""
     sys.path.insert(0, str(folder))
-    for name in _ABSENT:  # imported, never called
+    put_in_place()
+    for name in (*_ABSENT, "diffusion_policy.dataset.pusht_image_dataset"):  # imported, never called
         sys.modules[name] = MagicMock()
     # Today's diffusers has the one name no longer, and refuses what its version 0.12 was to have lost.
     diffusers.utils.__dict__.setdefault("_COMPATIBLE_STABLE_DIFFUSION_SCHEDULERS", [])
@@ -59,9 +52,10 @@ def run(folder: Path) -> dict[str, Arrays]:
 def of(variant: str) -> Arrays:
     """What one policy gives."""
     policy = made(streams.configuration(variant)["policy"])
-    given = streams.network(variant) | streams.normalizer()
+    given = streams.network(variant) | streams.normalizer(variant)
     left = policy.load_state_dict(given, strict=False)
-    assert all(name.endswith("_dummy_variable") for name in left.missing_keys), left.missing_keys
+    unset = ("_dummy_variable", "num_batches_tracked")
+    assert all(name.endswith(unset) for name in left.missing_keys), left.missing_keys
     assert all(name.startswith("normalizer.") for name in left.unexpected_keys), left.unexpected_keys
     policy.eval()
     evaluations: list[tuple[Any, Any]] = []
@@ -75,7 +69,7 @@ def of(variant: str) -> Arrays:
     actions, whole = [], []
     with patch("torch.randn", drawn):
         for observed in streams.observations(variant):
-            result = policy.predict_action({"obs": torch.from_numpy(observed)})
+            result = policy.predict_action({key: torch.from_numpy(value) for key, value in observed.items()})
             actions.append(result["action"].numpy())
             whole.append(result["action_pred"].clone().numpy())
     return {
