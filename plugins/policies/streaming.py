@@ -180,7 +180,7 @@ class _OfRow(nn.Module):
         self.denoiser, self.sizes = denoiser, sizes
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
-        obs, buffer, begins = row.split(self.sizes, -1)
+        obs, buffer, begins = torch.split(row, self.sizes, dim=-1)
         return self.denoiser(sample, timestep, obs, buffer.unflatten(-1, sample.shape[1:]), begins)  # type: ignore[no-any-return]
 
 
