@@ -180,8 +180,9 @@ class _OfRow(nn.Module):
         self.denoiser, self.sizes = denoiser, sizes
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
-        obs, buffer, begins = torch.split(row, self.sizes, dim=-1)
-        return self.denoiser(sample, timestep, obs, buffer.unflatten(-1, sample.shape[1:]), begins)  # type: ignore[no-any-return]
+        obs, buffer, begins = torch.split(row, list(self.sizes), dim=-1)
+        made: torch.Tensor = self.denoiser(sample, timestep, obs, torch.unflatten(buffer, -1, sample.shape[1:]), begins)
+        return made
 
 
 def low_dim(saved: Saved) -> Rebuilt:
