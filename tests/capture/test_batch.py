@@ -85,3 +85,13 @@ def test_a_number_that_changes_no_shape_is_no_batch() -> None:
 
     (clamp,) = (node for node in capture(Clamped(), toy_spec())[0].nodes if "clamp" in node.op)
     assert FIRST in (*clamp.args, *dict(clamp.kwargs).values())
+
+
+def test_one_part_of_a_tensor_is_the_tensor() -> None:
+    class Chunk(nn.Module):
+        def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
+            (whole,), (seen,) = sample.chunk(1, -1), obs.split([obs.shape[1]], 1)
+            return whole + 0 * seen[:, None, :1].unbind(2)[0][..., None]
+
+    found, _ = capture(Chunk(), toy_spec())
+    assert not any("split" in node.op for node in found.nodes)

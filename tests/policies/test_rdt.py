@@ -135,7 +135,7 @@ def test_more_weights_than_the_machine_can_compile_are_refused(
     if file == "model.safetensors":
         save_file(weights_of("rdt"), directory / file)
     monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 1000)
-    with pytest.raises(CheckpointError, match=rf"{file}: 0 million weights. Compiling them takes about 0\.0 GiB"):
+    with pytest.raises(CheckpointError, match=rf"{file}: 0 million weights.* Compiling them takes about 0\.0 GiB"):
         load_checkpoint_policy(directory)
 
 

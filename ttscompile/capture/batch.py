@@ -1,9 +1,8 @@
 """The batch as a symbol, found among the numbers of a graph that was captured with a batch size rare among them.
 
-torch.export can reason about a symbolic batch, and gives up where it cannot prove something that is true:
-``prediction.chunk(2, 0)`` of a doubled batch, say. With numbers there is nothing to prove: ``107 * c`` is ``c * B``. A
-network may have such a number of its own, so all shapes are then computed for two streams, and have to be those that
-follow. Where they are not, another number is tried.
+torch.export can reason about a symbolic batch, and gives up where it cannot prove something that is true, as of a
+doubled batch's ``chunk(2, 0)``. With numbers there is nothing to prove: ``107 * c`` is ``c * B``. A network may have
+such a number of its own, so all shapes are then computed for two streams. Where they differ, another number is tried.
 """
 
 from collections.abc import Mapping
@@ -25,8 +24,7 @@ def with_batch(graph: Graph, batch: int) -> Graph:
     """The graph for every batch size, of one that was captured with this one.
 
     Raises:
-        CaptureError: a size is no multiple of the batch size, or a multiple of it may be something else; names the
-            first node at which that is seen.
+        CaptureError: a size is no multiple of it, or a multiple of it may be something else; names the first such node.
     """
     inputs = {name: _type(type_, batch) for name, type_ in graph.inputs.items()}
     found = replace(graph, inputs=inputs, nodes=tuple(_node(node, batch) for node in graph.nodes))
@@ -56,16 +54,15 @@ def _size(size: Size, batch: int) -> Size:
 
 
 def _require_sizes(graph: Graph, captured: Graph, batch: int) -> None:
-    """Refuse a graph in which a number may be no size and was taken for one; a size that is none has a wrong shape."""
-    for node in graph.nodes:
+    for node in graph.nodes:  # a number that is no size; a size that is none has a wrong shape
         if node.op != GETITEM and not node.op.startswith("aten.arange."):
             kinds = {a.name: str(a.type) for a in resolve_op(node)._schema.arguments}  # type: ignore[attr-defined]
             given = [*zip(kinds, node.args, strict=False), *node.kwargs]
             if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
-                raise CaptureError(
-                    f"%{node.name} ({node.source}) computes with a multiple of {batch}, the batch size.{REMEDY}"
-                )
-    single = [(node, before) for node, before in zip(graph.nodes, captured.nodes, strict=True) if len(node.types) == 1]
+                where = f"%{node.name} ({node.source})"
+                raise CaptureError(f"{where} computes with a multiple of {batch}, the batch size.{REMEDY}")
+    both = zip(graph.nodes, captured.nodes, strict=True)
+    single = [(node, before) for node, before in both if len(node.types) == 1 and "unbind" not in node.op]
     run = Evaluator(replace(graph, outputs=tuple(node.name for node, _ in single)), _of_two(graph.constants), "meta")
     for (node, before), value in zip(single, run(_of_two(graph.inputs)), strict=True):
         if tuple(value.shape) != node.type.at(2):

@@ -32,6 +32,7 @@ _ADVICE = re.compile(r"\s*\n(?:Caused by: \(|For more information, run with|The 
 """Where torch.export's messages turn to its own debugging."""
 _RESHAPE = "aten.reshape.default"
 _VIEWS = (torch.ops.aten.view.default, torch.ops.aten._unsafe_view.default)
+_SPLITS = (torch.ops.aten.split.Tensor, torch.ops.aten.split_with_sizes.default)
 
 Weights = dict[str, npt.NDArray[np.generic]]
 
@@ -224,6 +225,10 @@ class _Converter:
         value, target = fx_node.meta.get("val"), fx_node.target
         if value is None or isinstance(value, torch.SymInt | torch.SymBool | int | bool):
             return None  # sizes are solved by _size; assertions on them hold by construction
+        whole = fx_node.args[0] if target is operator.getitem else fx_node
+        if whole.target in _SPLITS and len(whole.meta["val"]) == 1:  # one part is what was split
+            self.names[fx_node] = self.names[fx_node.args[0]]
+            return None
         if target is operator.getitem:
             op = GETITEM
         elif isinstance(target, torch._ops.OpOverload) and target.namespace == "aten":

@@ -49,9 +49,8 @@ def pack(matrix: Array) -> tuple[npt.NDArray[np.uint8], Array]:
 
 def columns_at_once(matrix: Array) -> Iterator[slice]:
     """Columns that are rounded together: a matrix may be a tenth of the memory, and rounding takes several times it."""
-    rows, columns = matrix.shape
-    count = max(1, _PART // max(1, rows))
-    return (slice(i, i + count) for i in range(0, columns, count))
+    count = max(1, _PART // max(1, len(matrix)))
+    return (slice(i, i + count) for i in range(0, matrix.shape[1], count))
 
 
 def unpack(packed: npt.NDArray[np.uint8], scales: Array, rows: int) -> Array:
