@@ -106,7 +106,7 @@ def test_a_branch_at_a_small_batch_is_refused(small: int) -> None:
     ("then", "why"),
     [
         (lambda y, t, o: y - y.mean(0), "for a stream beside another something else than alone"),
-        (lambda y, t, o: y / y.shape[0], r"%div .* computes with a multiple of 109, the batch size"),
+        (lambda y, t, o: y / y.shape[0], r"%div .* computes with a multiple of 109. Every stream"),
         (
             lambda y, t, o: y * torch.arange(y.shape[0])[:, None, None],
             "for a stream beside another something else than alone",

@@ -59,8 +59,7 @@ def _require_sizes(graph: Graph, captured: Graph, batch: int) -> None:
             kinds = {a.name: str(a.type) for a in resolve_op(node)._schema.arguments}  # type: ignore[attr-defined]
             given = [*zip(kinds, node.args, strict=False), *node.kwargs]
             if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
-                where = f"%{node.name} ({node.source})"
-                raise CaptureError(f"{where} computes with a multiple of {batch}, the batch size.{REMEDY}")
+                raise CaptureError(f"%{node.name} ({node.source}) computes with a multiple of {batch}.{REMEDY}")
     both = zip(graph.nodes, captured.nodes, strict=True)
     single = [(node, before) for node, before in both if len(node.types) == 1 and "unbind" not in node.op]
     run = Evaluator(replace(graph, outputs=tuple(node.name for node, _ in single)), _of_two(graph.constants), "meta")

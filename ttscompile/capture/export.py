@@ -225,9 +225,10 @@ class _Converter:
         value, target = fx_node.meta.get("val"), fx_node.target
         if value is None or isinstance(value, torch.SymInt | torch.SymBool | int | bool):
             return None  # sizes are solved by _size; assertions on them hold by construction
-        whole = fx_node.args[0] if target is operator.getitem else fx_node
+        source: Any = next(iter(fx_node.args), None)
+        whole = source if target is operator.getitem else fx_node
         if whole.target in _SPLITS and len(whole.meta["val"]) == 1:  # one part is what was split
-            self.names[fx_node] = self.names[fx_node.args[0]]
+            self.names[fx_node] = self.names[source]
             return None
         if target is operator.getitem:
             op = GETITEM
