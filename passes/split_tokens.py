@@ -5,10 +5,8 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import accumulate, groupby
 
-import numpy as np
-
 from ttscompile.ir.binding import bindings, input_bindings, join
-from ttscompile.ir.dataflow import reachable_from, reaching
+from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.graph import Argument, Graph, Node, Ref, TensorType
 from ttscompile.ir.operations import Movement, axis_after, operation
 from ttscompile.ir.program import Binding, Captured, Cut
@@ -255,39 +253,26 @@ class SplitStem(Pass[Captured, Captured]):
         %h.part1 = aten.linear.default(%time, %w[:, 720:])       # of one row: a table in the artifact
         %h       = aten.add.Tensor(%h.part0, %h.part1)
 
-    The result differs from the original by rounding only.
+    The result differs from the original by rounding only. ``CleanUp`` then makes constants of the columns, before a cut
+    puts them into the prologue: what the loop reads of that it reads a step at a time.
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
         """Split in the denoiser."""
-        graph, sample = program.denoiser, program.spec.sample_argument
-        loop, producers, types = reachable_from(graph, [sample]), graph.producers(), graph.types()
-        nodes, notes, constants, weights = list[Node](), list[str](), dict(graph.constants), dict(program.weights)
+        graph = program.denoiser
+        loop, producers = reachable_from(graph, [program.spec.sample_argument]), graph.producers()
+        nodes, notes, types = list[Node](), list[str](), graph.types()
         for node in graph.nodes:
-            parts = _features(node, producers, types) if node.op == _LINEAR and node.name in loop else []
+            parts = _features(node, producers, types) if node.op == _LINEAR else []
             moving = [i for i, part in enumerate(parts) if part in loop]
-            if len(parts) < 2 or len(moving) != 1 or list(node.refs())[1] not in constants:
+            if len(parts) < 2 or len(moving) != 1 or list(node.refs())[1] not in graph.constants:
                 nodes.append(node)
                 continue
             own = [part if part in loop else _narrow(part, producers, types) for part in parts]
-            for made in _sum(node, own, types, *moving):
-                if made.op != _SLICE:
-                    nodes.append(made)
-                    continue
-                # A constant of its own: what the loop reads of the prologue it reads a step at a time.
-                weight, _, start, end = made.args
-                assert isinstance(weight, Ref)
-                constants[made.name] = made.type
-                weights[made.name] = np.ascontiguousarray(program.weights[weight.name][:, start:end])
+            nodes += _sum(node, own, types, *moving)
             notes.append(f"%{node.name} ({node.source or 'source unknown'}): one of {len(parts)} parts is in the loop")
-        if not notes:
-            return PassResult(program)
-        split = replace(graph, nodes=tuple(nodes))
-        live = reaching(split, graph.outputs)  # without what was concatenated
-        left = {name: type_ for name, type_ in constants.items() if name in live}
-        split = replace(split, constants=left, nodes=tuple(node for node in nodes if node.name in live))
-        kept = {name: value for name, value in weights.items() if name in left}
-        return PassResult(replace(program, denoiser=split, weights=kept), tuple(notes))
+        split = replace(program, denoiser=replace(graph, nodes=tuple(nodes))) if notes else program
+        return PassResult(split, tuple(notes))
 
 
 def _narrow(part: str, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> str:

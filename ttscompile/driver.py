@@ -272,7 +272,8 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = lambda 
     dense = (graph_flops(whole) - once) * spec.sampler.steps + once
     captured = Captured(spec, graph, weights, dense_flops=dense, once_flops=once)
     verify(captured)
-    for simplify in (CleanUp[Captured](), CutCopies(), WidenAttention(), SplitStem(), RegroupSums()):
+    clean = CleanUp[Captured]()
+    for simplify in (clean, CutCopies(), WidenAttention(), SplitStem(), clean, RegroupSums()):
         captured = _run(simplify, captured, explain)
     captured, table = _find_blocks(captured, explain)
     cut = _run(Partition(table.blocks), captured, explain)

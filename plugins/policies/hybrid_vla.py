@@ -220,9 +220,8 @@ def _weights(path: Path) -> dict[str, Tensor]:
     found = {name: value for name, value in parts["llm_backbone"].items() if str(name).startswith(read)}
     found |= {f"{part}.{name}": value for part in _PARTS for name, value in parts[part].items()}
     found = {str(name): value for name, value in found.items() if not str(name).endswith(_UNREAD)}
-    tensors = [value for value in found.values() if isinstance(value, Tensor)]
-    copied = sum(value.numel() for value in tensors if value.dtype != torch.float32)
-    require_memory_for(path, sum(value.numel() for value in tensors), copied)
+    tensors = (value for value in found.values() if isinstance(value, Tensor))
+    require_memory_for(path, ((each.numel(), each.dtype == torch.float32) for each in tensors))
     return as_float32(found, f"{path}: ")
 
 

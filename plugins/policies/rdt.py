@@ -271,5 +271,6 @@ def _weights(directory: Path) -> dict[str, Tensor]:
         raise CheckpointError(f"{directory}: expected {WEIGHTS} or {PICKLED}; found neither. Copy the directory whole.")
     path = directory / PICKLED
     saved = read_checkpoint(path, mapped=True)
-    require_memory_for(path, sum(value.numel() for value in saved.values() if isinstance(value, Tensor)))
+    tensors = (value for value in saved.values() if isinstance(value, Tensor))
+    require_memory_for(path, ((each.numel(), each.dtype == torch.float32) for each in tensors))
     return as_float32(saved, f"{path}: ")

@@ -1,6 +1,5 @@
 """Weights in safetensors files as transformers' ``save_pretrained`` writes them, of which a head is a part."""
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -9,7 +8,7 @@ import torch
 from safetensors import safe_open
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.saved_weights import require_memory_for
+from ttscompile.frontends.saved_weights import require_memory_for, saved_size
 from ttscompile.frontends.settings import read_json
 
 WHOLE, INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -25,8 +24,8 @@ def read_part(directory: Path, prefix: str) -> dict[str, torch.Tensor]:
     files = _files(directory)
     part = {name: file for name, file in files.items() if name.startswith(prefix)} or files
     by_file = {file: [name for name, each in part.items() if each == file] for file in sorted(set(part.values()))}
-    shapes = [_take(file, lambda opened, name: opened.get_slice(name).get_shape(), by_file[file]) for file in by_file]
-    require_memory_for(directory, sum(math.prod(shape) for each in shapes for shape in each.values()))
+    sizes = [_take(file, saved_size, by_file[file]) for file in by_file]
+    require_memory_for(directory, [size for each in sizes for size in each.values()])
     found: dict[str, torch.Tensor] = {}
     for file, names in by_file.items():
         found |= _take(file, lambda opened, name: opened.get_tensor(name), names)

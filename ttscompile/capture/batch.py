@@ -60,11 +60,10 @@ def _require_sizes(graph: Graph, captured: Graph, batch: int) -> None:
             given = [*zip(kinds, node.args, strict=False), *node.kwargs]
             if any(isinstance(value, Batch) and "int" not in kinds[name] for name, value in given):
                 raise CaptureError(f"%{node.name} ({node.source}) computes with a multiple of {batch}.{REMEDY}")
-    both = zip(graph.nodes, captured.nodes, strict=True)
-    single = [(node, before) for node, before in both if len(node.types) == 1 and "unbind" not in node.op]
-    run = Evaluator(replace(graph, outputs=tuple(node.name for node, _ in single)), _of_two(graph.constants), "meta")
-    for (node, before), value in zip(single, run(_of_two(graph.inputs)), strict=True):
-        if tuple(value.shape) != node.type.at(2):
+    run = Evaluator(replace(graph, outputs=tuple(node.name for node in graph.nodes)), _of_two(graph.constants), "meta")
+    for node, before, value in zip(graph.nodes, captured.nodes, run(_of_two(graph.inputs)), strict=True):
+        # Of what gives several values each is looked at where it is taken.
+        if isinstance(value, torch.Tensor) and tuple(value.shape) != node.type.at(2):
             raise CaptureError(
                 f"a size at %{node.name} ({node.source}) is not a multiple of the batch size: it has the shape"
                 f" {tuple(before.type.shape)} for {batch} streams and {tuple(value.shape)} for 2. Only the batch may"

@@ -55,14 +55,16 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
         CaptureError: torch.export failed; the graph uses what the compiler cannot express, of which it names the node;
             or what the module computes for a stream depends on the others, or on how many there are.
     """
-    module = sharing_copy(module)
+    module, (first, second) = sharing_copy(module), BATCHES
+    traced = _Converter(*_traced(module, spec, first)).convert()  # what fails here fails with any batch
     with suppress(CaptureError):  # a number of the network may be a multiple of this batch
-        return _captured(module, spec, BATCHES[0])
-    return _captured(module, spec, BATCHES[1])
+        return _for_any_batch(module, spec, *traced, first)
+    return _for_any_batch(module, spec, *_Converter(*_traced(module, spec, second)).convert(), second)
 
 
-def _captured(module: nn.Module, spec: PolicySpec, batch: int) -> tuple[Graph, Weights]:
-    graph, weights = _Converter(*_traced(module, spec, batch)).convert()
+def _for_any_batch(
+    module: nn.Module, spec: PolicySpec, graph: Graph, weights: Weights, batch: int
+) -> tuple[Graph, Weights]:
     graph = with_batch(graph, batch)
     found, expected = graph.types()[graph.outputs[0]], graph.inputs[spec.sample_argument]
     if found != expected:
@@ -104,7 +106,8 @@ def _close(found: torch.Tensor, expected: torch.Tensor) -> bool:
 def _traced(
     module: nn.Module, spec: PolicySpec, streams: int
 ) -> tuple[torch.export.ExportedProgram, dict[str, torch.Tensor]]:
-    examples = _examples(spec, streams)
+    # Only types are traced, and memory that nobody writes to takes none.
+    examples = {name: one.new_empty(streams, *one.shape[1:]) for name, one in _examples(spec, 1).items()}
     given = _as_arguments(examples, spec)
     fastpath = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)  # the fused encoder layer is opaque to every pass
@@ -161,8 +164,6 @@ def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[
 
 
 def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
-    if streams in BATCHES:  # memory that nobody writes to takes none
-        return {name: one.new_empty(streams, *one.shape[1:]) for name, one in _examples(spec, 1).items()}
     generator = torch.Generator().manual_seed(0)
     sample = torch.randn(streams, *spec.sample, generator=generator)
     timestep = torch.from_numpy(spec.sampler.timesteps)[:1].repeat(streams)

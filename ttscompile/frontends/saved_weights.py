@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,24 +47,31 @@ def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
         return
     try:
         with safe_open(path, "np") as file:
-            slices = [file.get_slice(name) for name in file.keys() if not left_out(name, without)]  # noqa: SIM118
-            sizes = [(math.prod(each.get_shape()), each.get_dtype() != "F32") for each in slices]
+            names = [name for name in file.keys() if not left_out(name, without)]  # noqa: SIM118
+            sizes = [saved_size(file, name) for name in names]
     except Exception:  # a damaged file, which its reader describes
         return
-    require_memory_for(path, sum(count for count, _ in sizes), sum(count for count, copied in sizes if copied))
+    require_memory_for(path, sizes)
 
 
-def require_memory_for(path: Path, numbers: int, copied: int | None = None) -> None:
-    """The same of so many weights, which the file at ``path`` has; ``copied`` are not float32, None for all of them."""
-    copied = numbers if copied is None else copied
+def require_memory_for(path: Path, sizes: Iterable[tuple[int, bool]]) -> None:
+    """The same of tensors that the file at ``path`` has: how many numbers each has, and whether it is float32."""
+    sizes = list(sizes)
+    numbers, copied = sum(count for count, _ in sizes), sum(count for count, single in sizes if not single)
     need, there = BYTES * numbers + COPY * copied, memory_bytes()
     if need > there:
-        half = f", of which {copied / 1e6:,.0f} million are not in float32, and are copied" if copied else ""
+        told = f", of which {copied / 1e6:,.0f} million are not in float32, and are copied" if copied else ""
         raise CheckpointError(
-            f"{path}: {numbers / 1e6:,.0f} million weights{half}. Compiling them takes about {need / 2**30:.1f} GiB of"
+            f"{path}: {numbers / 1e6:,.0f} million weights{told}. Compiling them takes about {need / 2**30:.1f} GiB of"
             f" memory beside the file; this machine has {there / 2**30:.1f} GiB. Convert on a larger one: in precision"
             " 'int4' the artifact takes about a byte a weight to run."
         )
+
+
+def saved_size(file: Any, name: str) -> tuple[int, bool]:
+    """The same of a tensor in an open safetensors file."""
+    one = file.get_slice(name)
+    return math.prod(one.get_shape()), one.get_dtype() == "F32"
 
 
 def names_of(keys: Sequence[str]) -> str:
