@@ -14,9 +14,9 @@ from torch import nn
 from ..errors import CheckpointError
 from ..measure.machine import memory_bytes
 
-BYTES, COPY = 2, 4
-"""Bytes that compiling takes at most for each weight, beside the mapped file, and for a copy of one that was not saved
-in float32: see ``docs/decisions.md``."""
+BYTES_A_WEIGHT, BYTES_A_COPY = 2, 4
+"""That compiling takes at most, beside the mapped file; copies are of weights that were not saved in float32. Source:
+``docs/decisions.md``."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -58,7 +58,7 @@ def require_memory_for(path: Path, sizes: Iterable[tuple[int, bool]]) -> None:
     """The same of tensors that the file at ``path`` has: how many numbers each has, and whether it is float32."""
     sizes = list(sizes)
     numbers, copied = sum(count for count, _ in sizes), sum(count for count, single in sizes if not single)
-    need, there = BYTES * numbers + COPY * copied, memory_bytes()
+    need, there = BYTES_A_WEIGHT * numbers + BYTES_A_COPY * copied, memory_bytes()
     if need > there:
         told = f", of which {copied / 1e6:,.0f} million are not in float32, and are copied" if copied else ""
         raise CheckpointError(
