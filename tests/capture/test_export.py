@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from tests.passes.specs import toy_spec
+from ttscompile.capture import export
 from ttscompile.capture.export import capture
 from ttscompile.errors import CaptureError
 from ttscompile.ir.evaluate import evaluate
@@ -88,6 +89,15 @@ def test_the_error_is_all_that_is_said(
             logger.removeHandler(caplog.handler)
     assert (*capsys.readouterr(), caplog.text) == ("", "", "")
     assert "TORCH" not in str(caught.value)
+
+
+def test_what_cannot_be_traced_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another number of streams would change nothing, and the user waits for the error."""
+    calls, trace = list[int](), export._traced
+    monkeypatch.setattr(export, "_traced", lambda *given: (calls.append(given[-1]), trace(*given))[1])
+    with pytest.raises(CaptureError, match="could not capture"):
+        capture(Denoiser(lambda y, t, o: y if y.sum() > 0 else -y), toy_spec())
+    assert len(calls) == 1
 
 
 def test_a_constant_made_of_the_number_of_streams_is_refused() -> None:
