@@ -10,9 +10,9 @@ from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, random_weight, write
 from safetensors.torch import save_file
 
 from ttscompile.frontends.clip import TowerConfig
-from ttscompile.frontends.florence import read_florence
 from ttscompile.frontends.settings import Settings
-from ttscompile.frontends.xvla import XVLA, XVLAConfig
+from ttscompile.policies.florence import read_florence
+from ttscompile.policies.xvla import XVLA, XVLAConfig
 
 FLORENCE: dict[str, Any] = {
     "vision_config": {

@@ -1,4 +1,6 @@
-"""Policies beside those of the core, as their authors' code saved them; and LeRobot's ``act``, which has no loop.
+"""Policies beside those of the core: as their authors' code saved them; LeRobot's ``act`` and ``xvla``.
+
+``act`` has no loop, and no other policy sees as ``xvla`` does.
 
 Each is one module with the network and its loading, and one row: in ``frontends/families.py``, for a class of Diffusion
 Policy's kind in ``diffusion_policy.py``, or for a type of LeRobot's in ``lerobot.py``. Of an action head the

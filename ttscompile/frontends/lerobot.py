@@ -15,8 +15,9 @@ from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
 from .settings import read_json
 
-TYPES = {name: f"lerobot_{name}" for name in "diffusion evo1 groot multi_task_dit smolvla vla_jepa xvla".split()}
-TYPES |= {"pi0": "lerobot_pi", "pi05": "lerobot_pi", "act": ".policies.lerobot_act"}
+TYPES = {name: f"lerobot_{name}" for name in "diffusion evo1 groot multi_task_dit smolvla vla_jepa".split()}
+TYPES |= {"pi0": "lerobot_pi", "pi05": "lerobot_pi"}
+TYPES |= {name: f".policies.lerobot_{name}" for name in ("act", "xvla")}
 """The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 
 

@@ -12,21 +12,30 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.spec import PolicySpec, SamplerTable
-from ..errors import SpecError
-from ..samplers.flow import remixed_table
-from .clip import TowerConfig, find_encoder
-from .encoded import EncodedDenoiser
-from .families import LoadOptions
+from ttscompile.core.spec import PolicySpec, SamplerTable
+from ttscompile.errors import SpecError
+from ttscompile.frontends.clip import TowerConfig, find_encoder
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.instruction import encoder_folders, task_tokens
+from ttscompile.frontends.internvl import MEAN
+from ttscompile.frontends.lerobot_config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
+from ttscompile.frontends.lerobot_policy import integration_steps, read_weights
+from ttscompile.frontends.lerobot_processors import DOMAIN, IMAGENET, OWN_STEPS, Processors
+from ttscompile.frontends.lerobot_vla import (
+    Gathered,
+    part_of,
+    positive_number,
+    read_vla_config,
+    read_vla_processors,
+    seen_size,
+    vla_spec,
+)
+from ttscompile.frontends.saved_weights import filled, renamed, separated
+from ttscompile.frontends.settings import Settings
+from ttscompile.samplers.flow import remixed_table
+
 from .florence import FlorenceConfig, read_florence
-from .instruction import encoder_folders, task_tokens
-from .internvl import MEAN
-from .lerobot_config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
-from .lerobot_policy import integration_steps, read_weights
-from .lerobot_processors import DOMAIN, IMAGENET, OWN_STEPS, Processors
-from .lerobot_vla import Gathered, part_of, positive_number, read_vla_config, read_vla_processors, seen_size, vla_spec
-from .saved_weights import filled, renamed, separated
-from .settings import Settings
 from .xvla import XVLA, Denoiser, Prefix, XVLAConfig
 
 _MOST_LETTERS, _MOST_VIEWS, _MOST_DOMAINS = 400, 64, 4096

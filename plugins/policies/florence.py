@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .clip import ACTIVATIONS, Attention, FeedForward, TowerConfig
-from .internvl import Colours
-from .lerobot_config import MOST
-from .lerobot_vla import part_of, positive_number
-from .settings import Settings
+from ttscompile.frontends.clip import ACTIVATIONS, Attention, FeedForward, TowerConfig
+from ttscompile.frontends.internvl import Colours
+from ttscompile.frontends.lerobot_config import MOST
+from ttscompile.frontends.lerobot_vla import part_of, positive_number
+from ttscompile.frontends.settings import Settings
 
 _MOST_VOCABULARY = 2**20
 _STAGES: Mapping[str, list[Any]] = {

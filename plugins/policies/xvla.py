@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .clip import Layers, TowerConfig
+from ttscompile.frontends.clip import Layers, TowerConfig
+from ttscompile.frontends.language_layers import angles
+
 from .florence import Florence, FlorenceConfig
-from .language_layers import angles
 
 _LONGEST_PERIOD = 100
 
