@@ -36,7 +36,7 @@ class Frontier:
 
 
 def choose(kept: Kept, request: Request) -> Frontier:
-    """Judge and time every plan, in each precision that it can have, and choose.
+    """Judge and time every plan, in each precision that it can have, and with all tokens, and choose.
 
     The default is ``best_plan`` of those within ``Request.farthest``, where those within ``Request.bound`` are near
     enough; there is a warning if it is not one of them. ``schedule`` is the name of the default, ``safe`` that of the
@@ -53,6 +53,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
         entered[name] = plan
         if plan.precision:
             entered[f"{name}@fp32"] = replace(plan, precision={})
+        if plan.tokens is not None:  # looking for changes may take longer than a small encoder
+            entered[f"{name}, all tokens"] = replace(plan, tokens=None)
     kept.trials.bar.stage("held-out calls", len(entered))
     for number, (name, plan) in enumerate(entered.items(), 1):
         if kept.judged.get(name) is plan:

@@ -48,8 +48,8 @@ class Kept:
         """The best so far."""
         return self.plans[self.default]
 
-    def consider(self, proposal: Proposal) -> bool:
-        """Judge a proposal on held-out episodes, and keep it if it holds."""
+    def consider(self, proposal: Proposal) -> str | None:
+        """Judge a proposal on held-out episodes, and keep it if it holds; else why it does not."""
         trials = holding(self.trials, proposal)
         score = judge(trials, proposal.plan)
         reason = proposal.refusal(score, self.scores)
@@ -58,7 +58,7 @@ class Kept:
         if reason is not None:
             if proposal.name not in self.judged:  # one of that name that was kept before stays
                 self.refused[proposal.name] = reason
-            return False
+            return reason
         self.refused.pop(proposal.name, None)
         self.plans[proposal.name], self.scores[proposal.name] = proposal.plan, score
         self.judged[proposal.name] = proposal.plan
@@ -74,7 +74,7 @@ class Kept:
         if self.plan.loop in trials.artifact.manifest.spec.all_loops:
             trials = trials.of_loop(self.plan.loop)  # so that who trains weights learns from its calls
         self.trials = replace(trials, name=self.default)
-        return True
+        return None
 
     def _no_better(self, trials: Trials, score: Score, margin: float | None) -> str | None:
         """Why a plan does not take the place of the best one so far."""

@@ -26,7 +26,7 @@ from .clock import Clock
 from .judge import Score, other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
-from .proposer import LOOPS, Proposer, Request, Row, rows_of
+from .proposer import LOOPS, TOKENS, Proposer, Request, Row, rows_of
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
@@ -265,15 +265,17 @@ def calibrate(
             takes = np.cumsum([row.takes for row in rows])
             for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
                 _propose(row, proposer, kept, clock.until(float(share)))
-                told[row.name] = proposer.told
+                told[row.name] = "" if row.name in kept.refused else proposer.told
             if not kept.learned:
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
-                bar.warn(f"plan {name!r} is left out: {reason}")
+                bar.warn(f"{f'what was learned of {name}' if name in told else f'plan {name!r}'} is left out: {reason}")
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.plans, kept.scores, kept.default = frontier.plans, frontier.scores, SCHEDULE
+                if told.get(TOKENS) and not any(plan.tokens for plan in kept.plans.values()):
+                    told[TOKENS] += ", and no chosen plan is faster by it"
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         chosen_within = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(
@@ -315,14 +317,16 @@ def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock) -> None:
     Raises:
         CalibrationFailedError: it has nothing to propose, and nobody before it had.
     """
-    proposals = proposer.propose(kept.trials, kept.plan, clock)
+    proposals, reasons = proposer.propose(kept.trials, kept.plan, clock), list[str | None]()
     try:
         proposal = next(proposals)
         while True:
-            held = kept.consider(proposal)
-            proposal = proposals.send(held)
+            reasons.append(kept.consider(proposal))
+            proposal = proposals.send(reasons[-1] is None)
     except StopIteration:
-        return
+        # A change of a plan that is kept has its name, so that nothing says of the name that the change was refused.
+        if reasons and all(reasons) and proposal.name in kept.judged:
+            kept.refused[row.name] = reasons[-1] or ""
     except CalibrationFailedError as error:
         if not kept.learned:
             raise

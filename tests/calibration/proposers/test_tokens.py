@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.judge import Score, further, judge
+from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import tokens
@@ -21,6 +23,7 @@ from ttscompile.calibration.proposers.tokens import MOST_COMPUTED, Tokens
 from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.plan import DENSE, FULL, Plan, TokenReuse
 from ttscompile.errors import CalibrationFailedError
+from ttscompile.measure.timer import Times
 from ttscompile.verification import verify
 
 from .trying import proposed, request, trials_of
@@ -67,6 +70,39 @@ def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_
     assert whole.tokens == 1
     assert further(score, whole)[0] < 2 * Tokens.margin
     assert found.plan.cells is trials.base.cells and found.plan.precision == trials.base.precision
+
+
+def test_tokens_that_no_chosen_plan_reuses_are_said_to_be_of_no_use(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Looking for changes takes longer than a small encoder, so that no plan may take what was learned."""
+
+    def timed(entrants: Any, threads: int) -> list[Times]:
+        return [Times((10.0 if plan.tokens is None else slower,)) for _, plan in entrants]
+
+    monkeypatch.setattr("ttscompile.calibration.choose.timed", timed)
+    for slower, ends in ((20.0, "are computed, and no chosen plan is faster by it"), (5.0, "are computed")):
+        own = shutil.copytree(folder, tmp_path / f"{slower}")
+        files = recorded(tmp_path / "calls.npz")
+        result = calibrate(own, files, learn=("loops", "tokens"), progress=False, max_minutes=1, max_distance=0.9)
+        assert result.told["tokens"].endswith(ends)
+        assert any(plan.tokens for plan in load_artifact(own).plans.values()) is (slower == 5.0)
+
+
+def test_what_does_not_hold_on_other_episodes_is_told(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has the name of a plan that is kept, so that nothing else says that it was tried."""
+
+    def no_better(kept: Kept, trials: Trials, score: Score, margin: float | None) -> str | None:
+        return "is no better." if score.tokens < 1 else None
+
+    monkeypatch.setattr(Kept, "_no_better", no_better)
+    files = recorded(tmp_path / "calls.npz")
+    result = calibrate(folder, files, learn=("loops", "tokens"), max_minutes=1, max_distance=0.9)
+    assert result.told["tokens"] == "" and result.skipped["tokens"] == "is no better."
+    assert "what was learned of tokens is left out: is no better." in " ".join(capsys.readouterr().err.split())
+    assert not any(plan.tokens for plan in load_artifact(folder).plans.values())
 
 
 def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
