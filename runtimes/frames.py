@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.ir.pieces import FRAMES, frame_pieces
 
-from .tokens import Lane, Run, TokenTower
+from .tokens import Lane, Run, Seen, TokenTower
 
 Array: TypeAlias = npt.NDArray[Any]
 Content: TypeAlias = tuple[bytes, ...]
@@ -146,6 +146,11 @@ class FramePieces:
     def reuses_tokens(self) -> bool:
         """Whether of some frames only some tokens are computed."""
         return bool(self._tokens)
+
+    def seen(self) -> tuple[Seen, ...]:
+        """What is seen of each camera of each stream whose tokens are reused; nothing after ``forget``."""
+        lanes = ((name, dict.fromkeys(lanes)) for (name, _), lanes in self._lanes.items())
+        return tuple(one for name, own in lanes for one in self._tokens[name].seen(own))
 
     def forget(self) -> None:
         """Forget all frames."""

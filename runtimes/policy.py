@@ -25,6 +25,7 @@ from .queues import Queues, is_window
 from .random_calls import noise_of_any_horizon
 from .report import GIVEN, CallReport
 from .runtime import Runtime
+from .tokens import Seen
 
 NO_PREFIX = "its plan begins with the chunk of the call before, and so keeps to it already"
 
@@ -207,6 +208,11 @@ class CompiledPolicy:
             with np.errstate(all="ignore"):
                 normalized = {key: specs[key].normalized(array) for key, array in obs.items()}
                 return self._runtime.frames.learn(normalized, stop)
+
+    def seen(self) -> tuple[Seen, ...]:
+        """What it sees of each camera of each stream, and which patches it computed last, where tokens are reused."""
+        with self._turn():
+            return self._runtime.frames.seen()
 
     def follow(self, executed: int) -> None:
         """Say how many steps of the last chunk are executed before the next call, where it is not all of ``action``.

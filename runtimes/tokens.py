@@ -4,7 +4,7 @@ What a token gave is kept by camera and stream of the batch, with the pixels tha
 held against these pixels, not against the frame before, so that slow changes add up until they are seen.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -36,6 +36,23 @@ def sizes_of(tokens: int) -> tuple[int, ...]:
     return (*(-(-tokens // part) for part in PARTS), tokens)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What a policy sees of one camera.
+
+    Attributes:
+        pixels: ``[C, H, W]``, each patch as its token was last computed for.
+        computed: bool ``[rows, columns]``, the patches whose tokens were computed for the newest frame.
+        patch: height and width of a patch; pixels beyond the last one are in none.
+        number: of this frame, new ones counted alone.
+    """
+
+    pixels: Array
+    computed: Array
+    patch: tuple[int, int]
+    number: int
+
+
 @dataclass
 class _Kept:
     """What is kept of a lane.
@@ -43,13 +60,17 @@ class _Kept:
     Attributes:
         pixels: that each token was computed for, ``[C, H, W]``.
         arrays: rows ``[T, ...]`` by input of the piece.
+        index: of the tokens that were computed for the newest frame.
         age: new frames since all tokens were computed.
+        number: of the newest frame.
     """
 
     pixels: Array
     arrays: dict[str, Array]
     values: tuple[Array, ...]
+    index: Array
     age: int = 0
+    number: int = 0
 
 
 class TokenTower:
@@ -78,6 +99,13 @@ class TokenTower:
         """Forget all lanes: the next frame of each is computed whole."""
         self._lanes.clear()
 
+    def seen(self, lanes: Iterable[Lane]) -> Iterator[Seen]:
+        """What is seen in those of the lanes that had a frame."""
+        for kept in (self._lanes[lane] for lane in lanes if lane in self._lanes):
+            _, rows, columns, *_ = self._patches(kept.pixels).shape
+            computed = np.isin(np.arange(rows * columns) + self._record.fixed, kept.index).reshape(rows, columns)
+            yield Seen(kept.pixels.copy(), computed, self._record.patch, kept.number)
+
     def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
         """What the tower gives for a new frame, and for how many tokens it was computed.
 
@@ -93,22 +121,21 @@ class TokenTower:
         if kept is None:
             self._require_patches(pixels[0])
         index = self._changed(kept, pixels[0])
-        if kept is not None and not index.size:
-            kept.age += 1
-            self._lanes[lane] = kept
-            return kept.values, 0
-        nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
-        arrays = nothing if kept is None else kept.arrays
-        values = self._renew(self._part, {PIXELS: pixels, INDEX: index}, arrays)
-        if kept is None or len(index) == self.tokens:
-            kept = _Kept(pixels[0], arrays, values)
+        if kept is None:
+            nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
+            kept = _Kept(pixels[0], nothing, (), index)
         else:
+            kept.age, kept.number = kept.age + 1, kept.number + 1
+        if index.size:
+            kept.values = self._renew(self._part, {PIXELS: pixels, INDEX: index}, kept.arrays)
+        if len(index) == self.tokens:
+            kept.pixels, kept.age = pixels[0], 0
+        elif index.size:
             theirs, ours = self._patches(kept.pixels), self._patches(pixels[0])
             y, x = np.divmod(index[self._record.fixed :] - self._record.fixed, ours.shape[2])
             theirs[:, y, x] = ours[:, y, x]
-            kept.values, kept.age = values, kept.age + 1
-        self._lanes[lane] = kept
-        return values, len(index)
+        kept.index, self._lanes[lane] = index, kept
+        return kept.values, len(index)
 
     def _changed(self, kept: _Kept | None, pixels: Array) -> Array:
         """Numbers of the tokens to compute, int64; none where no patch changed."""

@@ -92,6 +92,26 @@ def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> 
     assert sizes_of(37) == (5, 10, 19, 37)
 
 
+def test_what_is_seen_has_each_patch_as_it_was_computed_last(policy: CompiledPolicy) -> None:
+    assert policy.seen() == ()
+    left, right = picture(0), picture(1)
+    act(policy, frame((left, right)), frame((left, right)))
+    one, other = policy.seen()
+    assert one.computed.all() and other.computed.all() and one.computed.shape == (6, 6) and one.patch == (4, 4)
+    act(policy, frame((left, right)), frame((changed := moved(left, 7), right)))
+    again, still = policy.seen()
+    assert (again.number - one.number, still.number - other.number) == (1, 0)
+    assert again.computed[1, 1], "patch 7 of rows of six"
+    assert np.count_nonzero(again.computed) == 4, "an eighth of 37 tokens, without the class token"
+    assert np.abs(again.pixels - one.pixels).max((0, 2)).nonzero()[0].tolist() == [4, 5, 6, 7]
+    np.testing.assert_allclose(again.pixels - one.pixels, 2 * (changed - left), atol=1e-5)  # as CLIP reads them
+    np.testing.assert_array_equal(still.pixels, other.pixels)
+    again.pixels[:] = np.nan  # what was given is a copy
+    assert np.isfinite(policy.seen()[0].pixels).all()
+    policy.reset()
+    assert policy.seen() == ()
+
+
 def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(compiled / "artifact", tmp_path / "own")
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))

@@ -151,7 +151,15 @@ def _episode(course: Course) -> Section:
     text = f"{len(course.plans)} consecutive calls of {course.name} with the default plan: {reused} {found}"
     caption = "Share of the cells that were reused, as executed. Step 0 of every call is dense."
     alt = "A line: the share of reused cells, call by call."
-    return Section("Episode", (text,), pictures=(Picture(pictures.sparsity_picture(course), caption, alt),))
+    drawn = [Picture(pictures.sparsity_picture(course), caption, alt)]
+    if course.seen:
+        computed, of = course.tokens
+        caption = f"{computed} of {of} tokens of the image encoders were computed, {share(computed / of)}. A row is a"
+        caption += (
+            " camera. In colour: the patches whose tokens were computed in this call. Pale: those that were kept."
+        )
+        drawn.append(Picture(pictures.seen_picture(course), caption))
+    return Section("Episode", (text,), pictures=tuple(drawn))
 
 
 def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Section:

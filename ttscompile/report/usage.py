@@ -1,7 +1,7 @@
 """Which heads, branches and tables of an artifact its plans use, and what the calls of an episode execute."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from ..ir.pieces import IDLE, PRUNER, of_loop, of_tokens
 from ..ir.program import Binding
 from ..runtimes.liveness import sources_of_pruner
 from ..runtimes.policy import CompiledPolicy
+from ..runtimes.tokens import Seen
 from ..trajectories.episodes import Episode
 from .facts import of_blocks
 from .page import Table
@@ -120,6 +121,9 @@ def _sources(artifact: Artifact) -> Mapping[str, BoolArray]:
 EPISODE_CALLS = 64
 """Of an episode at most: a picture of more says no more."""
 
+SEEN_CALLS = 6
+"""Of these, those of which a page shows what the cameras showed."""
+
 
 @dataclass(frozen=True)
 class Course:
@@ -128,11 +132,15 @@ class Course:
     Attributes:
         plans: int8 ``[R, K, blocks]``, as executed.
         legalised: cells of each call that were replaced because they were never computed.
+        tokens: of image encoders that were computed, and that the new pictures had; zeros where none are reused.
+        seen: of some calls, by number, what each camera showed; nothing where no tokens are reused.
     """
 
     name: str
     plans: PlanArray
     legalised: tuple[int, ...]
+    tokens: tuple[int, int]
+    seen: Mapping[int, tuple[Seen, ...]]
 
     @property
     def sparsity(self) -> npt.NDArray[np.float64]:
@@ -147,13 +155,22 @@ class Course:
 def run_episode(policy: CompiledPolicy, episode: Episode, plan: str | None = None) -> Course:
     """A plan, or the policy's default, on the first ``EPISODE_CALLS`` calls of an episode; reset before and after."""
     policy.reset()
-    made = []
-    for row in range(min(episode.calls, EPISODE_CALLS)):
+    made, seen, last = [], dict[int, tuple[Seen, ...]](), dict[int, int]()
+    count = min(episode.calls, EPISODE_CALLS)
+    for row in range(count):
         obs = {key: array[row : row + 1] for key, array in episode.observations.items()}
         policy.predict_action(obs, plan=plan)
         report = policy.last_report
         assert report is not None  # a call was made
         made.append(report)
+        shown = policy.seen()
+        if shown and row in np.linspace(0, count - 1, SEEN_CALLS).astype(int):
+            # A camera that shows what it showed in the call before has no new frame, and nothing was computed for it.
+            known = [last.get(i) == one.number for i, one in enumerate(shown)]
+            seen[row] = tuple(replace(s, computed=s.computed & (not k)) for s, k in zip(shown, known, strict=True))
+        last = {i: one.number for i, one in enumerate(shown)}
     policy.reset()
     plans = np.stack([report.plan[0] for report in made])
-    return Course(episode.name, plans, tuple(report.legalised[0] for report in made))
+    frames = [report.frames for report in made]
+    tokens = sum(one.tokens for one in frames), sum(one.of for one in frames)
+    return Course(episode.name, plans, tuple(report.legalised[0] for report in made), tokens, seen)
