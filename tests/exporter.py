@@ -16,7 +16,10 @@ import pytest
 import torch
 from onnxscript.rewriter._basics import MatchResult
 from onnxscript.rewriter._matcher import SimplePatternMatcher
+from torch.onnx._internal.exporter import _fx_passes
 from torch.onnx._internal.exporter._registration import ONNXRegistry
+from torch.onnx._internal.fx.passes.type_promotion import TypePromotionTable, get_type_promotion_rule
+from torch.utils._pytree import tree_leaves
 
 from ttscompile.ir.graph import Graph
 from ttscompile.lower import program
@@ -53,6 +56,7 @@ def exported_once(directory: Path) -> Iterator[None]:
         patch.setattr(program, "_export", once)
         patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib)))
         patch.setattr(SimplePatternMatcher, "match", looking_first(SimplePatternMatcher.match))
+        patch.setattr(_fx_passes, "insert_type_promotion_nodes", where_needed(_fx_passes.insert_type_promotion_nodes))
         yield
 
 
@@ -64,5 +68,34 @@ def looking_first(match: Callable[..., MatchResult]) -> Callable[..., MatchResul
         if wanted not in (None, node.op_identifier()):
             return MatchResult().fail("another operation")
         return match(matcher, model, graph, node, **options)
+
+    return own
+
+
+def where_needed(promote: Callable[[torch.fx.GraphModule], None]) -> Callable[[torch.fx.GraphModule], None]:
+    """Torch's exporter computes all shapes once more to see whether types have to be promoted: a third of an export.
+
+    None have to where what a node reads is of one type, no number of another kind is beside it, and it gives that type
+    or truth values.
+    """
+
+    def alike(node: torch.fx.Node) -> bool:
+        chooses = "where" in str(node.target)  # by truth values, which have no part in the type
+        tensors = [one.meta["val"] for one in node.all_input_nodes if isinstance(one.meta.get("val"), torch.Tensor)]
+        types = {value.dtype for value in tensors} - ({torch.bool} if chooses else set())
+        numbers = [one for one in tree_leaves((node.args, node.kwargs)) if isinstance(one, bool | int | float)]
+        given = node.meta["val"].dtype
+        if chooses and not types:
+            return given == torch.float32 and all(type(one) is float for one in numbers)
+        if len(types) != 1 or given not in (*types, torch.bool):
+            return False
+        (type_,) = types
+        return type_.is_floating_point or all(type_ != torch.bool and type(one) is int for one in numbers)
+
+    def own(module: torch.fx.GraphModule) -> None:
+        table = TypePromotionTable()
+        ruled = (n for n in module.graph.nodes if n.op == "call_function" and get_type_promotion_rule(n, table))
+        if not all(map(alike, ruled)):
+            promote(module)
 
     return own
