@@ -117,7 +117,9 @@ def test_another_seed_gives_another_split(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("saves", [1, 5, 7])  # during targets, search and adaptation
+@pytest.mark.parametrize(
+    "saves", [pytest.param(1, marks=pytest.mark.soak), 5, pytest.param(7, marks=pytest.mark.soak)]
+)  # during targets, search and adaptation
 def test_resuming_after_a_kill_ends_where_it_would_have_ended(
     calibrated: tuple[Path, CalibrationResult],
     artifact: Path,

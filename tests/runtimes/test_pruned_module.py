@@ -209,6 +209,7 @@ def test_the_head_and_the_branches_are_in_the_exported_program(
     assert sum(len(called(one, "aten.tanh.default")) for one in graphs(whole)) == 5
 
 
+@pytest.mark.soak
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(
     plain: tuple[Program, PrunedCall, CompiledPolicy, float], exported: torch.export.ExportedProgram, tmp_path: Path

@@ -92,6 +92,7 @@ def test_a_cost_is_that_of_a_step_and_of_each_further_one() -> None:
     assert [Cost(3.0, 0.5).of(steps) for steps in (1, 2, 5)] == [3.0, 3.5, 5.0]
 
 
+@pytest.mark.slow
 def test_loops_are_tried_and_the_fastest_that_is_near_enough_is_proposed_last(
     directory: Path, recording: Path, timed: None
 ) -> None:
@@ -154,11 +155,13 @@ def test_a_slow_original_is_left_out_where_the_fastest_plan_is_near(
     assert f"original takes 10 ms at least, and the best {COSTS[last.plan.loop][0]:g}" in proposer.told
 
 
+@pytest.mark.slow
 def test_where_no_plan_is_near_enough_the_nearest_is_told(directory: Path, recording: Path, timed: None) -> None:
     with pytest.raises(CalibrationFailedError, match=r"the nearest, '\w+\.\d', is .* 0.0001 and 0.000125 are allowed"):
         proposed(Loops(request(bound=1e-4)), trials_of(directory, [recording]))
 
 
+@pytest.mark.slow
 def test_with_a_deadline_more_steps_are_tried_than_have_to_be(directory: Path, recording: Path, timed: None) -> None:
     trials = trials_of(directory, [recording])
     steps = {}
