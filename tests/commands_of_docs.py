@@ -9,6 +9,8 @@ NOT_RUN = {
     "source": "of the shell, and for what make would have set up",
     "cd": "of the shell",
     "python examples/benchmark/sweep.py": "takes 20 minutes; tests/examples/test_benchmark_sweep.py runs it in short",
+    "python examples/benchmark/strategies.py": "tests/examples/test_benchmark_strategies.py runs it in short",
+    "python examples/ablation/oracle.py": "tests/examples/test_ablation_oracle.py runs it in short",
     "python examples/benchmark/gpu.py": "needs a GPU; tests/examples/test_benchmark_gpu.py runs it on the CPU",
     "pytest tests/runtimes/test_cuda.py": "needs a GPU",
     "python examples/evaluation/warm_start.py": "takes minutes; tests/examples has it in short",
@@ -35,7 +37,6 @@ NOT_RUN = {
     "ttscompile convert pretrained_model": "a LeRobot policy, with --task: tests/frontends/test_lerobot.py",
     "MUJOCO_GL=osmesa python": "in MuJoCo: tests/examples/test_environments.py has its worlds",
     "ttscompile calibrate compiled/ --trajectories calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
-    "python examples/benchmark/strategies.py compiled/ -t calls.npz --ray": "of Ray: tests/calibration/test_pool.py",
     "ttscompile calibrate compiled/ --trajectories lerobot": "of LeRobot: tests/trajectories/test_recordings.py",
 }
 """How the commands begin that are not run here, and why. Every other one is run; of these the options are checked."""
@@ -43,9 +44,7 @@ NOT_RUN = {
 SHORTER = {
     "convert": "--steps 5",
     "calibrate": "--target-sparsity 0.8 --max-minutes 0.001",
-    "strategies.py": "--sparsities 0.8 --intervals 1 --calls 4 --learned-calls 8",
     "bench": "--calls 1",
-    "oracle.py": "--computed-steps 2 --schedules 2 --calls 4 --draws 2",
     "record.py": "--episodes 2 --threads 1",
     "evaluate.py": "--episodes 1 --threads 1",
 }
