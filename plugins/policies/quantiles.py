@@ -1,4 +1,4 @@
-"""Statistics of a data set as OpenVLA's descendants save them: quantiles, and which numbers are left as they are."""
+"""Statistics of a data set as Octo and OpenVLA's descendants save them, and which numbers are left as they are."""
 
 import warnings
 from dataclasses import dataclass
@@ -78,16 +78,43 @@ def read_statistics(path: Path, actions: int, grippers: tuple[int, ...], state: 
     )
 
 
+def read_moments(where: Path, actions: int) -> tuple[str, Affine | None]:
+    """The one data set of Octo's, whose actions have mean 0 and deviation 1; else they stay so, with a warning."""
+    sets = read_json(where) if where.is_file() else {}
+    sets = {"its own": sets} if "action" in sets else sets  # of a training on one
+    if len(sets) != 1:
+        there = f"holds {len(sets)} data sets ({names_of(sorted(sets))})" if where.is_file() else "is not there"
+        warnings.warn(
+            f"{where} {there}: actions have mean 0 and deviation 1, as the network makes them. For those of a robot,"
+            " put a file there that holds its data set alone, and convert again.",
+            stacklevel=4,
+        )
+        return "none", None
+    name, entry = next(iter(sets.items()))
+    settings, mask = _settings(where, name, entry, "action", actions)
+    mean, deviation = (_vector(settings, key, actions) for key in ("mean", "std"))
+    if (deviation < 0).any():
+        raise settings.refusal("std", "numbers that are not negative")
+    deviation = np.maximum(deviation, _LEAST_WIDTH)
+    return name, Affine(np.where(mask, 1 / deviation, 1.0), np.where(mask, -mean / deviation, 0.0))
+
+
 def _range(where: Path, name: str, entry: Any, part: str, count: int) -> Range:
+    settings, mask = _settings(where, name, entry, part, count)
+    low, high = (_vector(settings, key, count) for key in ("q01", "q99"))
+    return Range(low, high, mask)
+
+
+def _settings(where: Path, name: str, entry: Any, part: str, count: int) -> tuple[Settings, npt.NDArray[np.bool_]]:
+    """What is known of the actions, say, and which of their numbers that is for."""
     inner = entry.get(part) if isinstance(entry, dict) else None
     settings = Settings(
         inner if isinstance(inner, dict) else {}, f"{where}: {name:.80}.{part}.", "Copy the file again."
     )
-    low, high = (_vector(settings, key, count) for key in ("q01", "q99"))
     mask = settings.values.get("mask", [True] * count)
     if not (isinstance(mask, list) and len(mask) == count and all(type(one) is bool for one in mask)):
         raise settings.refusal("mask", f"{count} times true or false")
-    return Range(low, high, np.array(mask))
+    return settings, np.array(mask)
 
 
 def _vector(settings: Settings, name: str, count: int) -> Vector:

@@ -101,7 +101,6 @@ LEROBOT_TYPES += ["molmoact2", "fastwam", "something_new"]
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["adapter_config.json", "adapter_model.safetensors"], "PEFT adapter.*adapter_config.json.*Merge"),
     (["step_10/pretrained_model/config.json"], "around what lerobot saved.*Give its folder pretrained_model"),
-    (["config.json", "example_batch.msgpack", "270000/default/checkpoint"], "an Octo model.*JAX.*diffusion head alone"),
     (["params/_METADATA", "params/manifest.ocdbt", "assets/norm.json"], "a JAX checkpoint.*Convert it to PyTorch"),
     (["model.msgpack"], "a JAX checkpoint"),
     (["manifest.json", "weights.safetensors"], "compiled already.*ttscompile.load"),

@@ -152,6 +152,15 @@ FAMILIES = (
         module=".policies.rdt",
     ),
     Family(
+        name="octo",
+        title="Octo",
+        reads="a folder that Octo's save_pretrained wrote, with config.json and example_batch.msgpack",
+        kind="directory",
+        detect=lambda path: (path / "example_batch.msgpack").is_file(),
+        module=".policies.octo",
+        options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
+    ),
+    Family(
         name="cogact",
         title="CogACT",
         reads="a .pt file of CogACT",

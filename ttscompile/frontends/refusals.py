@@ -26,7 +26,6 @@ _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model
 _INNER = "Give its folder pretrained_model."
 _JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
-_OCTO = "Its checkpoints are JAX. Its diffusion head alone, built in PyTorch, can go to ttscompile.compile_denoiser."
 _HYBRID_VLA = "Give the .pt file of its folder checkpoints, as its training saved it."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
@@ -77,7 +76,6 @@ POLICIES = (
 DIRECTORIES = (
     Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
     Refusal(r"^adapter_config\.json$", "a PEFT adapter without the config.json of its policy", MERGE),
-    Refusal(r"^(example_batch|octo[^/]*)\.msgpack$", "an Octo model", _OCTO),
     Refusal(_JAX_FILES, "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
