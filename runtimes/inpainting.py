@@ -120,8 +120,13 @@ def prefix_refusal(spec: PolicySpec) -> str | None:
     return None
 
 
-def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | None) -> FloatArray:
-    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, a copy of the caller's.
+def check_prefix(
+    prefix: Any, streams: int, spec: PolicySpec, refusal: str | None, reference: FloatArray | None = None
+) -> FloatArray:
+    """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, normalised: a copy of the caller's.
+
+    Args:
+        reference: what is added to the actions of the call, ``ChunkSpec.reference``.
 
     Raises:
         ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
@@ -142,16 +147,18 @@ def check_prefix(prefix: Any, streams: int, spec: PolicySpec, refusal: str | Non
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
     own: FloatArray = array.copy()
-    remedy = "Only actions that can be executed can be committed."
-    check_numbers(own, spec.chunk.normalizer, "prefix", remedy, ObservationError)
-    return own
+    own, told = (own, "prefix") if reference is None else (own - reference, "prefix, less the observation,")
+    remedy, normalizer = "Only actions that can be executed can be committed.", spec.chunk.normalizer
+    rows = None if normalizer is None else normalizer.at(slice(spec.chunk.start, spec.chunk.start + shape[1]))
+    check_numbers(own, rows, told, remedy, ObservationError)
+    return spec.chunk.normalized(own, spec.chunk.start)
 
 
 def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> Known | None:
     """What a prefix makes known of the samples of a call; None if it is empty.
 
     Args:
-        prefix: from ``check_prefix``, then normalised.
+        prefix: from ``check_prefix``.
         initial: the noise that the call starts from, ``[B, T, D]``.
     """
     if not prefix.size:

@@ -305,15 +305,15 @@ class CompiledPolicy:
         obs = check_observation(obs, spec.observations)
         streams = len(next(iter(obs.values())))
         self._runtime.require_streams(streams)
+        reference = spec.chunk.reference(obs)
         if prefix is not None:
-            prefix = check_prefix(prefix, streams, spec, self._prefix_refusal(wanted))
-            prefix = prefix if spec.chunk.normalizer is None else spec.chunk.normalizer.normalize(prefix)
+            prefix = check_prefix(prefix, streams, spec, self._prefix_refusal(wanted), reference)
         if noise is None:
             noise = noise_of_any_horizon(self._runtime.noise_spec(wanted), self._rng, streams)
         with np.errstate(all="ignore"):  # onnxruntime and torch raise no flags either: a call is judged by its actions
             normalized = {key: spec.observations[key].normalized(array) for key, array in obs.items()}
             sample, report = self._runtime.predict(normalized, noise, wanted, prefix)
-            actions = spec.chunk.unnormalized(sample)
+            actions = spec.chunk.unnormalized(sample, reference)
         if not np.isfinite(actions).all():
             self._runtime.reset()  # what it kept may not be finite either
             self._queues.reset()

@@ -107,6 +107,7 @@ class Runtime:
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
         self.streams: int | None = None
         self._chunk: FloatArray | None = None  # denoised sample of the last call of the episode
+        self._reference: FloatArray | None = None  # what was added to its actions
         self._executed: int | None = None  # steps of it; None for all of ``action``
 
     def view(self, plan: Plan) -> View:
@@ -196,8 +197,10 @@ class Runtime:
         view, backend = opened.view, opened.backend
         spec, manifest = view.manifest.spec, view.manifest
         noise = check_noise(noise, streams, self.noise_spec(plan))
+        reference = spec.reference(obs)
         if view.start is not None and self._chunk is not None:
-            noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed)
+            change = None if reference is None or self._reference is None else self._reference - reference
+            noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed, change)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         obs = {**obs, **spec.committed(streams, 0 if known is None else known.values.shape[2])}
         cells = (streams, manifest.steps, len(manifest.groups))
@@ -221,7 +224,7 @@ class Runtime:
             keep, written = np.zeros_like(keep), np.zeros_like(written)
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
-        self.streams, self._chunk = streams, made.sample
+        self.streams, self._chunk, self._reference = streams, made.sample, reference
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
         report = CallReport(

@@ -70,7 +70,9 @@ def measure_latencies(policy: Policy, clock: Clock, settings: Resolved) -> dict[
     obs, known = some_observation(policy.info.observation), {}
     if settings.seam == "prefix":  # one action that the normaliser maps to 0
         chunk = policy.info.action
-        known["prefix"] = chunk.unnormalized(np.zeros((1, 1, chunk.action_dim), np.float32))
+        known["prefix"] = chunk.unnormalized(
+            np.zeros((1, 1, chunk.action_dim), np.float32), chunk.reference(obs), chunk.start
+        )
     forget: Callable[[], object] = getattr(policy, "forget_frames", lambda: None)  # a call may have to compute them all
     timer = Timer(len(plans), settings.warm_up, clock.now)
     for _ in range(settings.warm_up + settings.measured_calls):

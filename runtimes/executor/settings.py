@@ -250,8 +250,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         raise ExecutorError(f"displacements = {settings.displacements}: {have}. Name the channels among these.")
     stall = None
     if settings.stall_after is not None:
-        scale = np.float32(1) if chunk.normalizer is None else np.abs(chunk.normalizer.scale)
-        reach = np.broadcast_to(np.float32(settings.stall_range) / scale, (chunk.action_dim,))
+        reach = np.float32(settings.stall_range) / np.atleast_2d(chunk.scale).max(0)
         after = ceil(settings.stall_after * control_hz)
         stall = StallRule(after, reach, settings.stall_plan, settings.displacements)
     named = tiers if stall is None else (*tiers, stall.plan)

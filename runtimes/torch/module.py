@@ -118,7 +118,7 @@ class SparseCall(CallModule):
         advance, offset, read = self._moves(network, initial, steps)
         sample, _ = denoise(network, self._plan, (), advance, initial, offset.unbind(), {}, read)
         if self._plain is None:
-            return self._actions(sample)
+            return self._actions(sample, obs)
         plain, far = self._plain, self._is_far(network)
         uncorrected, others, _ = self._moves(network, initial, steps, corrected=False)
 
@@ -127,9 +127,9 @@ class SparseCall(CallModule):
             return torch.where(far[:, None, None], made, sample).contiguous()
 
         if not torch.compiler.is_compiling():
-            return self._actions(some_plain() if far.any() else sample)
+            return self._actions(some_plain() if far.any() else sample, obs)
         network.know_steps(len(plain.counts))
-        return self._actions(either(far.any(), some_plain, sample))
+        return self._actions(either(far.any(), some_plain, sample), obs)
 
 
 class PrunedCall(CallModule):
@@ -187,7 +187,7 @@ class PrunedCall(CallModule):
                 kinds = [f"{value.dtype} {list(value.shape)}" for value in (expected, found)]
                 raise ObservationError(f"rollout: expected {name} {kinds[0]}; found {kinds[1]}. Use empty_rollout.")
         if not torch.compiler.is_compiling():
-            return self._by_plan(network, initial, steps, residuals, written, rollout is not None)
+            return self._by_plan(network, obs, initial, steps, residuals, written, rollout is not None)
         logits = network.logits()
         plan = _repaired(logits.argmax(-1).to(torch.int8), written)
         advance, offset, read = self._moves(network, initial, steps)
@@ -203,12 +203,13 @@ class PrunedCall(CallModule):
         cache = residuals if rollout is not None else None
         sample, cache = denoise_as_planned(network, self._groups, plan, advance, initial, offset, read, cache)
         broken = torch.where(logits.isnan().flatten(1).any(1), torch.nan, 0.0)
-        actions = self._actions(sample) + broken[:, None, None]
+        actions = self._actions(sample, obs) + broken[:, None, None]
         return (actions, plan) if cache is None else (actions, plan, (cache, written | (plan == Source.COMPUTE.value)))
 
     def _by_plan(
         self,
         network: PlainNetwork,
+        obs: Mapping[str, Tensor],
         initial: Tensor,
         steps: Tensor | None,
         residuals: Tensor,
@@ -248,7 +249,7 @@ class PrunedCall(CallModule):
             for cell, residual in computed.items():
                 after.flatten(0, 1)[cell].index_copy_(axis, members, residual)
         plan = torch.from_numpy(plans).to(initial.device)
-        actions = self._actions(sample)
+        actions = self._actions(sample, obs)
         return (actions, plan, (after, written | (plan == Source.COMPUTE.value))) if keeps else (actions, plan)
 
 

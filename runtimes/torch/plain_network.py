@@ -189,7 +189,8 @@ class CallModule(nn.Module):
             self._plain_cells = plain_cells(correction, len(manifest.blocks))
         for key, each in manifest.spec.observations.items():
             self._keep(f"normalizer {key}", _numbers(each.normalizer))
-        self._keep("actions", _numbers(manifest.spec.chunk.normalizer))
+        own = manifest.spec.chunk.normalizer
+        self._keep("actions", _numbers(None if own is None else own.at(slice(manifest.spec.sample[0]))))
         self.evaluators = {
             name: Evaluator(replace(graph, inputs={**graph.inputs, **graph.constants}, constants={}), {})
             for name, graph in pieces.graphs().items()
@@ -250,13 +251,17 @@ class CallModule(nn.Module):
             offset = offset + added
         return advance, nn.functional.pad(offset, (0, advance.memories * horizon)), read
 
-    def _actions(self, sample: Tensor) -> Tensor:
-        """The actions of a denoised sample ``[B, T, D]``, in their own units."""
+    def _actions(self, sample: Tensor, obs: Tensors) -> Tensor:
+        """The actions of a denoised sample ``[B, T, D]``, in their own units; of these observations, as given."""
         if self._bound is not None:
             sample = sample.clamp(-self._bound, self._bound)
         chunk, normalizer = self.spec.chunk, self.kept("actions")
         own = sample[..., : chunk.action_dim]
         actions = (own - normalizer["offset"]) / normalizer["scale"] if normalizer else own.clone()
+        if (relative := chunk.relative) is not None:
+            seen = obs[relative.key]
+            newest = nn.functional.pad(seen.reshape(len(seen), -1, seen.shape[-1])[:, -1:], (0, 1))
+            actions = actions + newest[..., relative.places(seen.shape[-1])]
         for one in chunk.switches:
             value = torch.where(own[..., [one.channel]] >= one.threshold, one.above, one.below)
             at = torch.arange(chunk.action_dim, device=own.device) == one.channel

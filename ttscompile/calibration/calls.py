@@ -205,10 +205,7 @@ class Actions:
     def __init__(self, spec: PolicySpec) -> None:
         self._chunk = spec.chunk
         self.size = (spec.chunk.stop - spec.chunk.start) * spec.chunk.action_dim
-        scale = np.ones(spec.chunk.action_dim, np.float32)
-        if spec.chunk.normalizer is not None:
-            scale = np.abs(spec.chunk.normalizer.scale)
-        self._scale = torch.from_numpy(np.array(scale))
+        self._scale = torch.from_numpy(np.array(spec.chunk.scale))
 
     def executed(self, samples: Tensor) -> Tensor:
         """The executed part of samples ``[..., T, D]`` as ``[..., size]``, as the network has it: normalised."""
@@ -228,7 +225,8 @@ class Actions:
         """
         difference = (self.executed(samples) - self.executed(targets)).abs()
         if units:
-            difference = (difference.reshape(*difference.shape[:-1], -1, len(self._scale)) / self._scale).flatten(-2)
+            numbers = (*difference.shape[:-1], -1, self._chunk.action_dim)
+            difference = (difference.reshape(numbers) / self._scale).flatten(-2)
         return np.asarray(difference.mean(-1).nan_to_num(nan=LARGEST).clamp(max=LARGEST).numpy(), dtype=np.float32)
 
 

@@ -145,14 +145,16 @@ def _apart(trials: Trials, score: Score) -> dict[str, Any]:
     assert x is not None  # ``judge`` made the score
     each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(spec.chunk.action_dim)]
     h, far = pairs(*(one.reshape(*one.shape[:2], -1).astype(np.float64) for one in (x, y)))
-    errors = np.abs(x - y).mean((0, 1, 2)) / (1.0 if (own := spec.chunk.normalizer) is None else np.abs(own.scale))
+    errors = (np.abs(x - y).mean((0, 1)) / spec.chunk.scale).mean(0)
     furthest = []
     for n in np.argsort(h)[:-4:-1].tolist():  # three are shown
         episode, row = int(sample.episodes[n]), int(sample.calls[n, 1])
         seen = trials.episodes[episode].observations
         cameras = {key: seen[key][row] for key, one in spec.observations.items() if one.image}
         newest = {key: frame.reshape(-1, *frame.shape[-3:])[-1] for key, frame in cameras.items()}
-        actions = spec.chunk.unnormalized(np.stack([y[n, 0], x[n, 0]]).astype(np.float32))
+        reference = spec.chunk.reference({key: frames[[row]] for key, frames in seen.items()})
+        both = np.stack([y[n, 0], x[n, 0]]).astype(np.float32)
+        actions = spec.chunk.unnormalized(both, reference, spec.chunk.start)
         furthest.append(FarCall(episode, row, rooted(float(h[n]), float(far.mean())), newest, actions))
     return {
         "by_number": tuple(rooted(float(gap.mean()), float(unit.mean())) for gap, unit in each),

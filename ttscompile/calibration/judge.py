@@ -167,7 +167,7 @@ def _in_units(trials: Trials) -> Numbers:
     """What the original executes, ``[N, R, Ta, Da]``."""
     spec, answers = trials.artifact.manifest.spec, trials.held_out.answers.astype(np.float64)
     part = answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
-    return np.asarray(part / (1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)))
+    return np.asarray(part / spec.chunk.scale)
 
 
 class _Answers:
@@ -268,8 +268,7 @@ def _scored(
     error = error_p90 = None
     original = trials.executor.view.artifact.manifest.spec.sampler
     if plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original):
-        scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
-        wrong = np.abs(x - y).reshape(*x.shape[:2], -1, spec.chunk.action_dim) / scale
+        wrong = np.abs(x - y).reshape(*x.shape[:2], -1, spec.chunk.action_dim) / spec.chunk.scale
         each = wrong.mean((2, 3)).clip(max=LARGEST)
         error, error_p90 = float(each.mean()), float(np.quantile(each, 0.9))
     cells = np.stack([report.plan[i] for report, i in reports])

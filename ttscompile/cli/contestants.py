@@ -188,7 +188,7 @@ def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
         f"observation {k!r}": (o.normalizer, expected.observations[k].normalizer) for k, o in found.observations.items()
     }
     pairs["the action"] = (found.chunk.normalizer, expected.chunk.normalizer)
-    numbers = {name: [one and (*one.scale, *one.offset) for one in pair] for name, pair in pairs.items()}
+    numbers = {name: [one and (*one.scale.flat, *one.offset.flat) for one in pair] for name, pair in pairs.items()}
     return [name for name, (left, right) in numbers.items() if left != right]
 
 

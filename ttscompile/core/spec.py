@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import SpecError
-from .coercion import integer, numbers
+from .chunk import LARGEST as LARGEST, Affine as Affine, ChunkSpec as ChunkSpec, Relative as Relative, Switch as Switch
+from .coercion import Array, integer
 from .pictures import in_bytes
 from .rules import LOOP_NAME, OMITTED, DType, LoopName, Positive, Shape
 from .sampler import FloatArray as FloatArray, SamplerTable as SamplerTable
@@ -32,48 +32,6 @@ COMMITTED = "committed"
 
 WITHOUT = "without"
 """In ``PolicySpec.source``: the cameras of the checkpoint that were left out, with commas between."""
-
-LARGEST = 1e6
-"""No number that goes into the network, normalised, is larger, either way; what is cannot be from training. A range
-maps to -1..1, and of N samples none is further than sqrt(N - 1) deviations from their mean. A network multiplies up to
-four of its numbers (a gated product of two, and a LayerNorm squares that): this leaves 1e14 for weights and sums."""
-
-
-@dataclass(frozen=True)
-class Affine:
-    """A normaliser: ``x * scale + offset``; inverted as ``(x - offset) / scale``.
-
-    Attributes:
-        scale: float32 ``[D]``, finite and not zero.
-        offset: float32 ``[D]``, finite.
-    """
-
-    scale: FloatArray
-    offset: FloatArray
-
-    def __post_init__(self) -> None:
-        for name in ("scale", "offset"):
-            array = numbers(getattr(self, name), f"normaliser {name}", SpecError)
-            if array.ndim != 1 or not np.isfinite(array).all():
-                raise SpecError(f"normaliser {name} must be a finite vector; found shape {array.shape}, {array}.")
-            object.__setattr__(self, name, array)
-        if self.scale.shape != self.offset.shape:
-            raise SpecError(f"normaliser scale {self.scale.shape} and offset {self.offset.shape} differ in length.")
-        if (self.scale == 0).any():
-            raise SpecError(f"normaliser scale is zero at {np.flatnonzero(self.scale == 0).tolist()}: not invertible.")
-
-    @cached_property
-    def reach(self) -> float:
-        """Numbers up to this size, either way, are normalised to at most ``LARGEST`` in every entry."""
-        return float(((LARGEST - np.abs(self.offset, dtype=np.float64)) / np.abs(self.scale)).min())
-
-    def normalize(self, x: npt.NDArray[np.float32]) -> FloatArray:
-        """``x * scale + offset`` over the last axis."""
-        return np.asarray(x * self.scale + self.offset, dtype=np.float32)
-
-    def unnormalize(self, x: npt.NDArray[np.float32]) -> FloatArray:
-        """``(x - offset) / scale`` over the last axis."""
-        return np.asarray((x - self.offset) / self.scale, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -172,81 +130,6 @@ class ObservationSpec:
 
 
 @dataclass(frozen=True)
-class Switch:
-    """A number of the actions that has two values alone, as a gripper's may.
-
-    Attributes:
-        channel: which number it is.
-        threshold: of the denoised sample: from there on the value is ``above``, else ``below``.
-        below: in the actions' own units, like ``above``.
-    """
-
-    channel: int
-    threshold: float
-    below: float
-    above: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "channel", integer(self.channel, "a switch's channel", SpecError))
-        if not np.isfinite([self.threshold, self.below, self.above]).all():
-            raise SpecError(f"a switch's threshold and values must be finite; found {self}.")
-
-
-@dataclass(frozen=True)
-class ChunkSpec:
-    """What of the denoised sample ``[T, D]`` is action, and what of the actions is executed.
-
-    Attributes:
-        action_dim: the first ``action_dim`` channels of the sample are the action (``action_pred``).
-        start: first executed step of the chunk (``To - 1`` for Diffusion Policy).
-        stop: one past the last executed step.
-        normalizer: its inverse is applied to the actions; None to return them as they are.
-        ranged: whether the normaliser maps the range of the actions in training to -1..1, so that no action should be
-            far outside; not one by mean and deviation, or by quantiles.
-        switches: numbers of the actions that the normaliser is not for.
-    """
-
-    action_dim: int
-    start: int
-    stop: int
-    normalizer: Affine | None = None
-    ranged: bool = True
-    switches: tuple[Switch, ...] = field(default=(), metadata=OMITTED)
-
-    def __post_init__(self) -> None:
-        for name in ("action_dim", "start", "stop"):
-            object.__setattr__(self, name, integer(getattr(self, name), f"a chunk's {name}", SpecError))
-        if not self.start < self.stop or self.action_dim < 1:
-            raise SpecError(f"chunk [{self.start}:{self.stop}] of {self.action_dim} channels is empty.")
-        channels = [one.channel for one in self.switches]
-        if len(set(channels)) < len(channels) or max(channels, default=0) >= self.action_dim:
-            raise SpecError(
-                f"switches are of the channels {channels}; expected different ones below {self.action_dim}."
-            )
-
-    @property
-    def usual(self) -> Affine | None:
-        """What maps the range in which actions usually are to -1..1; None where it is not known."""
-        if self.normalizer is None or not self.ranged:
-            return None
-        scale, offset = self.normalizer.scale.copy(), self.normalizer.offset.copy()
-        for one in self.switches:
-            width = abs(one.above - one.below) or 2.0
-            scale[one.channel], offset[one.channel] = 2 / width, -(one.above + one.below) / width
-        return Affine(scale, offset)
-
-    def unnormalized(self, sample: FloatArray) -> FloatArray:
-        """The actions ``[..., Da]`` of denoised samples ``[..., D]``, in their own units."""
-        own = sample[..., : self.action_dim]
-        actions = own if self.normalizer is None else self.normalizer.unnormalize(own)
-        for one in self.switches:
-            beyond = own[..., [one.channel]] >= np.float32(one.threshold)
-            at = np.arange(self.action_dim) == one.channel
-            actions = np.where(at, np.where(beyond, np.float32(one.above), np.float32(one.below)), actions)
-        return actions
-
-
-@dataclass(frozen=True)
 class PolicySpec:
     """Everything ``compile_denoiser`` has to know about a module ``eps(sample, timestep, **conditions)``.
 
@@ -311,10 +194,11 @@ class PolicySpec:
         words = self.instruction
         if words is not None and not {words.tokens, words.mask} <= self.observations.keys():
             raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
-        normalizer = self.chunk.normalizer
-        if normalizer is not None and len(normalizer.scale) != self.chunk.action_dim:
-            found = len(normalizer.scale)
-            raise SpecError(f"action normaliser has {found} entries for {self.chunk.action_dim} channels.")
+        own = np.ones(self.chunk.action_dim) if self.chunk.normalizer is None else self.chunk.normalizer.scale
+        if own.shape not in ((self.chunk.action_dim,), (horizon + self.left_out, self.chunk.action_dim)):
+            told = f"normaliser has {list(own.shape)} entries for {horizon + self.left_out} steps of"
+            raise SpecError(f"action {told} {self.chunk.action_dim} channels; expected some for each channel.")
+        self._check_relative()
         for name, table in self.loops.items():
             if not isinstance(name, str) or name == ORIGINAL or not LOOP_NAME.holds(name):
                 told = f"expected {LOOP_NAME.expected}, and not {ORIGINAL!r}, which is the policy's own sampler"
@@ -323,6 +207,18 @@ class PolicySpec:
             if kind != own:
                 told = f"its timesteps are {kind}, and those of the policy's own sampler {own}"
                 raise SpecError(f"loop {name!r}: {told}: one network takes one kind. Convert them.")
+
+    def _check_relative(self) -> None:
+        if (relative := self.chunk.relative) is None:
+            return
+        seen, width = (
+            self.observations.get(relative.key),
+            1 + max((n for n in relative.entries if n is not None), default=0),
+        )
+        shape = () if seen is None else seen.shape[bool(seen.frames) :]
+        if seen is None or seen.dtype != "float32" or len(shape) != 1 or shape[0] < width:
+            told = f"float32 [{width}] or more; found {seen and seen.dtype} {list(shape)}"
+            raise SpecError(f"actions are relative to observation {relative.key!r}: expected {told}.")
 
     @property
     def inputs(self) -> Mapping[str, ObservationSpec]:
@@ -333,6 +229,12 @@ class PolicySpec:
     def committed(self, streams: int, count: int = 0) -> dict[str, npt.NDArray[Any]]:
         """What a network that was trained with prefixes reads of one of so many actions; of all others nothing."""
         return {COMMITTED: np.full((streams, 1), count)} if self.trained_prefix else {}
+
+    def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
+        """``ChunkSpec.reference`` of observations as the network is given them."""
+        key = "" if self.chunk.relative is None else self.chunk.relative.key
+        own = self.observations[key].normalizer if key else None
+        return self.chunk.reference(obs if own is None else {key: own.unnormalize(obs[key])})
 
     @property
     def arguments(self) -> Mapping[str, str]:

@@ -29,18 +29,24 @@ class Start:
     action: float
     noise: float
 
-    def noise_from(self, before: FloatArray, chunk: ChunkSpec, fresh: Noise, executed: int | None = None) -> Noise:
+    def noise_from(
+        self,
+        before: FloatArray,
+        chunk: ChunkSpec,
+        fresh: Noise,
+        executed: int | None = None,
+        change: FloatArray | None = None,
+    ) -> Noise:
         """The noise of the rest, whose initial sample goes on with a chunk.
-
-        The chunk is moved by what was executed of it, and its last step is repeated where none is left.
 
         Args:
             before: the denoised sample of the call before, float32 ``[B, T, D]``.
             executed: how many steps of it were executed; None for all that are to be.
+            change: see ``ChunkSpec.moved``.
         """
         executed = chunk.stop - chunk.start if executed is None else executed
-        moved = np.minimum(np.arange(before.shape[1]) + executed, before.shape[1] - 1)
-        initial = np.float32(self.action) * before[:, moved] + np.float32(self.noise) * fresh.initial
+        moved = chunk.moved(before, executed, change)
+        initial = np.float32(self.action) * moved + np.float32(self.noise) * fresh.initial
         return Noise(initial, None if fresh.steps is None else fresh.steps[self.skipped :])
 
 

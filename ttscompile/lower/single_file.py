@@ -17,7 +17,7 @@ from onnx import ModelProto, ValueInfoProto, helper
 from ..core import correction
 from ..core.envelope import CENTER, ENVELOPE, FAR, PLAIN
 from ..core.lattice import Source
-from ..core.spec import ORIGINAL, PolicySpec
+from ..core.spec import ORIGINAL, PolicySpec, Relative
 from ..core.update import columns, diagonals, rows
 from ..errors import LoweringError
 from ..ir.graph import Graph
@@ -174,8 +174,11 @@ def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
     chunk = spec.chunk
     own = predicted = main.op("Slice", sample, *(main.constant([n]) for n in (0, chunk.action_dim, 2)))
     if chunk.normalizer is not None:
-        predicted = main.op("Sub", predicted, main.constant(chunk.normalizer.offset, np.float32))
-        predicted = main.op("Div", predicted, main.constant(chunk.normalizer.scale, np.float32))
+        affine = chunk.normalizer.at(slice(spec.sample[0]))
+        predicted = main.op("Sub", predicted, main.constant(affine.offset, np.float32))
+        predicted = main.op("Div", predicted, main.constant(affine.scale, np.float32))
+    if chunk.relative is not None:
+        predicted = main.op("Add", predicted, _reference(main, chunk.relative, spec))
     for one in chunk.switches:
         low, high, least = (main.constant([n], np.float32) for n in (one.below, one.above, one.threshold))
         value = main.op("Where", main.op("GreaterOrEqual", own, least), high, low)
@@ -183,6 +186,15 @@ def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
         predicted = main.op("Where", at, value, predicted)
     main.rename(predicted, "action_pred")
     main.rename(main.op("Slice", predicted, *(main.constant([n]) for n in (chunk.start, chunk.stop, 1))), "action")
+
+
+def _reference(main: GraphWriter, relative: Relative, spec: PolicySpec) -> str:
+    """``ChunkSpec.reference`` in ONNX: ``[B, 1, Da]``."""
+    entries = spec.observations[relative.key].shape[-1]
+    frames = main.op("Reshape", relative.key, main.constant([0, -1, entries]))
+    newest = main.op("Gather", frames, main.constant([-1]), axis=1)
+    padded = main.op("Pad", newest, main.constant([0, 0, 0, 0, 0, 1]))
+    return main.op("Gather", padded, main.constant(relative.places(entries)), axis=2)
 
 
 def _write_cache(main: GraphWriter, plans: ExecutedPlans, stored: str, new_rows: str, new_cells: str) -> None:

@@ -197,7 +197,7 @@ def check_preprocessing(artifact: Artifact, golden: Golden) -> Rung:
     raw, network = golden.raw_observations(spec), golden.network_observations(spec)
     for key, one in spec.observations.items():
         errors[f"observation {key!r}"] = largest(one.normalized(raw[key]), network[key])
-    errors["the action"] = largest(spec.chunk.unnormalized(golden.sample), golden.actions)
+    errors["the action"] = largest(spec.chunk.unnormalized(golden.sample, spec.chunk.reference(raw)), golden.actions)
     executed = golden.actions[:, spec.chunk.start : spec.chunk.stop]
     errors["the executed part of the chunk"] = largest(executed, golden.executed)
     wrong = [name for name, error in errors.items() if not error <= EXACT]

@@ -105,7 +105,7 @@ class _Recorder:
                 "the module's prediction on a random observation within the range of its normaliser is not a number."
                 " Look for NaN in its weights, and check normaliser and sampler."
             )
-        actions, flops = spec.chunk.unnormalized(sample), program.dense_flops
+        actions, flops = spec.chunk.unnormalized(sample, spec.chunk.reference(self._observations)), program.dense_flops
         evaluated = _spread(steps, EVALUATIONS)
         anchors = _spread(steps, steps if flops <= EFFORT else max(3, int(steps * EFFORT / flops)))
         if scales is None:
@@ -179,7 +179,9 @@ def _episode(
         cells, _ = repair_plan(wanted, cache.written)
         noise = Noise(golden.initial[::order], None if golden.draws is None else golden.draws[:, ::order])
         if view.start is not None:
-            noise = view.start.noise_from(chunk, view.manifest.spec.chunk, noise)
+            reference = view.manifest.spec.reference(obs)
+            change = None if reference is None else reference - reference[::order]
+            noise = view.start.noise_from(chunk, view.manifest.spec.chunk, noise, change=change)
         inputs = noise_tensors(noise, view.manifest.spec.sampler.stochastic)
         result = model.denoise(contexts, *inputs, cells, cache, correction=plan.correction)
         cache, chunk = result.cache, result.sample.numpy()

@@ -167,9 +167,8 @@ def _run(
         found += [float(np.abs(one - same).mean()) for one, same in zip(made, dense, strict=True)]
     if unpaired is not None:
         own = zip(actions(unpaired.plan, noises), actions(unpaired.plan, others), strict=True)
-        scale = 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
         for pair, both in zip(own, zip(dense, other, strict=True), strict=True):
-            unpaired.add(*(np.stack(each) * scale for each in (pair, both)))
+            unpaired.add(*(np.stack(each) * spec.chunk.scale for each in (pair, both)))
 
 
 def allowed(promised: float | None, least: float, calls: int) -> tuple[float, float]:
