@@ -211,10 +211,7 @@ class PolicySpec:
     def _check_relative(self) -> None:
         if (relative := self.chunk.relative) is None:
             return
-        seen, width = (
-            self.observations.get(relative.key),
-            1 + max((n for n in relative.entries if n is not None), default=0),
-        )
+        seen, width = self.observations.get(relative.key), 1 + max(n or 0 for n in relative.entries)
         shape = () if seen is None else seen.shape[bool(seen.frames) :]
         if seen is None or seen.dtype != "float32" or len(shape) != 1 or shape[0] < width:
             told = f"float32 [{width}] or more; found {seen and seen.dtype} {list(shape)}"

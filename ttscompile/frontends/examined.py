@@ -49,7 +49,7 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
 
 
 def _judged(key: str, one: Statistics) -> Finding:
-    first, second = one.first.flatten(), one.second.flatten()
+    first, second = (each[-1] if each.ndim == 2 else each.flatten() for each in (one.first, one.second))
     (of, width, place, size) = ("range", second - first, -1, 2)
     if one.mode == "MEAN_STD":
         (of, width, place, size) = ("deviation", second, 0, 1)

@@ -20,8 +20,7 @@ from .image_geometry import ResizeCrop
 from .lerobot_config import ACTION, MOST_PIXELS, STATE
 from .settings import Settings
 
-_PACK, _ENCODE = "groot_n1_7_pack_inputs_v1", "groot_n1_7_vlm_encode_v1"
-_UNPACK, _DECODE = "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1"
+(_PACK, _UNPACK, _DECODE), _ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _MOST_LETTERS, _EPSILON = 64, 400, 1e-8
@@ -103,13 +102,16 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         )
     read = packing.flag("normalize_min_max", True)
     state = _statistics(directory, lerobot.state_of(directory, pack) if read else {}, STATE, features)
-    action, bounded, executed = _actions(directory, decode, features)
+    actions, added = _actions(directory, decode, features), lerobot.relative_entries(directory, before, after, features)
+    if {*actions.relative} - {None} and added:
+        raise CheckpointError(f"{directory}: {_DECODE} and the steps after it add the state to actions; expected one.")
+    executed = actions.executed
     if kind == _LIBERO and executed is not None:
         executed = min(executed, _LIBERO_STEPS)
     encoding = _settings(directory, encode)
     return GrootProcessors(
         normalizers={} if state is None else {STATE: state},
-        action=action,
+        action=actions.statistics,
         renamed=lerobot.renamed_observations(directory, before, features),
         tokenizer={"tokenizer_name": encoding.text("model_name", "nvidia/Cosmos-Reason2-2B", _MOST_LETTERS)},
         cameras=_cameras(packing, features),
@@ -117,10 +119,11 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         embodiment=number,
         kind=kind,
         plain=packing.flag("formalize_language", True),
-        bounded=bounded,
+        bounded=actions.bounded,
         executed=executed,
         padded=(packing.number("max_state_dim", 132), packing.number("max_action_dim", 132)),
         geometry=_geometry(encoding),
+        relative=added or actions.relative,
     )
 
 
@@ -163,10 +166,16 @@ def _geometry(encoding: Settings) -> Geometry:
     return Geometry(edge, max(1, round(edge * share)) if 0 < share < 1 else edge, target[0])
 
 
-def _actions(
-    directory: Path, step: Mapping[str, Any], features: lerobot.Features
-) -> tuple[lerobot.Statistics | None, bool, int | None]:
-    """How actions are unnormalised, whether they are clipped before, and how many of a chunk mean something."""
+class _Actions(NamedTuple):
+    """How actions are unnormalised, and the rest as in ``GrootProcessors``."""
+
+    statistics: lerobot.Statistics | None
+    bounded: bool
+    executed: int | None = None
+    relative: tuple[int | None, ...] = ()
+
+
+def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Features) -> _Actions:
     settings, count = _settings(directory, step), features[ACTION][1][0]
     if settings.values.get("env_action_dim", 0) not in (0, count):
         raise settings.refusal("env_action_dim", f"{count}, as many as an action has, or 0")
@@ -175,19 +184,47 @@ def _actions(
         statistics = _statistics(directory, tensors, ACTION, features)
         if tensors and statistics is None:
             raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
-        return statistics, statistics is not None and settings.flag("clip_normalized_action", False), None
-    if settings.flag("use_relative_action", False):
-        raise settings.refusal("use_relative_action", "false: actions relative to the state are not compiled")
-    names = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
+        return _Actions(statistics, statistics is not None and settings.flag("clip_normalized_action", False))
+    ends = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
     try:
-        raw, own = settings.values["raw_stats"]["action"], settings.values["modality_config"]["action"]
-        ends = [[float(number) for group in own["modality_keys"] for number in raw[group][name]] for name in names]
-        steps = len(own.get("delta_indices") or ()) or None
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        expected = f"groups of an action in modality_config, and numbers {' and '.join(names)} of each in raw_stats"
+        own = settings.values["modality_config"]["action"]
+        names, steps = own["modality_keys"], len(own.get("delta_indices") or ()) or None
+        kinds = own["action_configs"] if settings.flag("use_relative_action", False) else [{}] * len(names)
+        *both, relative = zip(*(_group(settings, *each, ends) for each in zip(names, kinds, strict=True)), strict=True)
+        rows = max((each.shape[:-1] for each in (*both[0], *both[1])), default=())
+        tensors = {
+            f"{ACTION}.{name}": torch.cat([each.expand(*rows, -1) for each in groups], -1)
+            for name, groups in zip(("min", "max"), both, strict=True)
+        }
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        expected = f"groups of an action in modality_config, and numbers {' and '.join(ends)} of each in raw_stats"
         raise settings.error(f"{error!r:.80}; expected {expected}") from error
-    tensors = {f"{ACTION}.{name}": torch.tensor(end) for name, end in zip(("min", "max"), ends, strict=True)}
-    return _statistics(directory, tensors, ACTION, features), True, steps
+    steps = min(steps or rows[0], *rows) if rows else steps
+    shaped = {ACTION: ("ACTION", (*rows, count))}
+    return _Actions(_statistics(directory, tensors, ACTION, shaped), True, steps, sum(relative, ()))
+
+
+def _group(
+    settings: Settings, name: str, kind: Mapping[str, Any], ends: tuple[str, str]
+) -> tuple[Tensor, Tensor, tuple[int | None, ...]]:
+    """Where the range of a group of actions ends, ``[d]`` or a row for each step; and what they are relative to."""
+    raw, part, state = settings.values["raw_stats"], "action", settings.values["modality_config"].get("state")
+    if relative := str(kind.get("rep")).lower() == "relative":
+        if str(kind.get("type")).lower() != "non_eef":
+            raise settings.error(
+                f"actions {name!r} are relative to the pose of an end effector ({kind.get('format')}), and lerobot"
+                " composes both as rotations, which is not compiled; expected ABSOLUTE, or NON_EEF: the state is added"
+            )
+        part, ends = "relative_action", ("min", "max")
+    low, high = (torch.tensor(raw[part][name][end], dtype=torch.float32) for end in ends)
+    if not relative:
+        return low, high, (None,) * low.shape[-1]
+    sizes = {key: len(raw["state"][key].get("mean") or raw["state"][key]["min"]) for key in state["modality_keys"]}
+    own = kind.get("state_key") or name
+    first = sum(list(sizes.values())[: list(sizes).index(own)])
+    if sizes[own] != low.shape[-1]:
+        raise settings.error(f"actions {name!r} have {low.shape[-1]} numbers, and the state {own!r} {sizes[own]}")
+    return low, high, tuple(range(first, first + sizes[own]))
 
 
 def _statistics(

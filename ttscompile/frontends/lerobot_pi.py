@@ -61,9 +61,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task, config.trained_prefix > 0)
     side = config.vision.image_size
     spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options)
-    if adaptive:  # the instruction holds it
-        own = processors.renamed.get(STATE, STATE)
-        others = {key: each for key, each in spec.observations.items() if key != own}
+    if adaptive:  # the instruction holds the state, which the network does not read; actions may be relative to it
+        unread = () if spec.chunk.relative else (processors.renamed.get(STATE, STATE),)
+        others = {key: each for key, each in spec.observations.items() if key not in unread}
         spec = replace(spec, observations=others, instruction=None, trained_prefix=config.trained_prefix)
     return EncodedDenoiser(encoder, Expert(network)).eval(), spec
 

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec
+from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, Relative
 from ..errors import CheckpointError, SpecError
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
-from .lerobot_config import ACTION, CONFIG, WEIGHTS, LeRobotConfig
+from .lerobot_config import ACTION, CONFIG, STATE, WEIGHTS, LeRobotConfig
 from .lerobot_processors import Normalizer, Processors
 from .loops import Loops
 from .lora import find_base, merged, read_adapter
@@ -60,6 +60,7 @@ def policy_spec(
 ) -> PolicySpec:
     """The specification of a policy."""
     start = config.n_obs_steps - 1
+    relative = Relative(processors.renamed.get(STATE, STATE), processors.relative)
     return PolicySpec(
         sample=(config.horizon, config.action_dim),
         observations=_observations(config, processors) | dict(more or {}),
@@ -69,8 +70,9 @@ def policy_spec(
             action_dim=config.action_dim,
             start=start,
             stop=min(start + config.n_action_steps, config.horizon),
-            normalizer=None if processors.action is None else processors.action.inverse(),
+            normalizer=None if processors.action is None else processors.action.inverse(config.horizon),
             ranged=processors.action is not None and processors.action.mode == "MIN_MAX",
+            relative=relative if {*relative.entries} - {None} else None,
         ),
         source={"format": "lerobot", **source, **loops.source},
     )

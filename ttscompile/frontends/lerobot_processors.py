@@ -32,12 +32,15 @@ _COMMON = {PREPROCESSOR: (_RENAME, _BATCH, _DEVICE, _RELATIVE), POSTPROCESSOR: (
 _BEFORE, _AFTER = (_TOKENIZE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT), (_UNNORMALIZE, _CROP)
 """Beside them, those before and after a policy."""
 IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
+GROOT = ("groot_n1_7_pack_inputs_v1", "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1")
 PREPARE, CLIP = "vla_jepa_image_prep", "vla_jepa_clip_actions"
 SNAP, BINARIZE = "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
 OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN), "vla_jepa": (PREPARE,)}
 """By type of policy, steps before it that no other has, in the order that lerobot saves."""
 _OWN_LATER: Mapping[str, tuple[str, ...]] = {"vla_jepa": (CLIP, SNAP, _UNNORMALIZE, BINARIZE)}
 """By type of policy, steps after it of which no other has all, in the only order that is known."""
+_CHANGES = frozenset({NORMALIZE, _UNNORMALIZE, *_PAD, *GROOT})
+"""Steps that change the state, or make actions of what the network gives."""
 _OFTEN = frozenset({_BATCH, _DEVICE})
 """Steps that may be anywhere, more than once."""
 
@@ -101,14 +104,17 @@ class Statistics:
             x * self.second[channel] + first if self.mode == "MEAN_STD" else (x + 1) / 2 * self.width[channel] + first
         )
 
-    def inverse(self) -> Affine:
-        """The inverse as an ``Affine``, for vectors. MEAN_STD inverts with the bare standard deviation."""
-        first = self.first.double().numpy()
+    def inverse(self, steps: int = 1) -> Affine:
+        """The inverse as an ``Affine``, for vectors; of a chunk's steps, where statistics have rows, the last repeated.
+
+        MEAN_STD inverts with the bare standard deviation.
+        """
+        first, moved = self.first.double().numpy(), 0 if self.mode == "MEAN_STD" else 1
+        scale = 2 / self.width.double().numpy()
         if self.mode == "MEAN_STD":
             scale = 1 / np.maximum(self.second.double().numpy(), _LEAST_STD)
-            return Affine(scale=scale.astype(np.float32), offset=(-first * scale).astype(np.float32))
-        scale = 2 / self.width.double().numpy()
-        return Affine(scale=scale.astype(np.float32), offset=(-first * scale - 1).astype(np.float32))
+        own = Affine(scale=scale.astype(np.float32), offset=(-first * scale - moved).astype(np.float32))
+        return own.at(np.minimum(np.arange(steps), len(scale) - 1))
 
 
 class Normalizer(nn.Module):
@@ -156,6 +162,8 @@ class Processors:
         new_line: whether an instruction ends with a new line before it is tokenized.
         state_in_prompt: whether it holds the state too, as numbers in words.
         own: settings of the steps around the policy that its type alone has, by name, in their order.
+        relative: for each number of an action, which number of the state it is relative to; None for none. Empty where
+            actions are absolute.
     """
 
     normalizers: Mapping[str, Statistics]
@@ -165,6 +173,7 @@ class Processors:
     new_line: bool = False
     state_in_prompt: bool = False
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    relative: tuple[int | None, ...] = ()
 
 
 def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:
@@ -188,7 +197,36 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
             for step in (*before, *after)
             if step["registry_name"] in (*own, *later)
         },
+        relative=relative_entries(directory, before, after, features),
     )
+
+
+def relative_entries(
+    directory: Path, before: list[dict[str, Any]], after: list[dict[str, Any]], features: Features
+) -> tuple[int | None, ...]:
+    """What the pair of steps makes of actions: see ``Processors.relative``."""
+    orders = [[step["registry_name"] for step in steps] for steps in (before, after)]
+    both = [step for step in (*before, *after) if step["registry_name"] in (_RELATIVE, _ABSOLUTE)]
+    own = [Settings(step["config"], f"{directory}: {step['registry_name']}.") for step in both]
+    enabled = [each.flag("enabled", False) for each in own]
+    if not any(enabled):
+        return ()
+    (count,), state = features["action"][1], features.get("observation.state", ("", (0,)))[1][0]
+    names, excluded = own[0].values.get("action_names"), own[0].values.get("exclude_joints") or []
+    if enabled != [True, True] or any(name in _CHANGES for name in orders[0][: orders[0].index(_RELATIVE)]):
+        told = f"expected {_RELATIVE} before the state is changed, and {_ABSOLUTE}, both enabled or none"
+        raise CheckpointError(f"{directory}: {told}; found {orders[0]} and {orders[1]}, enabled: {enabled}.")
+    if orders[1].index(_ABSOLUTE) < max(i for i, name in enumerate(orders[1]) if name in _CHANGES):
+        raise CheckpointError(f"{directory}: expected {_ABSOLUTE} after actions are unnormalised; found {orders[1]}.")
+    if state < count:
+        raise own[0].error(f"the {count} numbers of an action are relative to those of a state that has {state}")
+    for entry in (names or [], excluded):
+        if not isinstance(entry, list) or not all(isinstance(name, str) for name in entry):
+            raise own[0].error(
+                f"found {own[0].values!s:.300}; expected names of joints in action_names, exclude_joints"
+            )
+    absolute = [any(part and part.lower() in name.lower() for part in excluded) for name in (names or [])[:count]]
+    return tuple(None if i < len(absolute) and absolute[i] else i for i in range(count))
 
 
 def read_steps(directory: Path, name: str, own: Collection[str]) -> list[dict[str, Any]]:
@@ -218,11 +256,6 @@ def read_steps(directory: Path, name: str, own: Collection[str]) -> list[dict[st
         if registered == _DEVICE and step["config"].get("float_dtype") not in (None, "float32"):
             found = f"{registered}.float_dtype is {step['config']['float_dtype']!r:.80}"
             raise CheckpointError(f"{path}: {found}; expected null or float32, in which the compiled policy computes.")
-        if registered in (_RELATIVE, _ABSOLUTE) and step["config"].get("enabled") is not False:
-            raise CheckpointError(
-                f"{path}: {registered} is enabled: actions are relative to the state, which is not compiled. Expected"
-                " a policy of absolute actions."
-            )
     order = [step["registry_name"] for step in steps]
     twice = sorted(kind for kind in known if kind not in _OFTEN and order.count(kind) > 1)
     if twice:

@@ -37,10 +37,10 @@ def read_vla_config(
     whether a policy may be without state.
     """
     config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True, stateless=stateless)
-    if config.settings.flag("adapt_to_pi_aloha", False) or config.settings.flag("use_relative_actions", False):
+    if config.settings.flag("adapt_to_pi_aloha", False):
         raise config.settings.error(
-            "adapt_to_pi_aloha or use_relative_actions is set: joints are turned into others, or actions are relative"
-            " to the state, around the policy, which is not compiled; expected false"
+            "adapt_to_pi_aloha is set: joints are turned into others around the policy, which is not compiled; expected"
+            " false"
         )
     if entries["type"] != "pi05" and config.settings.values.get("rtc_training_max_delay", 0) != 0:
         raise config.settings.error(
@@ -100,6 +100,8 @@ def vla_spec(
     source |= {} if options.task is None else {"task": options.task}
     source |= {WITHOUT: ", ".join(options.without_cameras)} if options.without_cameras else {}
     loops = loops_of(table or (lambda each: _sampler(config.settings, each)), options, "its own integration")
+    if config.settings.flag("use_relative_actions", False) and not processors.relative:
+        raise config.settings.error("use_relative_actions is set, and no step around the policy adds the state to them")
     spec = policy_spec(config, processors, loops, source, language)
     observations = dict(spec.observations)
     if image is not None:

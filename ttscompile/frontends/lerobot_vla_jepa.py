@@ -113,6 +113,9 @@ def _switches(shared: LeRobotConfig, processors: Processors) -> tuple[Switch, ..
     channel = next(iter(channels), shared.action_dim)
     if channel >= shared.action_dim:
         return ()
+    if processors.relative and processors.relative[channel] is not None:
+        told = "is relative to the state, and then made one of two values, which is not compiled"
+        raise shared.settings.error(f"number {channel} of an action {told}; expected it in relative_exclude_joints")
     below, above = (ends if processors.action is None else processors.action.unnormalized(ends, channel)).tolist()
     rising = above >= below
     if BINARIZE in names:

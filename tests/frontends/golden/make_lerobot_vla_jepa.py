@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.vla_jepa import modeling_vla_jepa
 from lerobot.policies.vla_jepa.configuration_vla_jepa import VLAJEPAConfig
 from lerobot.policies.vla_jepa.modeling_vla_jepa import VLAJEPAPolicy
 from lerobot.policies.vla_jepa.processor_vla_jepa import make_vla_jepa_pre_post_processors
@@ -39,7 +40,8 @@ from .make_lerobot_groot import SPECIAL, TEMPLATE, TEXT, VISION, of_bytes
 
 VIDEO = "vjepa2-tiny"
 TEMPLATE += "{%- if add_generation_prompt -%}{{- '<|im_start|>assistant\\n' -}}{%- endif -%}"
-MODULE = "lerobot.policies.vla_jepa.modeling_vla_jepa"
+AUTOCAST = next(name for name in ("_get_autocast_context", "get_autocast_context") if hasattr(modeling_vla_jepa, name))
+"""Of lerobot 0.6.1, or as it is called later."""
 ROPE: dict[str, Any] = {"rope_type": "default", "rope_theta": 5e6, "mrope_section": [2, 2, 2]}
 BACKBONES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "libero": ({"deepstack_visual_indexes": [0, 2]}, {"rope_parameters": ROPE}),
@@ -90,22 +92,7 @@ def main() -> None:
         folder.mkdir(parents=True)
         os.chdir(folder)
         backbone(kind)
-        VJEPA2Model(
-            VJEPA2Config(
-                patch_size=16,
-                crop_size=32,
-                frames_per_clip=4,
-                tubelet_size=2,
-                hidden_size=12,
-                num_attention_heads=2,
-                num_hidden_layers=1,
-                pred_hidden_size=12,
-                pred_num_attention_heads=2,
-                pred_num_hidden_layers=1,
-                pred_num_mask_tokens=1,
-            )
-        ).save_pretrained(VIDEO)
-        VJEPA2VideoProcessor().save_pretrained(VIDEO)
+        video()
         policy = save(kind)
         for call in (0, 1):
             numbers[f"{kind}.{call}"] = chunk(policy, call, vla_jepas.observation(kind, call))
@@ -142,6 +129,26 @@ def backbone(kind: str) -> None:
         tie_word_embeddings=True,
     )
     Qwen3VLForConditionalGeneration(config).save_pretrained(vla_jepas.BACKBONE)
+
+
+def video() -> None:
+    """A tiny V-JEPA."""
+    VJEPA2Model(
+        VJEPA2Config(
+            patch_size=16,
+            crop_size=32,
+            frames_per_clip=4,
+            tubelet_size=2,
+            hidden_size=12,
+            num_attention_heads=2,
+            num_hidden_layers=1,
+            pred_hidden_size=12,
+            pred_num_attention_heads=2,
+            pred_num_hidden_layers=1,
+            pred_num_mask_tokens=1,
+        )
+    ).save_pretrained(VIDEO)
+    VJEPA2VideoProcessor().save_pretrained(VIDEO)
 
 
 def save(kind: str) -> Any:
@@ -185,7 +192,7 @@ def chunk(policy: Any, call: int, given: dict[str, Any]) -> Any:
     batch = before({**{key: torch.from_numpy(value) for key, value in given.items()}, "task": vla_jepas.TASKS[call]})
     # On a processor, too, lerobot would compute in bfloat16, whatever torch_dtype says.
     with (
-        patch(f"{MODULE}._get_autocast_context", lambda *_: nullcontext()),
+        patch.object(modeling_vla_jepa, AUTOCAST, lambda *_: nullcontext()),
         patch("torch.randn", lambda *_, **__: torch.from_numpy(vla_jepas.noise())),
     ):
         return after(policy.predict_action_chunk(batch)).numpy()
