@@ -138,5 +138,5 @@ def with_relative_groups(directory: Path) -> Path:
             if "use_relative_action" in step["config"]:
                 step["config"]["use_relative_action"] = True
         write_json(file, pipeline)
-    change_json(directory / "config.json", use_relative_actions=True)
+    change_json(directory / "config.json", use_relative_actions=True, n_action_steps=4)
     return directory

@@ -29,12 +29,14 @@ def eager_chunk(
     """The whole chunk of the rebuilt network, not compiled, in robot units, given the task's tokens if it reads any."""
     module, spec = load_checkpoint_policy(directory, options=options)
     given = {key: value[None] for key, value in frame.items()}
-    if spec.instruction is not None:
+    if spec.instruction is not None and TOKENS not in given:
         length = spec.observations[TOKENS].shape[0]
         own = Tokenizer(tokenizer, CheckpointError).of_task(task, spec.instruction, length)
         given[TOKENS], given[MASK] = padded([own], length)
-    obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
-    return spec.chunk, spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(noise)).numpy())
+    seen = {key: as_given(key, given, spec) for key in spec.observations}
+    obs = {key: torch.from_numpy(value) for key, value in seen.items()}
+    sample = eager_policy(module, spec)(obs, Noise(noise)).numpy()
+    return spec.chunk, spec.chunk.unnormalized(sample, spec.chunk.reference(seen))
 
 
 def assert_agreement_on_random_plans(compiled: Path, runtime: str) -> None:

@@ -223,7 +223,7 @@ def relative_entries(
     for entry in (names or [], excluded):
         if not isinstance(entry, list) or not all(isinstance(name, str) for name in entry):
             raise own[0].error(
-                f"found {own[0].values!s:.300}; expected names of joints in action_names, exclude_joints"
+                f"found {own[0].values!s:.300}; expected names in action_names and exclude_joints"
             )
     absolute = [any(part and part.lower() in name.lower() for part in excluded) for name in (names or [])[:count]]
     return tuple(None if i < len(absolute) and absolute[i] else i for i in range(count))

@@ -92,6 +92,7 @@ def vla_jepa() -> dict[str, Array]:
     """Two states; the gripper is absolute, and has two values."""
     own = {"use_relative_actions": True, "action_feature_names": list(relatives.WIDE)}
     own |= {"relative_exclude_joints": relatives.EXCLUDED}
+    own |= dict.fromkeys(("binarize_gripper_action", "pre_snap_gripper_action", "clip_normalized_actions"), True)
     policies = {"libero": make_lerobot_vla_jepa.POLICIES["libero"] | own}
     make_lerobot_vla_jepa.backbone("libero")
     make_lerobot_vla_jepa.video()
