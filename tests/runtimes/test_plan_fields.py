@@ -24,6 +24,7 @@ from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import Source
+from ttscompile.core.spec import Relative
 from ttscompile.errors import IllegalPlanError, RuntimeUnavailableError
 from ttscompile.ir.pieces import is_block
 from ttscompile.lower.precision import quantize_model
@@ -59,6 +60,7 @@ def artifact(once: Once) -> Artifact:
             for name, steps in STEPS.items()
         }
         spec = replace(policies.spec(), sampler=tables.pop("original"), loops=tables)
+        spec = replace(spec, chunk=replace(spec.chunk, relative=Relative("obs", (2, None))))  # starts go on from it
         ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path, precision="int8")
         plain, rng = load_artifact(path), np.random.default_rng(0)
         names = {name for piece, graph in plain.graphs.items() if is_block(piece) for name in graph.constants}

@@ -17,6 +17,7 @@ from tests.rounding import allowed, assert_equal_but_for_rounding
 from tests.runtimes import committed
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import AsyncExecutor, ExecutorSettings
+from ttscompile.core.spec import Relative
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -27,12 +28,13 @@ from .simulation import FakeClock
 HZ, HORIZON, LATENCY = 10.0, 12, 0.2
 
 
-@pytest.fixture(scope="module")
-def inpainting(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The toy with DDIM and eleven actions a chunk."""
+@pytest.fixture(scope="module", params=[None, Relative("obs", (1, None))], ids=["absolute", "relative"])
+def inpainting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy with DDIM and eleven actions a chunk, of which a number may be relative to the observation."""
     program = toy_program(pruner=False, horizon=HORIZON)
     table = sampler_table(DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2"), steps=5)
-    program = replace(program, spec=replace(program.spec, sampler=table))
+    chunk = replace(program.spec.chunk, relative=request.param)
+    program = replace(program, spec=replace(program.spec, sampler=table, chunk=chunk))
     return written_artifact(program, tmp_path_factory.mktemp("inpainting") / "artifact").path
 
 

@@ -1,0 +1,240 @@
+"""Actions that are relative to what the robot measures, however a call is made, and from one call to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from tests.artifact.tiny import tiny_spec
+from tests.calibration import policies
+from tests.lower.whole_call import Episode, inputs, make
+from tests.once import Once
+from ttscompile import ChunkSpec, Noise, ObservationSpec, Plan, PolicySpec
+from ttscompile.artifact.golden import load_golden_plans
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.manifest import StartRecord
+from ttscompile.artifact.strict_json import dump, parse
+from ttscompile.artifact.typed_json import from_json, to_json
+from ttscompile.artifact.write import update_plans
+from ttscompile.core.lattice import Source
+from ttscompile.core.spec import Affine, Relative, Switch
+from ttscompile.core.start import rest_of
+from ttscompile.errors import ArtifactError, SpecError
+from ttscompile.samplers.flow import flow_matching_table
+from ttscompile.verification.record_golden import record_plans
+
+from .toys import toy_program
+
+RELATIVE = Relative("obs", (1, None))
+ROWS = np.arange(1, 4, dtype=np.float32)[:, None]
+
+
+def with_rows(chunk: ChunkSpec) -> ChunkSpec:
+    """The same chunk of three steps with a normaliser of its own for each."""
+    own = chunk.normalizer
+    assert own is not None
+    return replace(chunk, normalizer=Affine(own.scale * ROWS, own.offset + ROWS))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [False, True])
+def test_every_way_to_make_a_call_adds_it(tmp_path: Path, rows: bool) -> None:
+    """To each stream of a batch its own."""
+    program = toy_program(steps=3, blocks=2, noise=0.0, pruner=False)
+    plain = with_rows(program.spec.chunk) if rows else program.spec.chunk
+    program = replace(program, spec=replace(program.spec, chunk=replace(plain, relative=RELATIVE)))
+    policy, model = make(program, tmp_path)
+    obs, noise = inputs(policy, np.random.default_rng(0), 3)
+    reference = ttscompile.load(tmp_path / "artifact", "reference")
+    given = {"obs": program.spec.observations["obs"].normalized(obs["obs"])}
+    sample, _ = reference._runtime.predict(given, noise, reference.plans["dense"])
+    assert plain.normalizer is not None
+    expected = (sample - plain.normalizer.offset) / plain.normalizer.scale
+    expected[..., 0] += obs["obs"][:, None, 1]
+    made: dict[str, Any] = {
+        name: ttscompile.load(tmp_path / "artifact", name).predict_action(obs, noise, plan="dense")["action_pred"]
+        for name in ("onnxruntime", "torch", "reference")
+    }
+    made["file"] = Episode(model, 3).call(obs, noise, np.zeros((3, 2), np.int8))["action_pred"]
+    module = ttscompile.to_module(tmp_path / "artifact", "dense")
+    with torch.inference_mode():
+        made["module"] = module({"obs": torch.from_numpy(obs["obs"])}, torch.from_numpy(noise.initial)).numpy()
+    for name, found in made.items():
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5, err_msg=name)
+    assert load_artifact(tmp_path / "artifact").manifest.spec.chunk.relative == RELATIVE
+
+
+@pytest.fixture(scope="module")
+def artifact(once: Once) -> Path:
+    """A policy of flow matching, with a plan that begins with the chunk of the call before."""
+
+    def convert(path: Path) -> None:
+        table = replace(flow_matching_table(6), timesteps=np.arange(6)[::-1].copy())
+        spec = replace(policies.spec(), sampler=table)
+        spec = replace(spec, chunk=replace(spec.chunk, relative=Relative("obs", (2, None))))
+        ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path)
+        dense = load_artifact(path).plans["dense"]
+        warm = Plan("original-last-2", np.zeros((2, 6), np.int8), otherwise=dense)
+        sparse = replace(warm, cells=np.array([[0] * 6, [Source.TIMESTEP] * 6], np.int8))
+        plans, starts = {"dense": dense, "warm": warm, "sparse": sparse}, {warm.loop: StartRecord("original", 2)}
+        update_plans(path, plans, "warm", {}, starts=starts, golden=record_plans)
+
+    return once.compiled("relative and warm", convert)[0]
+
+
+def observed(seed: int, streams: int = 2) -> tuple[dict[str, np.ndarray], Noise]:
+    rng = np.random.default_rng(seed)
+    obs = {"obs": 3 * rng.standard_normal((streams, 2, 3)).astype(np.float32)}
+    return obs, Noise(rng.standard_normal((streams, policies.HORIZON, policies.CHANNELS)).astype(np.float32))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_a_call_goes_on_with_the_actions_of_the_call_before(artifact: Path, runtime: str) -> None:
+    """Not with its numbers, which were relative to another state. Each call has a state of its own."""
+    policy, spec = ttscompile.load(artifact, runtime), load_artifact(artifact).manifest.spec
+    normalizer, (_, start) = spec.chunk.normalizer, rest_of(spec.sampler, 2)
+    assert normalizer is not None
+    before = policy.predict_action(*observed(0))["action_pred"]
+    for call in (1, 2):
+        obs, noise = observed(call)
+        going_on = np.concatenate([before[:, 4:], np.repeat(before[:, -1:], 4, 1)], 1)  # four are executed
+        going_on[..., 0] -= obs["obs"][:, -1:, 2]
+        initial = start.action * normalizer.normalize(going_on) + start.noise * noise.initial
+        before = policy.predict_action(obs, noise)["action_pred"]
+        np.testing.assert_allclose(before, rest_alone(artifact, obs, initial.astype(np.float32)), rtol=0, atol=1e-4)
+        assert policy.last_report is not None
+        assert policy.last_report.plan_name == "warm"
+
+
+@pytest.mark.slow
+def test_every_rung_of_verify_holds(artifact: Path) -> None:
+    """Its records hold actions, and calls that begin with the chunk of another observation."""
+    report = ttscompile.verify(artifact, calls=2)
+    assert report.passed, report
+    assert set(load_golden_plans(load_artifact(artifact), 2)) == {"sparse"}
+
+
+def rest_alone(artifact: Path, obs: dict[str, np.ndarray], initial: np.ndarray) -> np.ndarray:
+    """The last two steps in torch, with the original network."""
+    spec = load_artifact(artifact).manifest.spec
+    rest, _ = rest_of(spec.sampler, 2)
+    seen, x = torch.from_numpy(spec.observations["obs"].normalized(obs["obs"])), torch.from_numpy(initial)
+    network = policies.Mixer(0).eval()
+    with torch.no_grad():
+        for k in range(2):
+            out = network(x, torch.full((len(x),), int(rest.timesteps[k])), seen)
+            x0 = float(rest.sample_to_x0[k]) * x + float(rest.out_to_x0[k]) * out
+            moved = float(rest.sample_to_next[k]) * x + float(rest.out_to_next[k]) * out
+            x = float(rest.x0_to_next[k]) * x0 + moved
+    return spec.chunk.unnormalized(x.numpy(), spec.chunk.reference(obs))
+
+
+@pytest.mark.parametrize("rows", [False, True])
+def test_a_chunk_that_is_moved_holds_the_same_actions(rows: bool) -> None:
+    program = toy_program(pruner=False)
+    chunk = replace(with_rows(program.spec.chunk) if rows else program.spec.chunk, relative=RELATIVE)
+    rng = np.random.default_rng(1)
+    sample = rng.standard_normal((2, 3, 2)).astype(np.float32)
+    old, new = (chunk.reference({"obs": rng.standard_normal((2, 2)).astype(np.float32)}) for _ in range(2))
+    assert old is not None and new is not None
+    moved = chunk.moved(sample, 1, old - new)
+    before, after = chunk.unnormalized(sample, old), chunk.unnormalized(moved, new)
+    np.testing.assert_allclose(after, before[:, [1, 2, 2]], rtol=0, atol=1e-5)
+    absolute = replace(chunk, relative=None)
+    np.testing.assert_allclose(
+        absolute.unnormalized(absolute.moved(sample, 1)), absolute.unnormalized(sample)[:, [1, 2, 2]], atol=1e-5
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_a_prefix_is_of_actions(artifact: Path, once: Once, runtime: str) -> None:
+    """It is as one of the difference in the policy that has the same network and adds nothing."""
+    table = replace(flow_matching_table(6), timesteps=np.arange(6)[::-1].copy())
+    spec = replace(policies.spec(), sampler=table)
+    plain, _ = once.compiled("warm alone", lambda to: ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, to))
+    (obs, noise), added = observed(3), np.zeros((2, 1, 2), np.float32)
+    added[:, 0, 0] = obs["obs"][:, -1, 2]
+    prefix = np.random.default_rng(4).standard_normal((2, 2, 2)).astype(np.float32)
+    found, expected = (
+        ttscompile.load(path, runtime).predict_action(obs, noise, "dense", given)["action_pred"]
+        for path, given in ((artifact, prefix), (plain, prefix - added))
+    )
+    np.testing.assert_allclose(found, expected + added, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found[:, 1:3], prefix, rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_calibration_measures_what_the_network_says(once: Once, tmp_path: Path) -> None:
+    """Two answers to one observation have the same added to them: every distance is that of the policy without."""
+    recording, found = policies.record(tmp_path / "calls.npz"), list[dict[str, Any]]()
+    for relative in (None, Relative("obs", (2, None))):
+        path, own = tmp_path / str(relative is None), policies.spec()
+        spec = replace(own, chunk=replace(own.chunk, relative=relative))
+        ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path)
+        ttscompile.calibrate(path, [recording], 0.8, "interval", progress=False)
+        plans = (load_artifact(path).manifest.calibration or {})["plans"]
+        found.append({name: (one["error"], one["distance"]) for name, one in plans.items()})
+    assert found[0]
+    assert found[0] == found[1]
+
+
+def test_it_is_written_where_there_is_some_and_read_strictly() -> None:
+    """What does not know the word refuses it, like any other that it does not know."""
+    plain = tiny_spec()
+    assert "relative" not in to_json(plain)["chunk"]
+    key, channels = next(iter(plain.observations)), plain.chunk.action_dim
+    rows = Affine(np.ones((plain.sample[0], channels)), np.arange(plain.sample[0] * channels).reshape(-1, channels))
+    relative = Relative(key, (0, *[None] * (channels - 1)))
+    spec = replace(plain, chunk=replace(plain.chunk, normalizer=rows, relative=relative))
+    written = to_json(spec)
+    found = from_json(PolicySpec, parse(dump(written), "spec"))
+    assert found.chunk.relative == relative
+    assert found.chunk.normalizer is not None
+    np.testing.assert_array_equal(found.chunk.normalizer.offset, rows.offset)
+    written["chunk"]["later"] = written["chunk"].pop("relative")
+    with pytest.raises(ArtifactError, match="later"):
+        from_json(PolicySpec, parse(dump(written), "spec"))
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (lambda: Relative("obs", (1,)), r"relative has \(1,\); expected 2 entries"),
+        (lambda: Relative("obs", (1, -1)), "an entry of relative"),
+        (lambda: Relative("obs", (None, 1)), r"relative has \(None, 1\); .* None for \[1\]"),
+        (lambda: Relative("obs", (2, None)), r"to observation 'obs': expected float32 \[3\] or more; found float32"),
+        (lambda: Relative("other", (0, None)), r"to observation 'other': expected float32 \[1\] or more; found None"),
+    ],
+)
+def test_what_nothing_can_be_relative_to(made: Callable[[], Relative], message: str) -> None:
+    spec = toy_program(pruner=False).spec
+    chunk = replace(spec.chunk, switches=(Switch(1, 0.0, 0.0, 1.0),))
+    with pytest.raises(SpecError, match=message):
+        replace(spec, chunk=replace(chunk, relative=made()))
+
+
+def test_what_has_no_numbers_to_add() -> None:
+    spec = toy_program(pruner=False).spec
+    chunk = replace(spec.chunk, relative=RELATIVE)
+    for one in (ObservationSpec((2,), dtype="int64", bounds=(0, 3)), ObservationSpec((2, 2), window=False)):
+        with pytest.raises(SpecError, match="actions are relative to observation 'obs'"):
+            replace(spec, observations={"obs": one}, chunk=chunk)
+    replace(spec, observations={"obs": ObservationSpec((4, 2))}, chunk=chunk)
+    with pytest.raises(SpecError, match=r"action normaliser has \[2, 2\] entries for 3 steps of 2 channels"):
+        replace(spec, chunk=replace(chunk, normalizer=Affine(np.ones((2, 2)), np.ones((2, 2)))))
+
+
+def test_no_range_is_known_of_actions_whose_place_is_not() -> None:
+    chunk = replace(toy_program(pruner=False).spec.chunk, ranged=True)
+    assert chunk.usual is not None
+    assert replace(chunk, relative=RELATIVE).usual is None
+    np.testing.assert_array_equal(with_rows(chunk).scale, chunk.scale * ROWS[1:])
