@@ -71,7 +71,12 @@ def test_the_rebuilt_network_gives_lerobots_actions(
 def compiled(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("groot")
     artifact, program = once.compiled("whole groot", lambda to: ttscompile.convert(groots.save("words", folder), to))
-    record("LeRobot groot", "actions that lerobot 0.6.1 gave, raw observation to action, 1e-4", "euler 4", program)
+    record(
+        "LeRobot groot",
+        "actions that lerobot 0.6.1 gave, raw observation to action, also relative to the state, 1e-4",
+        "euler 4",
+        program,
+    )
     return artifact
 
 
@@ -217,7 +222,7 @@ def test_steps_in_another_order(directory: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"use_relative_action": True}, "use_relative_action is True; expected false: actions relative to the state"),
+        ({"use_relative_action": "yes"}, "use_relative_action is 'yes'; expected true or false"),
         ({"raw_stats": {"action": {"arm": {}}}}, "KeyError.*; expected groups of an action .* numbers q01 and q99"),
         ({"modality_config": None}, "TypeError.*; expected groups of an action in modality_config"),
     ],
@@ -234,7 +239,7 @@ def test_groups_of_actions_that_are_not_rebuilt_are_named(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"use_relative_actions": True}, "adapt_to_pi_aloha or use_relative_actions is set"),
+        ({"use_relative_actions": True}, "use_relative_actions is set, and no step around the policy adds the state"),
         ({"action_decode_transform": "libero"}, "action_decode_transform is 'libero'; .* is the robot's to do"),
         ({"action_decode_transform": "auto", "embodiment_tag": "libero_sim"}, "action_decode_transform is 'auto'"),
         ({"tokenizer_assets_repo": "lerobot/eagle2hg"}, "this policy is of GR00T N1.5"),

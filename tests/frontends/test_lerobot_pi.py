@@ -109,7 +109,10 @@ def test_the_tokenizer_beside_a_policy_that_is_the_current_folder(
 
 def assert_recorded(kind: str, program: Program) -> None:
     record(
-        f"LeRobot {kind}", "actions that lerobot 0.6.1 gave, raw images and tokens to action, 1e-4", "euler 4", program
+        f"LeRobot {kind}",
+        "actions that lerobot 0.6.1 gave, raw images and tokens to action, also relative to the state, 1e-4",
+        "euler 4",
+        program,
     )
 
 

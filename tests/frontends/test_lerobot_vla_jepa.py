@@ -238,7 +238,7 @@ def test_the_last_step_alone_clips(directory: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"use_relative_actions": True}, "adapt_to_pi_aloha or use_relative_actions is set"),
+        ({"use_relative_actions": True}, "use_relative_actions is set, and no step around the policy adds the state"),
         ({"qwen_model_name": "Qwen/Qwen3-VL-2B-Instruct"}, "the backbone 'Qwen/Qwen3-VL-2B-Instruct' is not on this"),
         ({"prompt_template": "Do it."}, "prompt_template is 'Do it.'; expected text with {instruction}"),
         (

@@ -222,9 +222,7 @@ def relative_entries(
         raise own[0].error(f"the {count} numbers of an action are relative to those of a state that has {state}")
     for entry in (names or [], excluded):
         if not isinstance(entry, list) or not all(isinstance(name, str) for name in entry):
-            raise own[0].error(
-                f"found {own[0].values!s:.300}; expected names in action_names and exclude_joints"
-            )
+            raise own[0].error(f"found {own[0].values!s:.300}; expected names in action_names and exclude_joints")
     absolute = [any(part and part.lower() in name.lower() for part in excluded) for name in (names or [])[:count]]
     return tuple(None if i < len(absolute) and absolute[i] else i for i in range(count))
 

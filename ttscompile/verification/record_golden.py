@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from ..artifact.golden import DIGITS, Golden, GoldenPlan, is_sparse, load_golden, pattern, probe_stream, project
+from ..artifact.golden import DIGITS, Golden, GoldenPlan, expand, is_sparse, load_golden, pattern, probe_stream, project
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
 from ..core.plan import Plan
@@ -78,7 +78,7 @@ class _Recorder:
         self._observations, self._normalized, self._tensors = {}, {}, {}
         for key, one in spec.observations.items():
             raw = np.concatenate([one.draw(self._draw) for _ in range(streams)])
-            whole = np.stack([np.resize(each, one.shape) for each in pattern(raw, one.shape)])
+            whole = expand(pattern(raw, one.shape), one.shape)
             normalized = one.normalized(whole)
             self._observations[key], self._normalized[key] = (pattern(each, one.shape) for each in (whole, normalized))
             self._tensors[key] = torch.from_numpy(normalized)
@@ -105,7 +105,8 @@ class _Recorder:
                 "the module's prediction on a random observation within the range of its normaliser is not a number."
                 " Look for NaN in its weights, and check normaliser and sampler."
             )
-        actions, flops = spec.chunk.unnormalized(sample, spec.chunk.reference(self._observations)), program.dense_flops
+        seen = {key: expand(stored, spec.observations[key].shape) for key, stored in self._observations.items()}
+        actions, flops = spec.chunk.unnormalized(sample, spec.chunk.reference(seen)), program.dense_flops
         evaluated = _spread(steps, EVALUATIONS)
         anchors = _spread(steps, steps if flops <= EFFORT else max(3, int(steps * EFFORT / flops)))
         if scales is None:
