@@ -165,8 +165,8 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: an observation, noise or prefix that does not fit, is not finite, or is larger than any
-                that a policy can have seen (``core.chunk.LARGEST``); or a prefix where ``info.prefix_refusal`` says that
-                there can be none. Nothing was executed.
+                that a policy can have seen (``core.chunk.LARGEST``); or a prefix where ``info.prefix_refusal`` says
+                that there can be none. Nothing was executed.
             IllegalPlanError: a plan that is unknown, malformed or illegal; nothing was executed.
             NonFiniteActionsError: the arithmetic overflowed, and the episode has ended.
         """

@@ -27,6 +27,7 @@ from ttscompile.core.lattice import Source
 from ttscompile.core.spec import Affine, Relative, Switch
 from ttscompile.core.start import rest_of
 from ttscompile.errors import ArtifactError, SpecError
+from ttscompile.report import facts
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.verification.record_golden import record_plans
 
@@ -68,7 +69,10 @@ def test_every_way_to_make_a_call_adds_it(tmp_path: Path, rows: bool) -> None:
         made["module"] = module({"obs": torch.from_numpy(obs["obs"])}, torch.from_numpy(noise.initial)).numpy()
     for name, found in made.items():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5, err_msg=name)
-    assert load_artifact(tmp_path / "artifact").manifest.spec.chunk.relative == RELATIVE
+    written = load_artifact(tmp_path / "artifact")
+    assert written.manifest.spec.chunk.relative == RELATIVE
+    told = dict(facts.policy(written).tables[0].rows)["action"]
+    assert told == "2 numbers, 3 steps predicted, 1..2 executed; 1 of the numbers are relative to 'obs'"
 
 
 @pytest.fixture(scope="module")

@@ -194,9 +194,9 @@ class PolicySpec:
         words = self.instruction
         if words is not None and not {words.tokens, words.mask} <= self.observations.keys():
             raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
-        own = np.ones(self.chunk.action_dim) if self.chunk.normalizer is None else self.chunk.normalizer.scale
-        if own.shape not in ((self.chunk.action_dim,), (horizon + self.left_out, self.chunk.action_dim)):
-            told = f"normaliser has {list(own.shape)} entries for {horizon + self.left_out} steps of"
+        scale = np.ones(self.chunk.action_dim) if self.chunk.normalizer is None else self.chunk.normalizer.scale
+        if scale.shape not in ((self.chunk.action_dim,), (horizon + self.left_out, self.chunk.action_dim)):
+            told = f"normaliser has {list(scale.shape)} entries for {horizon + self.left_out} steps of"
             raise SpecError(f"action {told} {self.chunk.action_dim} channels; expected some for each channel.")
         self._check_relative()
         for name, table in self.loops.items():
