@@ -31,6 +31,7 @@ NOT_RUN = {
     "python -m lerobot_policy_ttscompile": "the same",
     "ttscompile convert rdt-1b/": "RDT-1B's directory: tests/policies converts a small one",
     "ttscompile convert CogACT-Base/": "CogACT's checkpoint: the same of a small one",
+    "ttscompile convert octo-small-1.5/": "Octo's folder: tests/policies converts small ones",
     "ttscompile convert authors/": "what others' code saved: tests/policies writes the same, and converts it",
     "ttscompile convert hybridvla/": "HybridVLA's checkpoint: tests/policies converts a small one",
     "ttscompile convert claw.pt": "Diffusion BC's weights: the same of small ones",

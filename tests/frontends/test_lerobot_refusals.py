@@ -288,7 +288,7 @@ def test_adapters_and_other_directories(tmp_path: Path) -> None:
         load_checkpoint_policy(empty)
     with pytest.raises(CheckpointError, match="no such directory"):
         load_checkpoint_policy(tmp_path / "nowhere", format="lerobot")
-    with pytest.raises(CheckpointError, match="for LeRobot policies"):
+    with pytest.raises(CheckpointError, match="for LeRobot and Octo policies"):
         load_checkpoint_policy(tmp_path / "policy.ckpt", options=LoadOptions(task="push"))
 
 

@@ -169,7 +169,7 @@ def test_a_damaged_or_hostile_configuration_is_refused(text: str, message: str, 
     ("norms", "message"),
     [
         ({"loc": [0.0], "scale": [1.0] * 5}, r"shapes \(1,\) and \(5,\); expected 5 numbers each"),
-        ({"loc": [0.0] * 5, "scale": [0.0] * 5}, "scale must be a finite vector"),
+        ({"loc": [0.0] * 5, "scale": [0.0] * 5}, "scale must be finite"),
         ({"loc": "a", "scale": 1}, "could not convert string to float"),
         ({}, r"shapes \(\) and \(\)"),
     ],

@@ -140,5 +140,5 @@ def test_more_weights_than_the_machine_can_compile_are_refused(
 
 
 def test_options_of_other_families_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="the option task is for LeRobot policies; this is one of RDT"):
+    with pytest.raises(CheckpointError, match="the option task is for LeRobot and Octo policies; this is one of RDT"):
         load_checkpoint_policy(save_rdt(tmp_path / "rdt"), options=LoadOptions(task="push the block"))

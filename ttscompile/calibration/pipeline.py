@@ -265,12 +265,13 @@ def calibrate(
             takes = np.cumsum([row.takes for row in rows])
             for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
                 _propose(row, proposer, kept, clock.until(float(share)))
-                told[row.name] = "" if row.name in kept.refused else proposer.told
+                told[row.name] = proposer.told
             if not kept.learned:
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
-                bar.warn(f"{f'what was learned of {name}' if name in told else f'plan {name!r}'} is left out: {reason}")
+                what = f"what was learned of {name}" if told.get(name) == "" else f"plan {name!r}"
+                bar.warn(f"{what} is left out: {reason}")
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.plans, kept.scores, kept.default = frontier.plans, frontier.scores, SCHEDULE
@@ -326,7 +327,7 @@ def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock) -> None:
     except StopIteration:
         # A change of a plan that is kept has its name, so that nothing says of the name that the change was refused.
         if reasons and all(reasons) and proposal.name in kept.judged:
-            kept.refused[row.name] = reasons[-1] or ""
+            kept.refused[row.name], proposer.told = reasons[-1] or "", ""
     except CalibrationFailedError as error:
         if not kept.learned:
             raise

@@ -186,10 +186,11 @@ def test_a_head_is_kept_if_it_is_nearer_than_the_schedule_and_its_plans_differ(
     recording, considered = record(tmp_path / "calls.npz", episodes=8), list[tuple[str, bool, Score]]()
     consider = Kept.consider
 
-    def seen(self: Kept, proposal: Proposal) -> bool:
+    def seen(self: Kept, proposal: Proposal) -> str | None:
         score = judge.judge(holding(self.trials, proposal), proposal.plan)
-        considered.append((proposal.name, consider(self, proposal), score))
-        return considered[-1][1]
+        refusal = consider(self, proposal)
+        considered.append((proposal.name, refusal is None, score))
+        return refusal
 
     monkeypatch.setattr(Kept, "consider", seen)
     result = ttscompile.calibrate(
