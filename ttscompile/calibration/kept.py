@@ -9,9 +9,11 @@ import numpy.typing as npt
 from ..artifact.manifest import StartRecord, WeightsRecord
 from ..artifact.stores import BlockWeights
 from ..core.plan import DENSE, FULL, Plan
+from ..errors import CalibrationFailedError
 from ..measure.points import SAME
+from .clock import Clock
 from .judge import Score, further, judge
-from .proposer import Proposal
+from .proposer import Proposal, Proposer
 from .trials import Trials
 
 
@@ -25,7 +27,9 @@ class Kept:
         trials: of the artifact with all that is kept.
         judged: the plans that these scores are of, by name.
         pruner: constants, and the loop whose pruner has them; None where they stay.
-        refused: why plans are left out, by name.
+        refused: why plans, or all that a proposer proposed, are left out, by name.
+        told: by proposer, a sentence on what became of it.
+        shared: by proposer, the fields that it gave to all plans.
         learned: whether any proposal but those ``beside`` was kept.
     """
 
@@ -41,12 +45,48 @@ class Kept:
         self.starts: dict[str, StartRecord] = {}
         self.pruner: tuple[Mapping[str, npt.NDArray[Any]], str] | None = None
         self.refused: dict[str, str] = {}
+        self.told: dict[str, str] = {}
+        self.shared: dict[str, dict[str, Any]] = {}
         self.learned = False
 
     @property
     def plan(self) -> Plan:
         """The best so far."""
         return self.plans[self.default]
+
+    def hear(self, name: str, proposer: Proposer, clock: Clock) -> None:
+        """Judge what a proposer proposes, one plan after the other.
+
+        Raises:
+            CalibrationFailedError: it has nothing to propose, and nobody before it had.
+        """
+        proposals, refusal, held = proposer.propose(self.trials, self.plan, clock), None, False
+        shared = self.shared[name] = {}
+        try:
+            proposal = next(proposals)
+            while True:
+                refusal = self.consider(proposal)
+                if refusal is None:
+                    held = True
+                    shared |= proposal.shared
+                proposal = proposals.send(refusal is None)
+        except StopIteration:
+            # A change of a plan has the plan's name, so that nothing says of the name that the change was refused.
+            if refusal is not None and not held and proposal.name in self.judged:
+                self.refused[name], self.told[name] = refusal, ""
+                return
+        except CalibrationFailedError as error:
+            if not self.learned:
+                raise
+            self.refused[name] = str(error)
+        self.told[name] = proposer.told
+
+    def leave(self, plans: Mapping[str, Plan], scores: Mapping[str, Score], default: str) -> None:
+        """Leave these plans alone, and tell of what was given to all plans that none of these has."""
+        self.plans, self.scores, self.default = dict(plans), dict(scores), default
+        for name, fields in self.shared.items():
+            if fields and not any(getattr(plan, key) == fields[key] for plan in plans.values() for key in fields):
+                self.told[name] += ", and no chosen plan is faster by it"
 
     def consider(self, proposal: Proposal) -> str | None:
         """Judge a proposal on held-out episodes, and keep it if it holds; else why it does not."""

@@ -26,7 +26,7 @@ from .clock import Clock
 from .judge import Score, other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
-from .proposer import LOOPS, TOKENS, Proposer, Request, Row, rows_of
+from .proposer import LOOPS, Request, Row, rows_of
 from .schedule import SCHEDULE, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
@@ -261,22 +261,18 @@ def calibrate(
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": (fewest, limit)}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             _warn(trials, rows, chosen, corrects)
-            kept, told = Kept(trials, anew), dict[str, str]()
+            kept = Kept(trials, anew)
             takes = np.cumsum([row.takes for row in rows])
             for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
-                _propose(row, proposer, kept, clock.until(float(share)))
-                told[row.name] = proposer.told
+                kept.hear(row.name, proposer, clock.until(float(share)))
             if not kept.learned:
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
-                what = f"what was learned of {name}" if told.get(name) == "" else f"plan {name!r}"
-                bar.warn(f"{what} is left out: {reason}")
+                bar.warn(f"{name!r} is left out: {reason}")
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
-                kept.plans, kept.scores, kept.default = frontier.plans, frontier.scores, SCHEDULE
-                if told.get(TOKENS) and not any(plan.tokens for plan in kept.plans.values()):
-                    told[TOKENS] += ", and no chosen plan is faster by it"
+                kept.leave(frontier.plans, frontier.scores, SCHEDULE)
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         chosen_within = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(
@@ -294,7 +290,7 @@ def calibrate(
             stopped=schedule.stopped or ("time limit" if clock.left() < 0 else "finished"),
             seconds=clock.elapsed(),
             budget=chosen_within if chooses else schedule.budget.record(),
-            told=told,
+            told=kept.told,
             frontier=() if frontier is None else frontier.tried,
         )
         if result.stopped == "time limit":
@@ -310,28 +306,6 @@ def calibrate(
         _write(Path(path), artifact, result, kept, anew)
         state.remove()
         return result
-
-
-def _propose(row: Row, proposer: Proposer, kept: Kept, clock: Clock) -> None:
-    """Judge what a proposer proposes, one plan after the other.
-
-    Raises:
-        CalibrationFailedError: it has nothing to propose, and nobody before it had.
-    """
-    proposals, reasons = proposer.propose(kept.trials, kept.plan, clock), list[str | None]()
-    try:
-        proposal = next(proposals)
-        while True:
-            reasons.append(kept.consider(proposal))
-            proposal = proposals.send(reasons[-1] is None)
-    except StopIteration:
-        # A change of a plan that is kept has its name, so that nothing says of the name that the change was refused.
-        if reasons and all(reasons) and proposal.name in kept.judged:
-            kept.refused[row.name], proposer.told = reasons[-1] or "", ""
-    except CalibrationFailedError as error:
-        if not kept.learned:
-            raise
-        kept.refused[row.name] = str(error)
 
 
 def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:

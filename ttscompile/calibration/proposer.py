@@ -172,8 +172,8 @@ class Row:
         return made
 
 
-LOOPS, TOKENS = "loops", "tokens"
-"""The first is the proposer after which the default is chosen among all plans that were kept (``choose``)."""
+LOOPS = "loops"
+"""The proposer after which the default is chosen among all plans that were kept (``choose``)."""
 
 PROPOSERS = (
     Row(
@@ -193,7 +193,7 @@ PROPOSERS = (
     ),
     Row("pruner", "gates for each observation", "calibration.proposers.pruner:Pruner", consecutive=True),
     Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
-    Row(TOKENS, "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
+    Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
     Row("weights", "low-rank updates of later steps' weights", "calibration.proposers.weights:Weights", True, True),
     Row("start", "how many steps a call needs that begins with the chunk before", "calibration.proposers.start:Start"),
 )
