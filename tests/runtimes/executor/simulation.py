@@ -253,3 +253,28 @@ class World:
         self.policy.release()
         self.executor.close(timeout=REAL_LIMIT)
         assert workers() == []
+
+
+def actions_of(
+    policy: Any, settings: ExecutorSettings, hz: float, latency: float, seen: Callable[[int], Any], count: int
+) -> np.ndarray:
+    """So many actions of a loop at the policy's rate, whose calls are said to take so long.
+
+    Args:
+        seen: the observation ``obs`` at each tick.
+    """
+    clock, actions, tick = FakeClock(), list[np.ndarray](), 0
+    executor = AsyncExecutor(policy, hz, settings, clock=clock, latencies={"dense": latency})
+    clock.settle()
+    try:
+        while len(actions) < count:
+            executor.observe({"obs": np.asarray(seen(tick), np.float32)})
+            clock.settle()
+            if executor.ready:
+                actions.append(executor.action())
+            clock.advance(1 / hz)
+            tick += 1
+    finally:
+        clock.free()
+        executor.close()
+    return np.array(actions)

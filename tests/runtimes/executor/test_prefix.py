@@ -23,7 +23,7 @@ from ttscompile.runtimes.executor.settings import resolve
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.table import sampler_table
 
-from .simulation import FakeClock
+from .simulation import actions_of
 
 HZ, HORIZON, LATENCY = 10.0, 12, 0.2
 
@@ -59,23 +59,10 @@ def drive(
     path: Path, ticks: int, latency: float = LATENCY, numbers: int = 2
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
     """Actions of a loop at the policy's rate whose calls are said to take so long, and the calls."""
-    clock, policy = FakeClock(), Recorded(ttscompile.load(path, seed=0))
+    policy, rng = Recorded(ttscompile.load(path, seed=0)), np.random.default_rng(0)
     settings = ExecutorSettings(seam="prefix", n_obs_steps=1)
-    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies={"dense": latency})
-    clock.settle()
-    actions: list[np.ndarray] = []
-    rng = np.random.default_rng(0)
-    try:
-        while len(actions) < ticks:
-            executor.observe({"obs": rng.standard_normal(numbers).astype(np.float32)})
-            clock.settle()
-            if executor.ready:
-                actions.append(executor.action())
-            clock.advance(1 / HZ)
-    finally:
-        clock.free()
-        executor.close()
-    return np.array(actions), policy.calls
+    actions = actions_of(policy, settings, HZ, latency, lambda _: rng.standard_normal(numbers), ticks)
+    return actions, policy.calls
 
 
 @pytest.mark.slow

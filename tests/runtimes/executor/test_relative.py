@@ -12,10 +12,10 @@ from torch import nn
 
 import ttscompile
 from tests.once import Once
-from ttscompile import AsyncExecutor, ChunkSpec, DirectDenoiser, ExecutorSettings, ObservationSpec, PolicySpec
+from ttscompile import ChunkSpec, DirectDenoiser, ExecutorSettings, ObservationSpec, PolicySpec
 from ttscompile.core.spec import Affine, Relative
 
-from .simulation import FakeClock
+from .simulation import actions_of
 
 HZ, HORIZON, EXECUTED, SLOPE = 10.0, 10, 6, 0.25
 SPEC = PolicySpec(
@@ -48,21 +48,8 @@ def compiled(once: Once, relative: bool) -> Path:
 
 def played(path: Path, settings: ExecutorSettings) -> np.ndarray:
     """Actions of a robot that is somewhere else at every tick."""
-    clock, rng, actions = FakeClock(), np.random.default_rng(0), list[np.ndarray]()
-    policy = ttscompile.load(path, seed=0)
-    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies={"dense": 0.2})
-    clock.settle()
-    try:
-        for tick in range(40):
-            executor.observe({"obs": np.array([rng.uniform(-9, 9), tick], np.float32)})
-            clock.settle()
-            if executor.ready:
-                actions.append(executor.action())
-            clock.advance(1 / HZ)
-    finally:
-        clock.free()
-        executor.close()
-    return np.array(actions)[:, 0]
+    rng, policy = np.random.default_rng(0), ttscompile.load(path, seed=0)
+    return actions_of(policy, settings, HZ, 0.2, lambda tick: [rng.uniform(-9, 9), tick], 4 * EXECUTED)[:, 0]
 
 
 @pytest.mark.slow
@@ -77,6 +64,6 @@ def played(path: Path, settings: ExecutorSettings) -> np.ndarray:
 )
 def test_the_actions_do_not_jump_with_the_state(once: Once, settings: ExecutorSettings) -> None:
     found = played(compiled(once, True), settings)
-    assert len(found) > 3 * EXECUTED
+    assert len(found) == 4 * EXECUTED
     np.testing.assert_allclose(np.diff(found), SLOPE, rtol=0, atol=1e-4)
     assert np.abs(np.diff(played(compiled(once, False), settings))).max() > 1, "the state is what would jump"
