@@ -40,6 +40,9 @@ def read_tree(path: Path, most: int | None = None) -> Tree:
 
     Args:
         most: bytes that the file may have; None if the machine's memory decides.
+
+    Raises:
+        CheckpointError: no such file, one that is too large or damaged, or no package msgpack.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file. Copy the directory whole.")
@@ -124,6 +127,9 @@ def for_torch(tree: Mapping[str, Any], where: Path, remedy: str) -> dict[str, Te
     """Weights as torch has them: by the names of flax's modules, kernels as ``weight`` with outputs first.
 
     ``StdConv`` is standardised here, which the original does in every call.
+
+    Raises:
+        CheckpointError: what is no array, or is an array in a file of its own; ``remedy`` says what to do.
     """
     made = {}
     for path, value in leaves(tree):

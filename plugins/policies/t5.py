@@ -36,15 +36,6 @@ class Words:
     buckets: int
 
 
-class _RootMeanSquare(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x * torch.rsqrt(x.square().mean(-1, keepdim=True) + _EPSILON) * self.weight
-
-
 class _WordAttention(nn.Module):
     def __init__(self, words: Words, first: bool) -> None:
         super().__init__()
@@ -65,8 +56,8 @@ class _WordLayer(nn.Module):
         super().__init__()
         self.layer = nn.ModuleList([nn.Module(), nn.Module()])
         attention, feed = self.layer
-        attention.SelfAttention, attention.layer_norm = _WordAttention(words, first), _RootMeanSquare(words.width)
-        feed.DenseReluDense, feed.layer_norm = nn.Module(), _RootMeanSquare(words.width)
+        attention.SelfAttention, attention.layer_norm = _WordAttention(words, first), nn.RMSNorm(words.width, _EPSILON)
+        feed.DenseReluDense, feed.layer_norm = nn.Module(), nn.RMSNorm(words.width, _EPSILON)
         feed.DenseReluDense.wi = nn.Linear(words.width, words.hidden, bias=False)
         feed.DenseReluDense.wo = nn.Linear(words.hidden, words.width, bias=False)
 
@@ -85,7 +76,7 @@ class T5(nn.Module):
         self.shared = nn.Embedding(words.vocabulary, words.width)
         self.encoder = nn.Module()
         self.encoder.block = nn.ModuleList(_WordLayer(words, not i) for i in range(words.layers))
-        self.encoder.final_layer_norm = _RootMeanSquare(words.width)
+        self.encoder.final_layer_norm = nn.RMSNorm(words.width, _EPSILON)
 
     def forward(self, tokens: Tensor, mask: Tensor, distances: Tensor) -> Tensor:
         """``[B, L]``, which of them count, and ``word_distances`` to ``[B, L, E]``."""
