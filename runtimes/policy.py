@@ -210,7 +210,11 @@ class CompiledPolicy:
                 return self._runtime.frames.learn(normalized, stop)
 
     def seen(self) -> tuple[Seen, ...]:
-        """What it sees of each camera of each stream, and which patches it computed last, where tokens are reused."""
+        """What the policy sees of each camera of each stream, and which patches were computed last.
+
+        Returns:
+            A ``Seen`` a camera and stream; nothing after ``reset``, and where no tokens are reused.
+        """
         with self._turn():
             return self._runtime.frames.seen()
 

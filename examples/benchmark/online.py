@@ -148,14 +148,14 @@ def measured(contestants: Contestants, spec: PolicySpec, judged: Judged, rounds:
     answers, count = list(contestants.answers.values()), len(judged.noise.initial)
     errors: list[list[Array]] = [[] for _ in answers]
     cells: list[list[Array]] = [[] for _ in answers]
-    chunk, scale = spec.chunk, 1.0 if spec.chunk.normalizer is None else np.abs(spec.chunk.normalizer.scale)
+    chunk = spec.chunk
     part = (slice(None), slice(chunk.start, chunk.stop), slice(chunk.action_dim))
     for begin in range(0, count, TOGETHER):
         given = judged.calls(range(begin, min(begin + TOGETHER, count)))
         want, _ = contestants.truth(*given)
         for answer, wrong, counted in zip(answers, errors, cells, strict=True):
             found, plans = answer(*given)
-            off = np.abs(found - want).astype(np.float64)[part] / scale
+            off = np.abs(found - want).astype(np.float64)[part] / chunk.scale
             wrong.append(off.mean((1, 2)))
             counted.append((plans == Source.COMPUTE).sum((1, 2)))
     timer = Timer(len(answers), WARM_UP, process_time)  # one thread computes

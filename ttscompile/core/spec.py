@@ -196,8 +196,8 @@ class PolicySpec:
             raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
         scale = np.ones(self.chunk.action_dim) if self.chunk.normalizer is None else self.chunk.normalizer.scale
         if scale.shape not in ((self.chunk.action_dim,), (horizon + self.left_out, self.chunk.action_dim)):
-            told = f"normaliser has {list(scale.shape)} entries for {horizon + self.left_out} steps of"
-            raise SpecError(f"action {told} {self.chunk.action_dim} channels; expected some for each channel.")
+            expected = f"[{self.chunk.action_dim}], or a row for each of {horizon + self.left_out} steps"
+            raise SpecError(f"action normaliser: expected {expected}; found shape {list(scale.shape)}.")
         self._check_relative()
         for name, table in self.loops.items():
             if not isinstance(name, str) or name == ORIGINAL or not LOOP_NAME.holds(name):
@@ -211,10 +211,11 @@ class PolicySpec:
     def _check_relative(self) -> None:
         if (relative := self.chunk.relative) is None:
             return
-        seen, width = self.observations.get(relative.key), 1 + max(n or 0 for n in relative.entries)
-        shape = () if seen is None else seen.shape[bool(seen.frames) :]
-        if seen is None or seen.dtype != "float32" or len(shape) != 1 or shape[0] < width:
-            told = f"float32 [{width}] or more; found {seen and seen.dtype} {list(shape)}"
+        if (seen := self.observations.get(relative.key)) is None:
+            raise SpecError(f"actions are relative to {relative.key!r}, which is none of {sorted(self.observations)}.")
+        shape, width = seen.shape[bool(seen.frames) :], 1 + max(n or 0 for n in relative.entries)
+        if seen.dtype != "float32" or len(shape) != 1 or shape[0] < width:
+            told = f"float32 [N] with N of {width} at least; found {seen.dtype} {list(shape)}"
             raise SpecError(f"actions are relative to observation {relative.key!r}: expected {told}.")
 
     @property
@@ -229,9 +230,10 @@ class PolicySpec:
 
     def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
         """``ChunkSpec.reference`` of observations as the network is given them."""
-        key = "" if self.chunk.relative is None else self.chunk.relative.key
-        own = self.observations[key].normalizer if key else None
-        return self.chunk.reference(obs if own is None else {key: own.unnormalize(obs[key])})
+        if (relative := self.chunk.relative) is None:
+            return None
+        seen, own = obs[relative.key], self.observations[relative.key].normalizer
+        return self.chunk.reference({relative.key: seen if own is None else own.unnormalize(seen)})
 
     @property
     def arguments(self) -> Mapping[str, str]:

@@ -49,6 +49,7 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
 
 
 def _judged(key: str, one: Statistics) -> Finding:
+    # Of a chunk's steps the last, whose actions are the furthest from the state that they are relative to.
     first, second = (each[-1] if each.ndim == 2 else each.flatten() for each in (one.first, one.second))
     (of, width, place, size) = ("range", second - first, -1, 2)
     if one.mode == "MEAN_STD":

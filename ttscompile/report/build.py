@@ -154,11 +154,9 @@ def _episode(course: Course) -> Section:
     drawn = [Picture(pictures.sparsity_picture(course), caption, alt)]
     if course.seen:
         computed, of = course.tokens
-        caption = f"{computed} of {of} tokens of the image encoders were computed, {share(computed / of)}. A row is a"
-        caption += (
-            " camera. In colour: the patches whose tokens were computed in this call. Pale: those that were kept."
-        )
-        drawn.append(Picture(pictures.seen_picture(course), caption))
+        counts = f"{computed} of {of} tokens of the image encoders were computed, {share(computed / of)}."
+        key = "A row is a camera. In colour: patches whose tokens were computed in this call. Pale: those kept."
+        drawn.append(Picture(pictures.seen_picture(course), f"{counts} {key}"))
     return Section("Episode", (text,), pictures=tuple(drawn))
 
 
