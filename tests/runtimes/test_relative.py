@@ -215,10 +215,7 @@ def test_it_is_written_where_there_is_some_and_read_strictly() -> None:
         (lambda: Relative("obs", (1,)), r"relative has \(1,\); expected 2 entries"),
         (lambda: Relative("obs", (1, -1)), "an entry of relative"),
         (lambda: Relative("obs", (None, 1)), r"relative has \(None, 1\); .* None for \[1\]"),
-        (
-            lambda: Relative("obs", (2, None)),
-            r"'obs': expected float32 \[N\] with N of 3 at least; found float32",
-        ),
+        (lambda: Relative("obs", (2, None)), r"'obs': expected float32 \[N\] with N of 3 at least; found float32"),
         (lambda: Relative("other", (0, None)), r"relative to 'other', which is none of \['obs'\]"),
     ],
 )
