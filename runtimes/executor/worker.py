@@ -219,12 +219,14 @@ class Worker:
             raise ExecutorError(f"the policy's action_pred has shape {list(predicted.shape)}; expected {expected}.")
         actions: npt.NDArray[np.float32] = predicted[0, settings.first : last].astype(np.float32)
         report = getattr(self._policy, "last_report", None)
+        far = bool(getattr(report, "far", False))
         with self.lock:
             now = self._clock.now()
-            outcome = self._opened.finish(job, actions, now, getattr(report, "far", False))
+            outcome = self._opened.finish(job, actions, now, far)
             self.news.notify_all()
         if self._trace.on:
-            args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome} | ({"stalled": True} if job.stalled else {})
+            args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
+            args |= {name: True for name, so in {"stalled": job.stalled, "outside": far}.items() if so}
             if self._seeing and report is not None:
                 frames = report.frames
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}

@@ -11,6 +11,7 @@ import torch
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.compare import compare
 from ttscompile.calibration.regression import envelope_of
 from ttscompile.core.envelope import FAR
 from ttscompile.trajectories import load_trajectories
@@ -63,6 +64,10 @@ def test_an_artifact_knows_what_it_was_calibrated_on(compiled: Path, recording: 
         policy.predict_action({"obs": times * recorded})
         report = policy.last_report
         assert report is not None and report.far == far == (report.outside[0] > FAR)
+    points = {one.name: one for one in compare(folder, [recording], calls=4).points}
+    half, most, furthest = points["schedule"].outside
+    assert 0 < half <= most <= furthest < FAR, "held-out calls of the same recording"
+    assert points["dense"].outside == (), "it has no correction, and nothing is said of it"
     with np.load(recording) as known:
         nearer = {name: np.float32(0.3) * known[name] if name == "obs" else known[name] for name in known.files}
     np.savez(tmp_path / "nearer.npz", **nearer)

@@ -131,6 +131,7 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
             latency_ms=took.median,
             quartiles_ms=took.quartiles,
             sparsity=score.sparsity,
+            outside=score.outside,
             flops=(1 - score.flops_saved) * one.trials.artifact.manifest.flops.dense,
             **_apart(one.trials, score),
         )

@@ -60,6 +60,7 @@ class Score:
         flops_saved: share of the FLOPs of a dense call of the original that are saved; all that is computed is counted.
         plans: how many different matrices of cells the calls had.
         tokens: share of the tokens of new frames that were computed; 1 where no tokens are reused.
+        outside: see ``MeasuredPoint``.
         gaps: mean h of each episode, and the mean over all episodes of |y_i - y_j|, that the others are of: what
             ``further`` compares.
         answers: what it executes, normalised, ``[N, R, Ta, Da]``.
@@ -74,12 +75,14 @@ class Score:
     flops_saved: float
     plans: int
     tokens: float = 1.0
+    outside: tuple[float, ...] = ()
     gaps: tuple[tuple[float, ...], float] = ((), 0.0)
     answers: Numbers | None = field(default=None, compare=False, repr=False)
 
     def record(self) -> dict[str, Any]:
         """As JSON, for the record of a calibration; the same on every machine."""
-        return {name: one for name, one in vars(self).items() if one is not None and name not in ("gaps", "answers")}
+        left = "outside", "gaps", "answers"
+        return {name: one for name, one in vars(self).items() if one is not None and name not in left}
 
 
 def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
@@ -274,6 +277,7 @@ def _scored(
     cells = np.stack([report.plan[i] for report, i in reports])
     frames = [report.frames for report, _ in reports]
     of = sum(one.of for one in frames)
+    outside = [report.outside[i] for report, i in reports if report.outside]
     block_flops = cells.shape[1] * sum(flops.blocks)
     computed = float(np.mean([plan_flops(one, flops.blocks) for one in cells]))
     return Score(
@@ -286,6 +290,7 @@ def _scored(
         flops_saved=1 - float(np.mean([report.flops[i] for report, i in reports])) / flops.dense,
         plans=len(np.unique(cells, axis=0)),
         tokens=sum(one.tokens for one in frames) / of if of else 1.0,
+        outside=tuple(np.quantile(outside, (0.5, 0.9, 1.0)).tolist()) if outside else (),
         gaps=(tuple(gaps.tolist()), float(apart.mean())),
         answers=x.reshape(*x.shape[:2], -1, spec.chunk.action_dim),
     )

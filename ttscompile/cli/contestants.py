@@ -15,6 +15,7 @@ from ttscompile.artifact.view import view_of
 from ttscompile.calibration.progress import Bar
 from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress, say, table
 from ttscompile.cli.sections import Recordings
+from ttscompile.core.envelope import FAR
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import ArtifactChangedError, SpecError, needing
@@ -244,11 +245,12 @@ def print_comparison(found: Comparison, output: Console) -> None:
             "yes" if p in efficient else "",
         )
     output.print(made)
-    apart = table("", "plan", "distance by number of the action", "error", "furthest calls")
+    apart = table("", "plan", "distance by number of the action", "error", "furthest calls", "outside")
     for p in found.points:
         calls = (f"episode {one.episode}, call {one.call}: {one.distance:.2f}" for one in p.furthest)
-        numbers = (", ".join(f"{one:.3g}" for one in each) for each in (p.by_number, p.errors))
-        apart.add_row(p.series, p.name, *numbers, "; ".join(calls))
+        numbers = (", ".join(f"{one:.3g}" for one in each) for each in (p.by_number, p.errors, p.outside))
+        by_number, errors, outside = numbers
+        apart.add_row(p.series, p.name, by_number, errors, "; ".join(calls), outside)
     output.print(apart)
     say(
         output,
@@ -256,6 +258,8 @@ def print_comparison(found: Comparison, output: Console) -> None:
         f" changes; 0 is the same. {found.calls} observations of episodes that no strategy here learned from, each with"
         " several draws of noise. Error: with the same noise, in the units of the actions, in which two calls of the"
         f" original are {found.other_noise:.4g} apart; another sampler takes other noise, and has none. Latency:"
-        f" medians, one stream, {_threads(found)}. Frontier: no other plan is faster and nearer.",
+        f" medians, one stream, {_threads(found)}. Frontier: no other plan is faster and nearer. Outside: how far"
+        " half, nine tenths and all of these observations are at most from those that were recorded for calibration, of"
+        f" which the furthest has 1; above {FAR:g} a call has no correction.",
     )
     say(output, *(f"{name}: left out: {reason}" for name, reason in found.skipped.items()))

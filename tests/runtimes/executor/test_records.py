@@ -167,6 +167,9 @@ def test_calls_far_outside_of_what_was_recorded_are_counted() -> None:
         for _ in range(60):
             world.tick()
         counted = world.executor.statistics()
+        events = world.executor.trace.to_json()["traceEvents"]
     assert counted.calls == len(world.policy.calls) > 6
     assert counted.calls_outside == counted.calls // 3
     assert counted.to_json()["calls_outside"] == counted.calls_outside
+    marked = [event["args"].get("outside", False) for event in events if event["name"] == "inference"]
+    assert marked == [number % 3 == 0 for number in range(1, counted.calls + 1)]
