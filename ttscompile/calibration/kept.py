@@ -27,7 +27,7 @@ class Kept:
         trials: of the artifact with all that is kept.
         judged: the plans that these scores are of, by name.
         pruner: constants, and the loop whose pruner has them; None where they stay.
-        refused: why plans, or all that a proposer proposed, are left out, by name.
+        refused: why plans, or all that a proposer proposed, are left out, by name; begins with a verb.
         told: by proposer, a sentence on what became of it.
         shared: by proposer, the fields that it gave to all plans.
         learned: whether any proposal but those ``beside`` was kept.
@@ -78,7 +78,7 @@ class Kept:
         except CalibrationFailedError as error:
             if not self.learned:
                 raise
-            self.refused[name] = str(error)
+            self.refused[name] = f"has nothing to propose: {error}"
         self.told[name] = proposer.told
 
     def leave(self, plans: Mapping[str, Plan], scores: Mapping[str, Score], default: str) -> None:

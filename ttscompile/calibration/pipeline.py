@@ -269,7 +269,7 @@ def calibrate(
                 why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
-                bar.warn(f"plan {name!r} is left out: {reason}")
+                bar.warn(f"plan {name!r} is left out: it {reason}")
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.leave(frontier.plans, frontier.scores, SCHEDULE)

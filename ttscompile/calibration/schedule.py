@@ -249,4 +249,4 @@ def one_plan(score: Score, intervals: int) -> str | None:
 def _no_safer(score: Score, others: Mapping[str, Score]) -> str | None:
     if score.distance < others[SCHEDULE].distance:
         return None
-    return f"{score.distance:.4g} from the original, no safer than {SCHEDULE}: its search was cut short"
+    return f"is {score.distance:.4g} from the original, no safer than {SCHEDULE}: its search was cut short"

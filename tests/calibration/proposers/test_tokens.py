@@ -101,7 +101,7 @@ def test_what_does_not_hold_on_other_episodes_is_told(
     files = recorded(tmp_path / "calls.npz")
     result = calibrate(folder, files, learn=("loops", "tokens"), max_minutes=1, max_distance=0.9)
     assert result.told["tokens"] == "" and result.skipped["tokens"] == "is no better."
-    assert "'tokens' is left out: is no better." in " ".join(capsys.readouterr().err.split())
+    assert "'tokens' is left out: it is no better." in " ".join(capsys.readouterr().err.split())
     assert not any(plan.tokens for plan in load_artifact(folder).plans.values())
 
 

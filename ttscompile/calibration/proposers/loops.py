@@ -99,13 +99,14 @@ class Loops(Proposer):
             share = clock.left() * weights[0] / sum(weights)
             own = self._opened(trials, loop, share)
             yield from self._of_loop(own, loop, _ending(clock, share), costs[loop], wanted)
-        best, found = self._best or self._nearest, "fastest that is near enough" if self._best else "nearest"
+        best = self._best or self._nearest
+        found = "computes the least of those that are near enough" if self._best else "is the nearest"
         if best is None:
             raise CalibrationFailedError(self._none())
         yield best
         left = f"left out: {', '.join(self._left_out)}" if self._left_out else ""
         more = self._tasks[best.name].whole.told_of_episodes(best.notes["steps"])
-        self.told = "; ".join(filter(None, (f"{best.name} is the {found}", left, more)))
+        self.told = "; ".join(filter(None, (f"{best.name} {found}", left, more)))
 
     def _by_distance(self, trials: Trials, costs: Mapping[str, Cost]) -> tuple[list[str], list[str]]:
         """Other loops than the original's that may give the default, and those that may give ``fast``; cheapest first.

@@ -68,7 +68,7 @@ class Tokens(Proposer):
 def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:
     if score.tokens <= MOST_COMPUTED:
         return None
-    return f"{score.tokens:.0%} of the tokens would be computed all the same"
+    return f"would compute {score.tokens:.0%} of the tokens all the same"
 
 
 def _refused(why: str) -> CalibrationFailedError:
