@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 import evaluate
@@ -130,6 +131,29 @@ def test_the_picture_is_of_now(environment: Environment) -> None:
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
     assert (first != earlier).any()
+
+
+@pytest.mark.skipif(missing("fetch-blocks") is not None, reason="NO TEST OF FETCH-BLOCKS: no gymnasium_robotics")
+def test_in_a_long_episode_instructions_follow_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second one is followed in its third step; the hand stays where it is, and the blocks do not."""
+    environment: Any = environment_class("fetch-blocks:long")()
+    monkeypatch.setattr(environment, "_solved", lambda: environment._given % 2 == 0 and environment._steps == 3)
+    environment.reset(1)
+    began, told, steps = [], {environment.instruction}, 0
+    while not environment.done:
+        given, grip, blocks = environment._given, environment.grip, [environment.block(number) for number in range(3)]
+        environment.step(environment.rest())
+        steps += 1
+        if environment._given > given:
+            began.append(steps)
+            told.add(environment.instruction)
+            assert np.linalg.norm(environment.grip - grip) < 0.01
+            now = [environment.block(number) for number in range(3)]
+            assert all(np.linalg.norm(one - other) > 1e-3 for one, other in zip(now, blocks, strict=True))
+            assert min(np.linalg.norm(one[:2] - environment.grip[:2]) for one in now) > 0.09
+    assert np.diff([0, *began, steps]).tolist() == [60, 3] * 5
+    assert len(told) > 5 and not environment.success
+    assert (environment.score, environment.measures) == (0.5, {"followed": 5.0})
 
 
 @pytest.mark.slow

@@ -225,22 +225,31 @@ class FetchBlocks:
         data = self._data
         mujoco.mj_resetData(self._model, data)
         data.qpos[:] = self._start
-        places: list[FloatArray] = []
-        while len(places) < len(self._blocks):
-            place = random.uniform((1.2, 0.6), (1.42, 0.9))
-            if all(np.linalg.norm(place - other) > 0.09 for other in places):
-                places.append(place)
-        for block, place in zip(self._blocks, places, strict=True):
-            data.qpos[block : block + 7] = (*place, TABLE + HALF, 1.0, 0.0, 0.0, 0.0)
+        self._place(random)
         data.mocap_pos[0] = self._middle
         data.mocap_quat[0] = _POINTING_DOWN
         mujoco.mj_forward(self._model, data)
         self._move(random.uniform((-0.1, -0.12, -0.06), (0.08, 0.12, 0.06)), 1.0, 60)
         self.task = TASKS[seed % len(TASKS)] if task is None else task
-        self.instruction = instruction(self.task, _number(seed), self.phrasings)
-        self._asked = list(COLOURS).index(self.task.split()[-1])
+        self._ask(self.task, _number(seed))
+        self.score = 0.0
+
+    def _place(self, random: np.random.Generator, *taken: FloatArray) -> None:
+        """Put the blocks on the table, apart from each other and from the places ``[2]`` that are taken."""
+        places = list(taken)
+        while len(places) < len(taken) + len(self._blocks):
+            place = random.uniform((1.2, 0.6), (1.42, 0.9))
+            if all(np.linalg.norm(place - other) > 0.09 for other in places):
+                places.append(place)
+        for block, place in zip(self._blocks, places[len(taken) :], strict=True):
+            self._data.qpos[block : block + 7] = (*place, TABLE + HALF, 1.0, 0.0, 0.0, 0.0)
+
+    def _ask(self, task: str, number: int) -> None:
+        """From here on this is to be done, in the phrasing of this number."""
+        self._doing, self.instruction = task, instruction(task, number, self.phrasings)
+        self._asked = list(COLOURS).index(task.split()[-1])
         self._was = self.block(self._asked)
-        self._steps, self.done, self.success, self.score = 0, False, False, 0.0
+        self._steps, self.done, self.success = 0, False, False
 
     def _move(self, displacement: FloatArray, opening: float, substeps: int) -> None:
         data = self._data
@@ -294,11 +303,11 @@ class FetchBlocks:
 
     def _solved(self) -> bool:
         now = self.block(self._asked)
-        if self.task.startswith("touch"):
+        if self._doing.startswith("touch"):
             return float(np.linalg.norm(self.grip - now - (0.0, 0.0, HALF))) < 0.03
-        if self.task.startswith("lift"):
+        if self._doing.startswith("lift"):
             return bool(now[2] - self._was[2] > LIFTED)
-        sign = 1.0 if "left" in self.task else -1.0
+        sign = 1.0 if "left" in self._doing else -1.0
         return bool(sign * (now[1] - self._was[1]) > PUSHED)
 
     def rest(self) -> Array:

@@ -1,4 +1,4 @@
-"""Fetch with blocks: other words, other light, cameras that fail, and a world that changes within an episode."""
+"""Fetch with blocks: other words, other light, cameras that fail, a world that changes, and long episodes."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ CHANGES, MOVES, LONGER = 16, 12, 100
 """Steps after which the instruction changes, and the block is moved; and after which such an episode ends."""
 MOVED = 0.06
 """Metres that the block is moved."""
+INSTRUCTIONS = 10
+"""One after the other, in a long episode."""
 
 
 class Unseen(FetchBlocks):
@@ -180,6 +182,37 @@ class Moved(Seeded):
         self._was = self.block(self._asked)
 
 
+class Long(FetchBlocks):
+    """Ten instructions, one after the other; the score is the share that was followed.
+
+    Where one was followed, or as many steps as an episode has were in vain, the blocks are put elsewhere, away from the
+    hand, and the next one is given. Nobody resets the policy, and the hand goes on from where it is.
+    """
+
+    title, max_steps = f"Fetch with blocks, {INSTRUCTIONS} instructions in a row", INSTRUCTIONS * FetchBlocks.max_steps
+
+    def reset(self, seed: int, task: str | None = None, scene: int | None = None) -> None:
+        """Start the episode of this seed, which decides the later places and instructions, too."""
+        super().reset(seed, task, scene)
+        self._later = np.random.default_rng((seed, 2))
+        self.task = ""  # none is the episode's
+        self._given, self._followed, self.measures = 1, 0, {"followed": 0.0}
+
+    def step(self, action: Array) -> None:
+        """Move for 0.04 s."""
+        super().step(action)
+        over = self.success or self._steps == FetchBlocks.max_steps
+        self._followed += self.success
+        self.score, self.measures = self._followed / INSTRUCTIONS, {"followed": float(self._followed)}
+        self.done, self.success = over and self._given == INSTRUCTIONS, self._followed == INSTRUCTIONS
+        if over and not self.done:
+            self._given += 1
+            self._place(self._later, self.grip[:2])
+            self._data.qvel[:] = 0.0
+            mujoco.mj_forward(self._model, self._data)
+            self._ask(str(self._later.choice(TASKS)), int(self._later.integers(100)))
+
+
 def other(task: str) -> str:
     """A task of another kind, with a block of another colour."""
     return TASKS[(TASKS.index(task) + 4) % len(TASKS)]
@@ -193,6 +226,7 @@ DISTURBED: dict[str, type[FetchBlocks]] = {
     "noisy": Noisy,
     "shaken": Shaken,
     "late": Late,
+    "long": Long,
     "changed": Changed,
     "moved": Moved,
 }
