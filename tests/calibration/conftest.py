@@ -11,17 +11,26 @@ import pytest
 
 import ttscompile
 from tests.once import Once
-from ttscompile.calibration import tts
+from ttscompile.calibration import regression, tts
 
 from . import policies, tasks
+
+EPOCHS = regression.EPOCHS
 
 
 @pytest.fixture(autouse=True, scope="package")
 def _short_search() -> Iterator[None]:
-    """Intervals of all phases, and few of them."""
+    """Intervals of all phases, and few of them; networks of corrections learn for a while."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tts, "DISTANCES", (1,))
+        patch.setattr(regression, "EPOCHS", 10)
         yield
+
+
+@pytest.fixture
+def long_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks of corrections learn as long as they do outside these tests."""
+    monkeypatch.setattr(regression, "EPOCHS", EPOCHS)
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,8 @@ from ttscompile.errors import CalibrationError
 from . import tasks
 from .tasks import MakeTask
 
+pytestmark = pytest.mark.usefixtures("long_training")
+
 
 @pytest.fixture
 def plan(compiled: Path) -> PlanArray:

@@ -16,6 +16,8 @@ from ttscompile.runtimes.reference.sampler import through
 
 from .tasks import MakeTask
 
+pytestmark = pytest.mark.usefixtures("long_training")
+
 
 def drawn(calls: int, noise: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Eight numbers that are read, neither centred nor scaled, and two that are not linear in them."""
