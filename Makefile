@@ -17,6 +17,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
+# Where it is set, every process that a test starts compiles the sources anew.
+unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo quick test lint types pytest together alone test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot test-openpi clean
 
 demo: $(READY)
