@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+import logging
 import re
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -50,6 +51,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if importlib.util.find_spec("torch") is not None:
         import torch
 
+        # Torch would look up Python's stack for each line of this log, which nobody reads.
+        logging.getLogger("torch.__trace").handlers.clear()
         torch.set_num_threads(1)
         torch.set_warn_always(True)  # a warning that is given once is an error of whichever test comes first
 

@@ -5,6 +5,7 @@
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -141,26 +142,29 @@ def fill(shapes: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tenso
 
     Masks, grids, counters and temperatures keep their values. Scales are such that every block matters.
     """
-    filled = {}
-    for name, value in shapes.items():
-        kept = ("mask", "pos_x", "pos_y", "num_batches_tracked", "temperature", "_dummy_variable")
-        if name.endswith(kept):
-            filled[name] = value
-            continue
-        # numpy's legacy generator: its numbers are frozen for all versions.
-        rng = np.random.RandomState(sum(ord(c) * (i + 1) for i, c in enumerate(name)) + seed)
-        drawn = rng.uniform(-1, 1, tuple(value.shape)).astype(np.float32)
-        if name.endswith("running_var"):
-            drawn = 1.0 + 0.5 * drawn
-        elif value.ndim == 1 and name.endswith("weight"):
-            drawn = 1.0 + 0.4 * drawn
-        elif value.ndim == 1:
-            drawn = 0.2 * drawn
-        else:
-            gain = 5.0 if "pool." in name or "nets.1.nets" in name else 2.0  # keypoints that move
-            drawn = drawn * gain / math.sqrt(max(math.prod(value.shape[1:]), 1))
-        filled[name] = torch.from_numpy(drawn.astype(np.float32))
-    return filled
+    kept = ("mask", "pos_x", "pos_y", "num_batches_tracked", "temperature", "_dummy_variable")
+    return {
+        name: value if name.endswith(kept) else torch.from_numpy(drawn(name, tuple(value.shape), seed).copy())
+        for name, value in shapes.items()
+    }
+
+
+@lru_cache(maxsize=4096)
+def drawn(name: str, shape: tuple[int, ...], seed: int) -> npt.NDArray[np.float32]:
+    """The same numbers again and again, where each test of a file fills the network that all of them are about."""
+    # numpy's legacy generator: its numbers are frozen for all versions.
+    rng = np.random.RandomState(sum(ord(c) * (i + 1) for i, c in enumerate(name)) + seed)
+    numbers = rng.uniform(-1, 1, shape).astype(np.float32)
+    if name.endswith("running_var"):
+        numbers = 1.0 + 0.5 * numbers
+    elif len(shape) == 1 and name.endswith("weight"):
+        numbers = 1.0 + 0.4 * numbers
+    elif len(shape) == 1:
+        numbers = 0.2 * numbers
+    else:
+        gain = 5.0 if "pool." in name or "nets.1.nets" in name else 2.0  # keypoints that move
+        numbers = numbers * gain / math.sqrt(max(math.prod(shape[1:]), 1))
+    return np.asarray(numbers, np.float32)
 
 
 def normalizer(variant: str) -> dict[str, torch.Tensor]:
