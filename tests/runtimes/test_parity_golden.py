@@ -29,7 +29,7 @@ from .plans import random_plan
 pytestmark = pytest.mark.slow
 
 CHECKPOINTS = ("bert", "ddim8", "inpainting", "mlp_encoder_causal", "transformer_encoder_causal")
-EPISODES = ("timestep_95", "mixed_95", "mixed_80")
+EPISODES = ("timestep_95", "mixed_95", pytest.param("mixed_80", marks=pytest.mark.soak))
 FAMILIES = {
     "pusht_dpt": "Diffusion Policy, low-dimensional transformer",
     "transformer_encoder_causal": "the same, with a transformer as condition encoder",

@@ -107,7 +107,9 @@ def test_episodes_of_its_plans(tmp_path: Path, name: str, streams: int) -> None:
     assert len(plans) > 4 * streams
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.soak) if name == "plain" else name for name in VARIANTS]
+)  # ``exported`` is the plain one
 def test_exported_it_computes_the_same(tmp_path: Path, name: str) -> None:
     """For two streams, whose plans differ."""
     program = variant(name)
