@@ -126,7 +126,7 @@ def check_prefix(
     """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, normalised: a copy of the caller's.
 
     Args:
-        reference: what is added to the actions of the call, ``ChunkSpec.reference``.
+        reference: what the actions of the call are relative to, ``ChunkSpec.reference``.
 
     Raises:
         ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
@@ -146,8 +146,9 @@ def check_prefix(
         raise ObservationError(f"{told}. Give no more, or call earlier, so that fewer are executed meanwhile.")
     if shape[1] and refusal is not None:
         raise ObservationError(f"the policy takes no prefix: {refusal} Call it without one.")
-    own: FloatArray = array.copy()
-    own, told = (own, "prefix") if reference is None else (own - reference, "prefix, less the observation,")
+    own, told = array.copy(), "prefix"
+    if (relative := spec.chunk.relative) is not None:
+        own, told = relative.absolute(own, reference, inverse=True), "prefix, less the observation,"
     remedy, normalizer = "Only actions that can be executed can be committed.", spec.chunk.normalizer
     rows = None if normalizer is None else normalizer.at(slice(spec.chunk.start, spec.chunk.start + shape[1]))
     check_numbers(own, rows, told, remedy, ObservationError)

@@ -107,7 +107,7 @@ class Runtime:
         self._dropped: BoolArray | None = None  # computed in this episode, and not kept
         self.streams: int | None = None
         self._chunk: FloatArray | None = None  # denoised sample of the last call of the episode
-        self._reference: FloatArray | None = None  # what was added to its actions
+        self._reference: FloatArray | None = None  # what its actions are relative to
         self._executed: int | None = None  # steps of it; None for all of ``action``
 
     def view(self, plan: Plan) -> View:
@@ -199,7 +199,7 @@ class Runtime:
         noise = check_noise(noise, streams, self.noise_spec(plan))
         reference = spec.reference(obs)
         if view.start is not None and self._chunk is not None:
-            change = None if reference is None or self._reference is None else self._reference - reference
+            change = None if reference is None or self._reference is None else (self._reference, reference)
             noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed, change)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         obs = {**obs, **spec.committed(streams, 0 if known is None else known.values.shape[2])}

@@ -68,11 +68,12 @@ def measure_latencies(policy: Policy, clock: Clock, settings: Resolved) -> dict[
     """
     plans = settings.plans
     obs, known = some_observation(policy.info.observation), {}
-    if settings.seam == "prefix":  # one action that the normaliser maps to 0
+    if settings.seam == "prefix":  # one action that the normaliser maps to 0, with poses as they are measured
         chunk = policy.info.action
-        known["prefix"] = chunk.unnormalized(
-            np.zeros((1, 1, chunk.action_dim), np.float32), chunk.reference(obs), chunk.start
-        )
+        reference = chunk.reference(obs)
+        known["prefix"] = chunk.unnormalized(np.zeros((1, 1, chunk.action_dim), np.float32), reference, chunk.start)
+        for pose in () if chunk.relative is None else chunk.relative.poses:
+            known["prefix"][..., pose.numbers] = reference[..., pose.numbers]
     forget: Callable[[], object] = getattr(policy, "forget_frames", lambda: None)  # a call may have to compute them all
     timer = Timer(len(plans), settings.warm_up, clock.now)
     for _ in range(settings.warm_up + settings.measured_calls):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ttscompile.core.coercion import integer
+from ttscompile.core.poses import has_rotation, upright
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
@@ -19,6 +20,7 @@ from .window import FrameSpec
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from ttscompile.core.poses import Pose
     from ttscompile.core.spec import FloatArray, Switch
     from ttscompile.runtimes.frames import FrameWork
     from ttscompile.runtimes.info import PolicyInfo
@@ -189,6 +191,7 @@ class Resolved(ExecutorSettings):
         stall: when the policy has stopped moving; None if nobody looks.
         trained_prefix: see ``PolicyInfo``; 0 where the seam is not ``prefix``.
         switches: numbers of an action that have two values alone.
+        poses: nine numbers of an action each, of which six are a rotation.
     """
 
     policy_hz: float
@@ -204,10 +207,21 @@ class Resolved(ExecutorSettings):
     stall: StallRule | None
     trained_prefix: int
     switches: tuple[Switch, ...]
+    poses: tuple[Pose, ...]
 
-    def switched(self, row: FloatArray) -> FloatArray:
-        """An action with the nearer of two values where it has no other: a seam or ``linear`` may be between them."""
+    def possible(self, row: FloatArray, before: FloatArray | None) -> FloatArray:
+        """An action with the nearer of two values where it has no other: a seam or ``linear`` may be between them.
+
+        And with rotations, of which these and a guard's limits may make numbers that are none. Of two that are opposite
+        nothing is between: that of the action before stands.
+        """
         row = row.copy()
+        for pose in self.poses:
+            own = row[pose.numbers]
+            if has_rotation(own):
+                row[pose.numbers] = upright(own)
+            elif before is not None:
+                own[3:] = before[pose.numbers][3:]
         for one in self.switches:
             row[one.channel] = min(one.below, one.above, key=lambda value: abs(value - row[one.channel]))
         return row
@@ -248,6 +262,11 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     if max(settings.displacements, default=0) >= chunk.action_dim:
         have = f"actions have {chunk.action_dim} channels, 0 to {chunk.action_dim - 1}"
         raise ExecutorError(f"displacements = {settings.displacements}: {have}. Name the channels among these.")
+    poses = () if chunk.relative is None else chunk.relative.poses
+    of_poses = {n for pose in poses for n in range(chunk.action_dim)[pose.numbers]}
+    if clash := sorted(of_poses.intersection(settings.displacements)):
+        where = "are numbers of poses, which say where to be, and not how far to move. Leave them out"
+        raise ExecutorError(f"displacements = {settings.displacements}: {clash} {where}.")
     stall = None
     if settings.stall_after is not None:
         reach = np.float32(settings.stall_range) / np.atleast_2d(chunk.scale).max(0)
@@ -273,5 +292,6 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         "stall": stall,
         "trained_prefix": info.trained_prefix if settings.seam == "prefix" else 0,
         "switches": chunk.switches,
+        "poses": poses,
     }
     return Resolved(**{**vars(settings), **found})

@@ -135,7 +135,7 @@ class ExecutorState:
         row = None if timeline is None else timeline.at(tick)
         if row is None or timeline is None:
             return None
-        row = self._settings.switched(row)
+        row = self._settings.possible(row, None if last is None else last[1])
         late = tick >= schedule.due
         if late:
             recorder.counts.reserve += 1

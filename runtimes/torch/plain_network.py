@@ -261,7 +261,7 @@ class CallModule(nn.Module):
         if (relative := chunk.relative) is not None:
             seen = obs[relative.key]
             newest = nn.functional.pad(seen.reshape(len(seen), -1, seen.shape[-1])[:, -1:], (0, 1))
-            actions = actions + newest[..., relative.places(seen.shape[-1])]
+            actions = relative.absolute(actions, newest[..., relative.places(seen.shape[-1])], torch)
         for one in chunk.switches:
             value = torch.where(own[..., [one.channel]] >= one.threshold, one.above, one.below)
             at = torch.arange(chunk.action_dim, device=own.device) == one.channel

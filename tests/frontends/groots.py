@@ -21,12 +21,12 @@ SIZES = ((24, 24), (40, 30))
 """Height and width of the images of each call."""
 SAVED = Path(__file__).parent / "golden" / "lerobot_groot"
 BASE, BACKBONE, SHAPES = "gr00t-tiny", "Cosmos-Reason2-2B", "shapes.json"
-STATE_DIM, ACTION_DIM, PADDED, HORIZON = 4, 5, 7, 6
+STATE_DIM, ACTION_DIM, STATE_PADDED, PADDED, HORIZON = 4, 5, 6, 7, 6
 
 
-def save(kind: str, folder: Path) -> Path:
+def save(kind: str, folder: Path, saved: Path = SAVED) -> Path:
     """A policy and, beside it, the files of its base and backbone. Returns the policy's directory."""
-    shutil.copytree(SAVED / kind, folder, dirs_exist_ok=True)
+    shutil.copytree(saved / kind, folder, dirs_exist_ok=True)
     shapes = json.loads((folder / "policy" / SHAPES).read_text())
     (folder / "policy" / SHAPES).unlink()
     save_file(weights(shapes), folder / "policy" / "model.safetensors")

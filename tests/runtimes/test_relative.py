@@ -149,7 +149,7 @@ def test_a_chunk_that_is_moved_holds_the_same_actions(rows: bool) -> None:
     sample = rng.standard_normal((2, 3, 2)).astype(np.float32)
     old, new = (chunk.reference({"obs": rng.standard_normal((2, 2)).astype(np.float32)}) for _ in range(2))
     assert old is not None and new is not None
-    moved = chunk.moved(sample, 1, old - new)
+    moved = chunk.moved(sample, 1, (old, new))
     before, after = chunk.unnormalized(sample, old), chunk.unnormalized(moved, new)
     np.testing.assert_allclose(after, before[:, [1, 2, 2]], rtol=0, atol=1e-5)
     absolute = replace(chunk, relative=None)

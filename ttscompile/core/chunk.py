@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import SpecError
+from ..errors import ObservationError, SpecError
 from .coercion import Array, integer, numbers
+from .poses import NUMBERS, Pose, composed, has_rotation
 from .rules import OMITTED
 from .sampler import FloatArray
 
@@ -89,18 +91,45 @@ class Relative:
     Attributes:
         key: of the observation; it counts as it is given, and of several frames the newest.
         entries: for each number of the actions, which number of the observation is added to it; None for none.
+        poses: nine numbers of the actions each, which are composed with nine of the observation, and not added.
     """
 
     key: str
     entries: tuple[int | None, ...]
+    poses: tuple[Pose, ...] = field(default=(), metadata=OMITTED)
 
     def __post_init__(self) -> None:
         own = tuple(None if n is None else integer(n, "an entry of relative", SpecError) for n in self.entries)
         object.__setattr__(self, "entries", own)
+        taken = [n for n, entry in enumerate(own) if entry is not None]
+        taken += [n for pose in self.poses for n in range(pose.action, pose.action + NUMBERS)]
+        if len(set(taken)) < len(taken) or max(taken, default=0) >= len(own):
+            told = f"{NUMBERS} numbers each of {len(own)}, of which no other pose has one, with None in entries"
+            raise SpecError(f"relative has the poses {self.poses} and the entries {own}; expected {told}.")
+
+    @cached_property
+    def columns(self) -> tuple[int | None, ...]:
+        """For each number of the actions, which number of the observation it needs; None for none."""
+        found = dict(enumerate(self.entries))
+        return tuple({**found, **{p.action + i: p.measured + i for p in self.poses for i in range(NUMBERS)}}.values())
 
     def places(self, width: int) -> list[int]:
-        """Where each number finds what is added to it, in an observation of this width with a zero behind it."""
-        return [width if entry is None else entry for entry in self.entries]
+        """Where each number finds what it needs, in an observation of this width with a zero behind it."""
+        return [width if entry is None else entry for entry in self.columns]
+
+    def absolute(self, actions: Any, reference: Any, library: Any = np, inverse: bool = False) -> Any:
+        """Actions ``[..., Da]`` of the robot, of what the network gives and of ``ChunkSpec.reference``; or the inverse.
+
+        Arrays of numpy, as float64; or tensors where torch is the library. NaN where a pose has no rotation.
+        """
+        if library is np:
+            actions, reference = np.float64(actions), np.float64(reference)
+        changed = actions - reference if inverse else actions + reference
+        with np.errstate(all="ignore"):
+            for pose in self.poses:
+                both = reference[..., pose.numbers], actions[..., pose.numbers]
+                changed[..., pose.numbers] = composed(*both, library, inverse)
+        return changed
 
 
 @dataclass(frozen=True)
@@ -116,7 +145,7 @@ class ChunkSpec:
         ranged: whether the normaliser maps the range of the actions in training to -1..1, so that no action should be
             far outside; not one by mean and deviation, or by quantiles.
         switches: numbers of the actions that the normaliser is not for.
-        relative: what is added to actions once they are denormalised; None for nothing.
+        relative: what actions are relative to, once they are denormalised; None for nothing.
     """
 
     action_dim: int
@@ -137,7 +166,7 @@ class ChunkSpec:
             raise SpecError(
                 f"switches are of the channels {channels}; expected different ones below {self.action_dim}."
             )
-        entries = (None,) * self.action_dim if self.relative is None else self.relative.entries
+        entries = (None,) * self.action_dim if self.relative is None else self.relative.columns
         if len(entries) != self.action_dim or any(entries[channel] is not None for channel in channels):
             raise SpecError(f"relative has {entries}; expected {self.action_dim} entries, and None for {channels}.")
 
@@ -160,15 +189,27 @@ class ChunkSpec:
         return Affine(scale, offset)
 
     def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
-        """What is added to the actions of a call with these observations, as they are given; None for nothing.
+        """What the actions of a call with these observations, as they are given, are relative to; None for nothing.
 
         Returns:
             ``[B, 1, Da]``, with zeros where actions are not relative.
+
+        Raises:
+            ObservationError: a measured pose has no rotation.
         """
         if self.relative is None:
             return None
         seen = obs[self.relative.key]
         newest = np.pad(seen.reshape(len(seen), -1, seen.shape[-1])[:, -1:], ((0, 0), (0, 0), (0, 1)))
+        for pose in self.relative.poses:
+            own = newest[:, 0, pose.measured : pose.measured + NUMBERS]
+            if not (turned := has_rotation(own)).all():
+                told = f"numbers {pose.measured + 3} to {pose.measured + NUMBERS - 1} are to be two rows of a rotation"
+                found = f"{own[~turned][0, 3:].tolist()} of stream {int(np.flatnonzero(~turned)[0])}"
+                raise ObservationError(
+                    f"observation {self.relative.key!r}: {told}, of length 1 and at right angles; found {found}, which"
+                    " gives none. Give the measured pose: a place, then the first two rows of its matrix."
+                )
         return np.asarray(newest[..., self.relative.places(seen.shape[-1])])
 
     def unnormalized(self, sample: FloatArray, reference: FloatArray | None = None, first: int = 0) -> FloatArray:
@@ -176,35 +217,41 @@ class ChunkSpec:
 
         Args:
             sample: with an axis of steps before the last.
-            reference: what is added to them, from the method of that name.
+            reference: what they are relative to, from the method of that name.
             first: which step of the chunk is the sample's first.
         """
         assert (reference is None) is (self.relative is None)
         own = sample[..., : self.action_dim]
         actions = own if self.normalizer is None else self.normalizer.at(_from(first, own)).unnormalize(own)
-        actions = actions if reference is None else actions + reference
+        if self.relative is not None:
+            actions = self.relative.absolute(actions, reference).astype(np.float32)
         for one in self.switches:
             beyond = own[..., [one.channel]] >= np.float32(one.threshold)
             at = np.arange(self.action_dim) == one.channel
             actions = np.where(at, np.where(beyond, np.float32(one.above), np.float32(one.below)), actions)
         return actions
 
-    def moved(self, sample: FloatArray, executed: int, change: FloatArray | None = None) -> FloatArray:
+    def moved(
+        self, sample: FloatArray, executed: int, change: tuple[FloatArray, FloatArray] | None = None
+    ) -> FloatArray:
         """Denoised samples ``[B, T, D]`` so many steps later; the last step is repeated where none is left.
 
         Args:
-            change: what is added to their actions, less what will be: the actions stay the same. None for no change.
+            change: what their actions are relative to, and what they will be: the actions stay the same. None for none.
         """
         steps = np.minimum(np.arange(sample.shape[1]) + executed, sample.shape[1] - 1)
         later, normalizer = sample[:, steps], self.normalizer
         if change is not None or (normalizer is not None and normalizer.scale.ndim > 1):
             own = later[..., : self.action_dim]
             actions = own if normalizer is None else normalizer.at(steps).unnormalize(own)
-            later[..., : self.action_dim] = self.normalized(actions if change is None else actions + change)
+            if self.relative is not None and change is not None:
+                before, now = change
+                actions = self.relative.absolute(self.relative.absolute(actions, before), now, inverse=True)
+            later[..., : self.action_dim] = self.normalized(actions)
         return later
 
     def normalized(self, actions: FloatArray, first: int = 0) -> FloatArray:
-        """What a network has for actions ``[..., N, Da]`` without what is added to them, from this step of a chunk."""
+        """What a network has for actions ``[..., N, Da]`` that are what it gives, from this step of a chunk on."""
         return actions if self.normalizer is None else self.normalizer.at(_from(first, actions)).normalize(actions)
 
 

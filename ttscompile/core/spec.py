@@ -213,7 +213,7 @@ class PolicySpec:
             return
         if (seen := self.observations.get(relative.key)) is None:
             raise SpecError(f"actions are relative to {relative.key!r}, which is none of {sorted(self.observations)}.")
-        shape, width = seen.shape[bool(seen.frames) :], 1 + max(n or 0 for n in relative.entries)
+        shape, width = seen.shape[bool(seen.frames) :], 1 + max(n or 0 for n in relative.columns)
         if seen.dtype != "float32" or len(shape) != 1 or shape[0] < width:
             told = f"float32 [N] with N of {width} at least; found {seen.dtype} {list(shape)}"
             raise SpecError(f"actions are relative to observation {relative.key!r}: expected {told}.")

@@ -35,7 +35,7 @@ class Start:
         chunk: ChunkSpec,
         fresh: Noise,
         executed: int | None = None,
-        change: FloatArray | None = None,
+        change: tuple[FloatArray, FloatArray] | None = None,
     ) -> Noise:
         """The noise of the rest, whose initial sample goes on with a chunk.
 

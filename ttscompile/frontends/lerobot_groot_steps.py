@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..core.poses import NUMBERS, Pose
 from ..core.tokenizer import TASK
 from ..errors import CheckpointError
 from . import lerobot_processors as lerobot
@@ -25,6 +26,8 @@ _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _MOST_LETTERS, _EPSILON = 64, 400, 1e-8
 _CAMERA = "observation.images."
+_POSES = ("xyz_rot6d", "xyz+rot6d")
+"""Both names of the one format of poses that lerobot decodes."""
 _LIBERO, _LIBERO_STEPS = "libero_sim", 8
 """An embodiment of which lerobot executes so many actions of a chunk."""
 
@@ -103,7 +106,7 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
     read = packing.flag("normalize_min_max", True)
     state = _statistics(directory, lerobot.state_of(directory, pack) if read else {}, STATE, features)
     actions, added = _actions(directory, decode, features), lerobot.relative_entries(directory, before, after, features)
-    if {*actions.relative} - {None} and added:
+    if added and ({*actions.relative} - {None} or actions.poses):
         raise CheckpointError(f"{directory}: {_DECODE} and the steps after it add the state to actions; expected one.")
     executed = actions.executed
     if kind == _LIBERO and executed is not None:
@@ -124,6 +127,7 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         padded=(packing.number("max_state_dim", 132), packing.number("max_action_dim", 132)),
         geometry=_geometry(encoding),
         relative=added or actions.relative,
+        poses=actions.poses,
     )
 
 
@@ -173,6 +177,7 @@ class _Actions(NamedTuple):
     bounded: bool
     executed: int | None = None
     relative: tuple[int | None, ...] = ()
+    poses: tuple[Pose, ...] = ()
 
 
 def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Features) -> _Actions:
@@ -190,7 +195,8 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
         own = settings.values["modality_config"]["action"]
         names, steps = own["modality_keys"], len(own.get("delta_indices") or ()) or None
         kinds = own["action_configs"] if settings.flag("use_relative_action", False) else [{}] * len(names)
-        *both, relative = zip(*(_group(settings, *each, ends) for each in zip(names, kinds, strict=True)), strict=True)
+        found = zip(*(_group(settings, *each, ends) for each in zip(names, kinds, strict=True)), strict=True)
+        *both, columns, of_poses = found
         rows = max((each.shape[:-1] for each in (*both[0], *both[1])), default=())
         tensors = {
             f"{ACTION}.{name}": torch.cat([each.expand(*rows, -1) for each in groups], -1)
@@ -200,31 +206,37 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
         expected = f"groups of an action in modality_config, and numbers {' and '.join(ends)} of each in raw_stats"
         raise settings.error(f"{error!r:.80}; expected {expected}") from error
     steps = min(steps or rows[0], *rows) if rows else steps
-    shaped = {ACTION: ("ACTION", (*rows, count))}
-    return _Actions(_statistics(directory, tensors, ACTION, shaped), True, steps, sum(relative, ()))
+    shaped, entries, poses = {ACTION: ("ACTION", (*rows, count))}, list[int | None](), list[Pose]()
+    for own, pose in zip(columns, of_poses, strict=True):
+        poses += [Pose(len(entries), own[0])] * pose
+        entries += [None] * len(own) if pose else own
+    return _Actions(_statistics(directory, tensors, ACTION, shaped), True, steps, tuple(entries), tuple(poses))
 
 
 def _group(
     settings: Settings, name: str, kind: Mapping[str, Any], ends: tuple[str, str]
-) -> tuple[Tensor, Tensor, tuple[int | None, ...]]:
-    """Where the range of a group of actions ends, ``[d]`` or a row for each step; and what they are relative to."""
+) -> tuple[Tensor, Tensor, tuple[int | None, ...], bool]:
+    """Where the range of a group ends, ``[d]`` or a row for each step; what it is relative to; whether it is a pose."""
     raw, part, state = settings.values["raw_stats"], "action", settings.values["modality_config"].get("state")
+    pose, told = False, f"{kind.get('type')} of the format {kind.get('format')}"
     if relative := str(kind.get("rep")).lower() == "relative":
-        if str(kind.get("type")).lower() != "non_eef":
+        pose = str(kind.get("type")).lower() == "eef"
+        if str(kind.get("type")).lower() != "non_eef" and not (pose and str(kind.get("format")).lower() in _POSES):
             raise settings.error(
-                f"actions {name!r} are relative to the pose of an end effector ({kind.get('format')}), and lerobot"
-                " composes both as rotations, which is not compiled; expected ABSOLUTE, or NON_EEF: the state is added"
+                f"actions {name!r} are relative, as {told}, which lerobot does not decode; expected NON_EEF, or EEF of"
+                " the format XYZ_ROT6D"
             )
         part, ends = "relative_action", ("min", "max")
     low, high = (torch.tensor(raw[part][name][end], dtype=torch.float32) for end in ends)
     if not relative:
-        return low, high, (None,) * low.shape[-1]
+        return low, high, (None,) * low.shape[-1], False
     sizes = {key: len(raw["state"][key].get("mean") or raw["state"][key]["min"]) for key in state["modality_keys"]}
     own = kind.get("state_key") or name
-    first = sum(list(sizes.values())[: list(sizes).index(own)])
-    if sizes[own] != low.shape[-1]:
-        raise settings.error(f"actions {name!r} have {low.shape[-1]} numbers, and the state {own!r} {sizes[own]}")
-    return low, high, tuple(range(first, first + sizes[own]))
+    first, count = sum(list(sizes.values())[: list(sizes).index(own)]), NUMBERS if pose else low.shape[-1]
+    if not sizes[own] == count == low.shape[-1]:
+        found = f"actions {name!r} have {low.shape[-1]} numbers, and the state {own!r} {sizes[own]}"
+        raise settings.error(f"{found}; expected {f'{count} each, as {told} has' if pose else 'as many'}")
+    return low, high, tuple(range(first, first + count)), pose
 
 
 def _statistics(

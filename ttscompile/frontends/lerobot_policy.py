@@ -60,7 +60,7 @@ def policy_spec(
 ) -> PolicySpec:
     """The specification of a policy."""
     start = config.n_obs_steps - 1
-    relative = Relative(processors.renamed.get(STATE, STATE), processors.relative)
+    relative = Relative(processors.renamed.get(STATE, STATE), processors.relative, processors.poses)
     return PolicySpec(
         sample=(config.horizon, config.action_dim),
         observations=_observations(config, processors) | dict(more or {}),
@@ -72,7 +72,7 @@ def policy_spec(
             stop=min(start + config.n_action_steps, config.horizon),
             normalizer=None if processors.action is None else processors.action.inverse(config.horizon),
             ranged=processors.action is not None and processors.action.mode == "MIN_MAX",
-            relative=relative if {*relative.entries} - {None} else None,
+            relative=relative if {*relative.columns} - {None} else None,
         ),
         source={"format": "lerobot", **source, **loops.source},
     )

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ..core.poses import Pose
 from ..core.spec import Affine
 from ..errors import CheckpointError
 from .saved_weights import read_tensors
@@ -164,6 +165,7 @@ class Processors:
         own: settings of the steps around the policy that its type alone has, by name, in their order.
         relative: for each number of an action, which number of the state it is relative to; None for none. Empty where
             actions are absolute.
+        poses: of an action, that are relative to poses of the state.
     """
 
     normalizers: Mapping[str, Statistics]
@@ -174,6 +176,7 @@ class Processors:
     state_in_prompt: bool = False
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     relative: tuple[int | None, ...] = ()
+    poses: tuple[Pose, ...] = ()
 
 
 def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:

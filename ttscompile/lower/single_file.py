@@ -28,6 +28,7 @@ from .graph_writer import GraphWriter, Weights, tensor
 from .loop import LoopInputs
 from .onnx_model import opsets, own_model
 from .plan import ExecutedPlans, write_executed_plans
+from .poses import write_absolute
 from .streams import residual_sizes, write_streams
 
 LARGEST = 2**31 - 1
@@ -178,7 +179,7 @@ def _write_actions(main: GraphWriter, sample: str, spec: PolicySpec) -> None:
         predicted = main.op("Sub", predicted, main.constant(affine.offset, np.float32))
         predicted = main.op("Div", predicted, main.constant(affine.scale, np.float32))
     if chunk.relative is not None:
-        predicted = main.op("Add", predicted, _reference(main, chunk.relative, spec))
+        predicted = write_absolute(main, predicted, _reference(main, chunk.relative, spec), chunk.relative)
     for one in chunk.switches:
         low, high, least = (main.constant([n], np.float32) for n in (one.below, one.above, one.threshold))
         value = main.op("Where", main.op("GreaterOrEqual", own, least), high, low)

@@ -47,7 +47,8 @@ def policy(artifact: Artifact) -> Section:
     action += f"; {spec.left_out} more are left out" * bool(spec.left_out)
     action += f"; the sample has {channels} channels" * (channels != chunk.action_dim)
     if (relative := chunk.relative) is not None:
-        action += f"; {sum(n is not None for n in relative.entries)} of the numbers are relative to {relative.key!r}"
+        action += f"; {sum(n is not None for n in relative.columns)} of the numbers are relative to {relative.key!r}"
+        action += f", in {len(relative.poses)} poses of nine" * bool(relative.poses)
     kept = (
         f"{needs.read} of {needs.cells} residuals a stream, {needs.bytes_read / 1e6:.1f} MB, for its plans;"
         f" {needs.bytes_most / 1e6:.1f} MB for plans that you give"

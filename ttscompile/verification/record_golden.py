@@ -181,7 +181,7 @@ def _episode(
         noise = Noise(golden.initial[::order], None if golden.draws is None else golden.draws[:, ::order])
         if view.start is not None:
             reference = view.manifest.spec.reference(obs)
-            change = None if reference is None else reference - reference[::order]
+            change = None if reference is None else (reference, reference[::order])
             noise = view.start.noise_from(chunk, view.manifest.spec.chunk, noise, change=change)
         inputs = noise_tensors(noise, view.manifest.spec.sampler.stochastic)
         result = model.denoise(contexts, *inputs, cells, cache, correction=plan.correction)

@@ -24,7 +24,7 @@ from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import PreTrainedTokenizerFast, Qwen2VLImageProcessor, Qwen3VLConfig, Qwen3VLVideoProcessor
 
 from .. import groots
-from ..vlas import CAMERAS, STATE
+from ..vlas import CAMERAS, STATE, Array
 
 TEMPLATE = """{%- for message in messages -%}
 {{- '<|im_start|>' + message.role + '\\n' -}}
@@ -200,7 +200,7 @@ def base(kind: str) -> None:
         backbone_embedding_dim=24,
         hidden_size=18,
         input_embedding_dim=20,
-        max_state_dim=6,
+        max_state_dim=groots.STATE_PADDED,
         max_action_dim=groots.PADDED,
         action_horizon=groots.HORIZON,
         max_seq_len=9,
@@ -229,7 +229,7 @@ def save(kind: str) -> Any:
         **POLICIES[kind],
         base_model_path=f"./{groots.BASE}",
         chunk_size=groots.HORIZON,
-        max_state_dim=6,
+        max_state_dim=groots.STATE_PADDED,
         max_action_dim=groots.PADDED,
         use_bf16=False,
         device="cpu",
@@ -253,14 +253,15 @@ def save(kind: str) -> Any:
     return policy
 
 
-def chunk(policy: Any, call: int, given: dict[str, Any]) -> Any:
+def chunk(policy: Any, call: int, given: dict[str, Any], noise: Array | None = None) -> Any:
     """The actions of a whole chunk in robot units."""
+    drawn = torch.from_numpy(groots.noise() if noise is None else noise)
     before, after = make_pre_post_processors(policy.config, pretrained_path="policy")
     batch = {**{key: torch.from_numpy(value) for key, value in given.items()}, "task": groots.TASKS[call]}
     # As on a graphics card: on a processor torchvision would round in the middle of a resize.
     with patch(RESIZE, lambda _: False):
         batch = before(batch)
-    with patch("torch.randn", lambda *_, **__: torch.from_numpy(groots.noise())):
+    with patch("torch.randn", lambda *_, **__: drawn):
         return after(policy.predict_action_chunk(batch)).numpy()
 
 
