@@ -208,7 +208,7 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
     steps = min(steps or rows[0], *rows) if rows else steps
     shaped, entries, poses = {ACTION: ("ACTION", (*rows, count))}, list[int | None](), list[Pose]()
     for own, pose in zip(columns, of_poses, strict=True):
-        poses += [Pose(len(entries), own[0])] * pose
+        poses += [Pose(len(entries), own[0])] if pose else []
         entries += [None] * len(own) if pose else own
     return _Actions(_statistics(directory, tensors, ACTION, shaped), True, steps, tuple(entries), tuple(poses))
 

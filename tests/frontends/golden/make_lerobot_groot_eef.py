@@ -58,9 +58,10 @@ def composition() -> dict[str, Array]:
 
 def chunks(kind: str) -> dict[str, Array]:
     """Two calls, and one of two streams."""
+    given = [*(eefs.observation(kind, call) for call in (0, 1)), eefs.both(kind)]  # images are drawn after a state
     own = make_lerobot_groot.PROCESSORS["native"] | {"modality_configs": {TAGS[kind]: eefs.modality(kind)}}
     processors = {kind: own | {"use_relative_action": True}}
-    policies = {kind: {"embodiment_tag": TAGS[kind], "n_action_steps": groots.HORIZON}}
+    policies = {kind: {"embodiment_tag": TAGS[kind], "n_action_steps": eefs.STEPS}}
     sizes = {"STATE_DIM": eefs.width(kind), "ACTION_DIM": eefs.width(kind)}
     sizes |= {"STATE_PADDED": eefs.STATE_PADDED, "PADDED": eefs.PADDED}
     tables = {"BACKBONES": make_lerobot_groot.BACKBONES, "BASES": make_lerobot_groot.BASES}
@@ -76,8 +77,8 @@ def chunks(kind: str) -> dict[str, Array]:
         (base / "embodiment_id.json").write_text(json.dumps({TAGS[kind]: 2, "leg": 0}))
         policy = make_lerobot_groot.save(kind)
         made = make_lerobot_groot.chunk
-        found = {f"{kind}.{call}": made(policy, call, eefs.observation(kind, call), eefs.noise()) for call in (0, 1)}
-        return found | {f"{kind}.both": made(policy, 0, eefs.both(kind), eefs.noise(2))}
+        found = {f"{kind}.{call}": made(policy, call, given[call], eefs.noise()) for call in (0, 1)}
+        return found | {f"{kind}.both": made(policy, 0, given[2], eefs.noise(2))}
 
 
 if __name__ == "__main__":
