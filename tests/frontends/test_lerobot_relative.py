@@ -190,7 +190,7 @@ def test_a_gripper_of_two_values_has_to_be_absolute(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"type": "EEF", "format": "XYZ_ROT6D"}, r"'reach' are relative to the pose of an end effector \(XYZ_ROT6D\)"),
+        ({"type": "EEF", "format": "XYZ_ROT6D"}, "have 3 numbers, and the state 'arm' 3; expected 9 each, as EEF"),
         ({"state_key": "leg"}, "ValueError.*leg.*; expected groups of an action"),
         ({"state_key": "gripper"}, "actions 'reach' have 3 numbers, and the state 'gripper' 1"),
         ({"rep": "ABSOLUTE"}, None),
