@@ -73,7 +73,7 @@ def compiled(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
     artifact, program = once.compiled("whole groot", lambda to: ttscompile.convert(groots.save("words", folder), to))
     record(
         "LeRobot groot",
-        "actions that lerobot 0.6.1 gave, raw observation to action, also relative to the state, 1e-4",
+        "actions that lerobot 0.6.1 gave, raw observation to action, also relative to state and pose, 1e-4",
         "euler 4",
         program,
     )
