@@ -52,7 +52,8 @@ def test_rows_are_made_upright_the_first_first() -> None:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_inverse_takes_back_what_was_composed(dtype: type) -> None:
     """But for what made no rotation of the numbers, which does not come back."""
-    measured, own = poses(200, 1).astype(dtype), upright(poses(200, 2).astype(dtype))
+    measured: np.ndarray = poses(200, 1).astype(dtype)
+    own = upright(poses(200, 2).astype(dtype))
     near = 2e-4 if dtype is np.float32 else 1e-11
     np.testing.assert_allclose(composed(measured, composed(measured, own), inverse=True), own, atol=near)
     np.testing.assert_allclose(composed(measured, composed(measured, own, inverse=True)), own, atol=near)

@@ -12,6 +12,7 @@ from ..artifact.view import view_of
 from ..core.envelope import FAR
 from ..core.lattice import dense_plan
 from ..core.plan import DENSE
+from ..core.poses import NUMBERS
 from ..core.spec import ObservationSpec, SamplerTable
 from ..ir.flops import frames_flops, graph_flops
 from ..ir.program import Binding
@@ -48,7 +49,7 @@ def policy(artifact: Artifact) -> Section:
     action += f"; the sample has {channels} channels" * (channels != chunk.action_dim)
     if (relative := chunk.relative) is not None:
         action += f"; {sum(n is not None for n in relative.columns)} of the numbers are relative to {relative.key!r}"
-        action += f", in {len(relative.poses)} poses of nine" * bool(relative.poses)
+        action += f", {NUMBERS * len(relative.poses)} of them in poses" * bool(relative.poses)
     kept = (
         f"{needs.read} of {needs.cells} residuals a stream, {needs.bytes_read / 1e6:.1f} MB, for its plans;"
         f" {needs.bytes_most / 1e6:.1f} MB for plans that you give"

@@ -60,16 +60,14 @@ def chunks(kind: str) -> dict[str, Array]:
     """Two calls, and one of two streams."""
     given = [*(eefs.observation(kind, call) for call in (0, 1)), eefs.both(kind)]  # images are drawn after a state
     own = make_lerobot_groot.PROCESSORS["native"] | {"modality_configs": {TAGS[kind]: eefs.modality(kind)}}
-    processors = {kind: own | {"use_relative_action": True}}
-    policies = {kind: {"embodiment_tag": TAGS[kind], "n_action_steps": eefs.STEPS}}
-    sizes = {"STATE_DIM": eefs.width(kind), "ACTION_DIM": eefs.width(kind)}
+    sizes: dict[str, Any] = {"STATE_DIM": eefs.width(kind), "ACTION_DIM": eefs.width(kind)}
     sizes |= {"STATE_PADDED": eefs.STATE_PADDED, "PADDED": eefs.PADDED}
-    tables = {"BACKBONES": make_lerobot_groot.BACKBONES, "BASES": make_lerobot_groot.BASES}
-    tables = {name: {kind: table["native"]} for name, table in tables.items()}
-    with (
-        patch.multiple(groots, **sizes),
-        patch.multiple(make_lerobot_groot, PROCESSORS=processors, POLICIES=policies, **tables),
-    ):
+    tables: dict[str, Any] = {
+        name: {kind: getattr(make_lerobot_groot, name)["native"]} for name in ("BACKBONES", "BASES")
+    }
+    tables["PROCESSORS"] = {kind: own | {"use_relative_action": True}}
+    tables["POLICIES"] = {kind: {"embodiment_tag": TAGS[kind], "n_action_steps": eefs.STEPS}}
+    with patch.multiple(groots, **sizes), patch.multiple(make_lerobot_groot, **tables):
         make_lerobot_groot.backbone(kind)
         make_lerobot_groot.base(kind)
         base = Path(groots.BASE)
