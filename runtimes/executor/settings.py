@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ttscompile.core.coercion import integer
-from ttscompile.core.poses import has_rotation, upright
+from ttscompile.core.poses import has_rotation, orthonormal
 from ttscompile.errors import ExecutorError
 
 from .feasibility import Feasibility
@@ -219,7 +219,7 @@ class Resolved(ExecutorSettings):
         for pose in self.poses:
             own = row[pose.numbers]
             if has_rotation(own):
-                row[pose.numbers] = upright(own)
+                row[pose.numbers] = orthonormal(own)
             elif before is not None:
                 own[3:] = before[pose.numbers][3:]
         for one in self.switches:

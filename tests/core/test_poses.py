@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ttscompile.core.chunk import ChunkSpec, Relative, Switch
-from ttscompile.core.poses import LEAST, Pose, composed, has_rotation, upright
+from ttscompile.core.poses import LEAST, Pose, composed, has_rotation, orthonormal
 from ttscompile.errors import ObservationError, SpecError
 from ttscompile.lower.graph_writer import GraphWriter, tensor
 from ttscompile.lower.poses import write_absolute
@@ -39,21 +39,21 @@ def test_a_quarter_turn_by_hand() -> None:
     np.testing.assert_allclose(composed(TURN, TURN, inverse=True), STAYS, atol=1e-7)
 
 
-def test_rows_are_made_upright_the_first_first() -> None:
-    np.testing.assert_allclose(upright(np.array([7, 8, 9, 0, 5, 0, 3, -2, 0.0])), [7, 8, 9, 0, 1, 0, 1, 0, 0])
-    found = upright(poses(100)).astype(np.float64)
+def test_rows_are_made_orthonormal_the_first_first() -> None:
+    np.testing.assert_allclose(orthonormal(np.array([7, 8, 9, 0, 5, 0, 3, -2, 0.0])), [7, 8, 9, 0, 1, 0, 1, 0, 0])
+    found = orthonormal(poses(100)).astype(np.float64)
     np.testing.assert_allclose((found[:, 3:6] ** 2).sum(1), 1, atol=1e-6)
     np.testing.assert_allclose((found[:, 6:] ** 2).sum(1), 1, atol=1e-6)
     np.testing.assert_allclose((found[:, 3:6] * found[:, 6:]).sum(1), 0, atol=1e-6)
-    found = upright(poses(100).astype(np.float64))
-    np.testing.assert_allclose(upright(found), found, atol=1e-12)
+    found = orthonormal(poses(100).astype(np.float64))
+    np.testing.assert_allclose(orthonormal(found), found, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_inverse_takes_back_what_was_composed(dtype: type) -> None:
     """But for what made no rotation of the numbers, which does not come back."""
     measured: np.ndarray = poses(200, 1).astype(dtype)
-    own = upright(poses(200, 2).astype(dtype))
+    own = orthonormal(poses(200, 2).astype(dtype))
     near = 2e-4 if dtype is np.float32 else 1e-11
     np.testing.assert_allclose(composed(measured, composed(measured, own), inverse=True), own, atol=near)
     np.testing.assert_allclose(composed(measured, composed(measured, own, inverse=True)), own, atol=near)
@@ -63,9 +63,9 @@ def test_the_inverse_takes_back_what_was_composed(dtype: type) -> None:
 
 def test_composing_goes_from_the_left_on() -> None:
     """``(a b) c = a (b c)``; half turns and next to none among them."""
-    a, b, c = (upright(poses(50, seed).astype(np.float64)) for seed in (3, 4, 5))
+    a, b, c = (orthonormal(poses(50, seed).astype(np.float64)) for seed in (3, 4, 5))
     a[0], b[0] = composed(TURN, TURN), composed(TURN, TURN)
-    a[1] = upright(np.array([0, 0, 0, 1, 1e-6, 0, -1e-6, 1, 0.0]))
+    a[1] = orthonormal(np.array([0, 0, 0, 1, 1e-6, 0, -1e-6, 1, 0.0]))
     np.testing.assert_allclose(composed(composed(a, b), c), composed(a, composed(b, c)), atol=1e-12)
 
 

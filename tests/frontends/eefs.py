@@ -30,7 +30,7 @@ GROUPS: dict[str, list[tuple[str, str, tuple[str, str, str], int]]] = {
 STATES = {"arm": {"wrist": 9, "gripper_position": 1, "joint_position": 2}, "alone": {"eef_9d": 9}}
 """Of the state, in another order."""
 TURNS = ([0.36, 0.48, -0.8, -0.8, 0.6, 0.0], [-1.1, 1e-4, 0.0, 0.2, -0.9, 1e-4])
-"""Two rows as measured, by call: upright; and nearly a half turn, not upright."""
+"""Two rows as measured, by call: orthonormal; and nearly a half turn, not orthonormal."""
 
 
 def width(kind: str) -> int:

@@ -14,7 +14,7 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.core.poses import Pose, composed, upright
+from ttscompile.core.poses import Pose, composed, orthonormal
 from ttscompile.core.spec import Noise, Relative
 from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -39,13 +39,13 @@ def golden() -> Mapping[str, Array]:
 
 
 def test_poses_are_composed_as_lerobot_composes_them(golden: Mapping[str, Array]) -> None:
-    """Of no turn, of little, of nearly half a turn, and of rows that are not upright."""
+    """Of no turn, of little, of nearly half a turn, and of rows that are not orthonormal."""
     measured, relative, absolute = (golden[f"composition.{name}"] for name in ("measured", "relative", "absolute"))
     np.testing.assert_allclose(composed(measured[:, None], relative), absolute, atol=1e-6 * np.abs(absolute).max())
     found = composed(torch.from_numpy(measured[:, None]), torch.from_numpy(relative), torch).numpy()
     np.testing.assert_allclose(found, absolute, atol=1e-4)
     back = composed(measured[:, None].astype(np.float64), absolute.astype(np.float64), inverse=True)
-    np.testing.assert_allclose(back, upright(relative.astype(np.float64)), atol=1e-5)
+    np.testing.assert_allclose(back, orthonormal(relative.astype(np.float64)), atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", eefs.KINDS)

@@ -26,7 +26,7 @@ from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.compare import compare
 from ttscompile.cli import main
 from ttscompile.core.lattice import Source
-from ttscompile.core.poses import Pose, upright
+from ttscompile.core.poses import Pose, orthonormal
 from ttscompile.core.spec import Affine, Relative
 from ttscompile.core.start import rest_of
 from ttscompile.errors import ArtifactError, ObservationError
@@ -76,15 +76,15 @@ def made(once: Once) -> Path:
 
 
 def observed(seed: int, streams: int = 2) -> tuple[dict[str, np.ndarray], Noise]:
-    """Of another pose each; rows are not quite upright, as measured."""
+    """Of another pose each; rows are not quite orthonormal, as measured."""
     rng = np.random.default_rng(seed)
     obs = rng.standard_normal((streams, 2, DO)).astype(np.float32)
-    obs[..., 2:11] = upright(obs[..., 2:11]) + rng.uniform(-0.01, 0.01, 9).astype(np.float32)
+    obs[..., 2:11] = orthonormal(obs[..., 2:11]) + rng.uniform(-0.01, 0.01, 9).astype(np.float32)
     return {"obs": obs}, Noise(rng.standard_normal((streams, T, DA)).astype(np.float32))
 
 
 def matrix(pose: np.ndarray) -> np.ndarray:
-    """A homogeneous one, in numpy's own words: the triangle of the two rows is what is not upright."""
+    """A homogeneous one, in numpy's own words: the triangle of the two rows is what is not orthonormal."""
     q, r = np.linalg.qr(pose[3:].reshape(2, 3).T.astype(np.float64))
     rows = (q * np.sign(np.diag(r))).T
     turned = np.vstack([rows, np.cross(*rows)])
@@ -201,8 +201,8 @@ def test_calibration_measures_what_the_network_says(once: Once, tmp_path: Path) 
         shown.append(compare(path, [recording], calls=4).points[-1].furthest[0].actions)
     assert found[0] and found[0] == found[1]
     assert np.abs(shown[0] - shown[1]).max() > 0.1
-    np.testing.assert_allclose(upright(shown[1][..., 1:10]), shown[1][..., 1:10], atol=1e-5)
-    assert np.abs(upright(shown[0][..., 1:10]) - shown[0][..., 1:10]).max() > 1e-3
+    np.testing.assert_allclose(orthonormal(shown[1][..., 1:10]), shown[1][..., 1:10], atol=1e-5)
+    assert np.abs(orthonormal(shown[0][..., 1:10]) - shown[0][..., 1:10]).max() > 1e-3
 
 
 def test_it_is_written_where_there_is_one_and_read_strictly() -> None:

@@ -1,8 +1,8 @@
-"""Poses relative to a measured one, as nine numbers: a place, and the first two rows of the matrix of a rotation.
+"""Poses relative to a measured one, as nine numbers: a position, and the first two rows of the matrix of a rotation.
 
     R(p, q)                  rows a = p / |p|, b = (q - (a q) a) / |q - (a q) a| and a x b
-    composed with (m, M)     place M x + m, rows of M R
-    its inverse              place M^T (x - m), rows of M^T R
+    composed with (m, M)     position M x + m, rows of M R
+    its inverse              position M^T (x - m), rows of M^T R
 
 Source: ``xyz+rot6d`` of GR00T N1.7, lerobot.policies.groot.utils of huggingface/lerobot 0.6.
 """
@@ -44,15 +44,15 @@ class Pose:
 
 def composed(measured: Any, pose: Any, library: Any = np, inverse: bool = False) -> Any:
     """Poses ``[..., 9]`` seen from where a measured one is seen from; or the inverse. Of numpy or torch, as given."""
-    turn, own, place = _matrix(measured, library), _matrix(pose, library), pose[..., :3]
+    rotation, own, position = _matrix(measured, library), _matrix(pose, library), pose[..., :3]
     if inverse:
-        turn, place = turn.swapaxes(-1, -2), place - measured[..., :3]
-    place, rows = (turn @ place[..., None])[..., 0], (turn @ own)[..., :2, :]
-    place = place if inverse else place + measured[..., :3]
-    return library.concatenate((place, rows.reshape((*rows.shape[:-2], 6))), -1)
+        rotation, position = rotation.swapaxes(-1, -2), position - measured[..., :3]
+    position, rows = (rotation @ position[..., None])[..., 0], (rotation @ own)[..., :2, :]
+    position = position if inverse else position + measured[..., :3]
+    return library.concatenate((position, rows.reshape((*rows.shape[:-2], 6))), -1)
 
 
-def upright(poses: Array) -> Array:
+def orthonormal(poses: Array) -> Array:
     """The same poses ``[..., 9]``, the rotation of each by two rows of length 1 at right angles."""
     return np.concatenate((poses[..., :3], _matrix(poses, np)[..., :2, :].reshape(*poses.shape[:-1], 6)), -1)
 

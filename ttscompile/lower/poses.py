@@ -19,11 +19,11 @@ def write_absolute(main: GraphWriter, actions: str, reference: str, relative: Re
 
 def _composed(main: GraphWriter, measured: str, pose: str) -> str:
     """``core.poses.composed``."""
-    turn, own = _matrix(main, measured), _matrix(main, pose)
-    place = main.op("MatMul", turn, main.op("Reshape", _part(main, pose, 0, 3), main.constant([0, 0, 3, 1])))
-    place = main.op("Add", main.op("Reshape", place, main.constant([0, 0, 3])), _part(main, measured, 0, 3))
-    rows = main.op("Reshape", main.op("MatMul", turn, own), main.constant([0, 0, NUMBERS]))
-    return main.op("Concat", place, _part(main, rows, 0, 6), axis=2)
+    rotation, own = _matrix(main, measured), _matrix(main, pose)
+    position = main.op("MatMul", rotation, main.op("Reshape", _part(main, pose, 0, 3), main.constant([0, 0, 3, 1])))
+    position = main.op("Add", main.op("Reshape", position, main.constant([0, 0, 3])), _part(main, measured, 0, 3))
+    rows = main.op("Reshape", main.op("MatMul", rotation, own), main.constant([0, 0, NUMBERS]))
+    return main.op("Concat", position, _part(main, rows, 0, 6), axis=2)
 
 
 def _matrix(main: GraphWriter, poses: str) -> str:

@@ -54,7 +54,7 @@ def given(settings: ExecutorSettings, relative: Relative | None, turn: float = 1
     return np.stack([one for one in made if one is not None])
 
 
-def upright_by(rows: np.ndarray) -> float:
+def off_orthonormal(rows: np.ndarray) -> float:
     """How far two rows ``[N, 6]`` are from length 1 and right angles."""
     both = rows.reshape(-1, 2, 3).astype(np.float64)
     return float(np.abs(both @ both.swapaxes(1, 2) - np.eye(2)).max())
@@ -72,8 +72,8 @@ def upright_by(rows: np.ndarray) -> float:
 )
 def test_every_action_has_a_rotation(settings: ExecutorSettings) -> None:
     between, found = given(settings, None), given(settings, RELATIVE)
-    assert upright_by(between[:, 4:]) > 0.1, "the test has mixtures to look at"
-    assert upright_by(found[:, 4:]) < 1e-5
+    assert off_orthonormal(between[:, 4:]) > 0.1, "the test has mixtures to look at"
+    assert off_orthonormal(found[:, 4:]) < 1e-5
     np.testing.assert_array_equal(found[:, :4], between[:, :4])
     # about z a mixture of two turns is between them, and only its length is another
     alike = between[:, 4:] / np.linalg.norm(between[:, 4:6], axis=1, keepdims=True)
@@ -86,7 +86,7 @@ def test_between_opposite_rotations_the_one_before_stands() -> None:
     between, found = given(TURNS, None, np.pi), given(TURNS, RELATIVE, np.pi)
     nothing = np.abs(between[:, 4:]).max(1) < 1e-3
     assert 10 < nothing.sum() < 20
-    assert upright_by(found[:, 4:]) < 1e-5
+    assert off_orthonormal(found[:, 4:]) < 1e-5
     (where,) = np.nonzero(nothing[1:])
     np.testing.assert_array_equal(found[where + 1, 4:], found[where, 4:])
     np.testing.assert_array_equal(found[:, :4], between[:, :4])
@@ -110,7 +110,7 @@ class Path3(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         turned, now = obs[:, 0, :9], obs[:, :, 9:] + self.steps[:, None]
         first, second = turned[:, 3:6], turned[:, 6:9]
-        back = torch.stack([first, second, torch.linalg.cross(first, second)], 2)  # the inverse, for upright rows
+        back = torch.stack([first, second, torch.linalg.cross(first, second)], 2)  # the inverse, for orthonormal rows
         place = torch.cat([now, 2 * now, -now], 2) - turned[:, None, :3]
         c, s, o = torch.cos(0.3 * now), torch.sin(0.3 * now), 0 * now
         whole = torch.stack([torch.cat(row, 2) for row in ((c, -s, o), (s, c, o), (o, o, 1 + o))], 2)
