@@ -58,7 +58,7 @@ class Tokens(Proposer):
             raise _refused(f"the actions are {least:.3g} further off at least, and {self.margin:g} is allowed")
         score, best = min(good, key=lambda one: one[0].tokens)  # of equals the smallest threshold, the rarest refresh
         if (told := _too_many(score, {})) is not None:
-            raise _refused(told)
+            raise _refused(f"it {told}")
         assert best.tokens is not None
         self.told = f"{score.tokens:.0%} of the tokens of new frames are computed"
         notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
