@@ -103,7 +103,7 @@ class Relative:
         object.__setattr__(self, "entries", own)
         taken = [n for n, entry in enumerate(own) if entry is not None]
         taken += [n for pose in self.poses for n in range(pose.action, pose.action + NUMBERS)]
-        if len(set(taken)) < len(taken) or max(taken, default=0) >= len(own):
+        if len(set(taken)) < len(taken) or max(taken, default=-1) >= len(own):
             told = f"{NUMBERS} numbers each of {len(own)}, of which no other pose has one, with None in entries"
             raise SpecError(f"relative has the poses {self.poses} and the entries {own}; expected {told}.")
 
