@@ -226,7 +226,8 @@ class Worker:
             self.news.notify_all()
         if self._trace.on:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
-            args |= {name: True for name, so in {"stalled": job.stalled, "outside": far}.items() if so}
+            args |= {"stalled": True} if job.stalled else {}
+            args |= {"outside": True} if far else {}
             if self._seeing and report is not None:
                 frames = report.frames
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}

@@ -266,10 +266,10 @@ def calibrate(
             for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
                 kept.hear(row.name, proposer, clock.until(float(share)))
             if not kept.learned:
-                why = " ".join(f"plan {name!r} {reason}" for name, reason in kept.refused.items())
+                why = " ".join(f"{name!r} {reason}" for name, reason in kept.refused.items())
                 raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
             for name, reason in kept.refused.items():
-                bar.warn(f"plan {name!r} is left out: it {reason}")
+                bar.warn(f"{name!r} is left out: it {reason}")
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.leave(frontier.plans, frontier.scores, SCHEDULE)

@@ -248,8 +248,8 @@ def print_comparison(found: Comparison, output: Console) -> None:
     apart = table("", "plan", "distance by number of the action", "error", "furthest calls", "outside")
     for p in found.points:
         calls = (f"episode {one.episode}, call {one.call}: {one.distance:.2f}" for one in p.furthest)
-        numbers = (", ".join(f"{one:.3g}" for one in each) for each in (p.by_number, p.errors, p.outside))
-        by_number, errors, outside = numbers
+        listed = (p.by_number, p.errors, p.outside)
+        by_number, errors, outside = (", ".join(f"{one:.3g}" for one in each) for each in listed)
         apart.add_row(p.series, p.name, by_number, errors, "; ".join(calls), outside)
     output.print(apart)
     say(
@@ -258,8 +258,8 @@ def print_comparison(found: Comparison, output: Console) -> None:
         f" changes; 0 is the same. {found.calls} observations of episodes that no strategy here learned from, each with"
         " several draws of noise. Error: with the same noise, in the units of the actions, in which two calls of the"
         f" original are {found.other_noise:.4g} apart; another sampler takes other noise, and has none. Latency:"
-        f" medians, one stream, {_threads(found)}. Frontier: no other plan is faster and nearer. Outside: how far"
-        " half, nine tenths and all of these observations are at most from those that were recorded for calibration, of"
-        f" which the furthest has 1; above {FAR:g} a call has no correction.",
+        f" medians, one stream, {_threads(found)}. Frontier: no other plan is faster and nearer. Outside: within"
+        " what distance of what was recorded for calibration half, nine tenths and all of these observations are. The"
+        f" furthest that was recorded has 1; above {FAR:g} a call has no correction.",
     )
     say(output, *(f"{name}: left out: {reason}" for name, reason in found.skipped.items()))

@@ -110,8 +110,10 @@ class Relative:
     @cached_property
     def columns(self) -> tuple[int | None, ...]:
         """For each number of the actions, which number of the observation it needs; None for none."""
-        found = dict(enumerate(self.entries))
-        return tuple({**found, **{p.action + i: p.measured + i for p in self.poses for i in range(NUMBERS)}}.values())
+        found = list(self.entries)
+        for pose in self.poses:
+            found[pose.numbers] = range(pose.measured, pose.measured + NUMBERS)
+        return tuple(found)
 
     def places(self, width: int) -> list[int]:
         """Where each number finds what it needs, in an observation of this width with a zero behind it."""
@@ -208,7 +210,7 @@ class ChunkSpec:
                 found = f"{own[~turned][0, 3:].tolist()} of stream {int(np.flatnonzero(~turned)[0])}"
                 raise ObservationError(
                     f"observation {self.relative.key!r}: {told}, of length 1 and at right angles; found {found}, which"
-                    " gives none. Give the measured pose: a place, then the first two rows of its matrix."
+                    " gives none. Give the measured pose: a position, then the first two rows of its matrix."
                 )
         return np.asarray(newest[..., self.relative.places(seen.shape[-1])])
 

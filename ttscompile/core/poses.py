@@ -60,8 +60,8 @@ def orthonormal(poses: Array) -> Array:
 def has_rotation(poses: Array) -> Array:
     """Of which poses ``[..., 9]`` the six last numbers are a rotation: see ``LEAST``."""
     first, second = poses[..., 3:6].astype(np.float64), poses[..., 6:].astype(np.float64)
-    long = np.linalg.norm(first, axis=-1)
-    return np.asarray((long >= LEAST) & (np.linalg.norm(np.cross(first, second), axis=-1) >= LEAST * long))
+    square, along, other = (first * first).sum(-1), (first * second).sum(-1), (second * second).sum(-1)
+    return np.asarray((square >= LEAST**2) & (square * other - along**2 >= LEAST**2 * square))
 
 
 def _matrix(poses: Any, library: Any) -> Any:
