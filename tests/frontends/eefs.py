@@ -3,6 +3,7 @@
 ``golden/make_lerobot_groot_eef.py`` wrote the folders, and gave lerobot the same weights, observations and noise.
 """
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from . import groots
 from .vlas import STATE, Array
 
 SAVED = Path(__file__).parent / "golden" / "lerobot_groot_eef"
+BACKBONE = groots.SAVED / "native" / groots.BACKBONE
+"""Its files are those of ``groots``."""
 KINDS = ("arm", "alone")
 """A pose, joints and a gripper as of ``oxe_droid_relative_eef_relative_joint``; and a pose alone."""
 STATE_PADDED, PADDED = 14, 13
@@ -63,6 +66,7 @@ def noise(streams: int = 1) -> Array:
 
 def save(kind: str, folder: Path) -> Path:
     """A policy and, beside it, the files of its base and backbone. Returns the policy's directory."""
+    shutil.copytree(BACKBONE, folder / groots.BACKBONE)
     return groots.save(kind, folder, SAVED)
 
 

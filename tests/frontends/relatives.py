@@ -64,6 +64,16 @@ def pipelines(directory: Path) -> tuple[Path, Path]:
     return directory / "policy_preprocessor.json", directory / "policy_postprocessor.json"
 
 
+def change_group(directory: Path, number: int, changes: dict[str, Any]) -> None:
+    """Change how a group of GR00T's actions is configured, in both pipelines."""
+    for path in pipelines(directory):
+        pipeline = json.loads(path.read_text())
+        for step in pipeline["steps"]:
+            if "modality_config" in step["config"]:
+                step["config"]["modality_config"]["action"]["action_configs"][number] |= changes
+        change_json(path, steps=pipeline["steps"])
+
+
 def with_wide_state(directory: Path, kind: str) -> Path:
     """Give a policy a state that is as wide as ``STATE_DIMS`` says. pi0 pads it; VLA-JEPA has a layer for it."""
     width, path = STATE_DIMS[kind], directory / "model.safetensors"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from ttscompile.frontends.families import AS_SAVED
 from ttscompile.report import facts
 
 from . import eefs, groots, originals, relatives
-from .lerobot_tiny import change_json
 from .vlas import STATE, Array
 from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
 
@@ -55,7 +53,7 @@ def test_the_rebuilt_network_gives_lerobots_actions(tmp_path: Path, kind: str, g
     assert chunk.relative == RELATIVE[kind]
     assert chunk.normalizer is not None and chunk.normalizer.scale.shape == (groots.HORIZON, eefs.width(kind))
     for call in (0, 1):
-        told = eefs.SAVED / kind / groots.BACKBONE, groots.TASKS[call]
+        told = eefs.BACKBONE, groots.TASKS[call]
         _, found = eager_chunk(directory, AS_SAVED, eefs.observation(kind, call), eefs.noise(), *told)
         expected = golden[f"{kind}.{call}"]
         assert expected.shape == (1, eefs.STEPS, eefs.width(kind))
@@ -68,7 +66,7 @@ def compiled(once: Once, tmp_path: Path, kind: str) -> Path:
 
 
 def opened(path: Path, kind: str, runtime: str = "onnxruntime") -> Any:
-    return ttscompile.load(path, runtime=runtime, tokenizer=eefs.SAVED / kind / groots.BACKBONE)
+    return ttscompile.load(path, runtime=runtime, tokenizer=eefs.BACKBONE)
 
 
 def given_to(kind: str, call: int) -> dict[str, Any]:
@@ -147,12 +145,7 @@ def test_a_state_without_a_rotation_is_refused(once: Once, tmp_path: Path) -> No
 )
 def test_what_lerobot_composes_alone_is_compiled(tmp_path: Path, changes: dict[str, Any], message: str | None) -> None:
     directory = eefs.save("arm", tmp_path)
-    for path in relatives.pipelines(directory):
-        pipeline = json.loads(path.read_text())
-        for step in pipeline["steps"]:
-            if "modality_config" in step["config"]:
-                step["config"]["modality_config"]["action"]["action_configs"][1] |= changes
-        change_json(path, steps=pipeline["steps"])
+    relatives.change_group(directory, 1, changes)
     if message is None:
         assert load_checkpoint_policy(directory)[1].chunk.relative == RELATIVE["arm"]
         return

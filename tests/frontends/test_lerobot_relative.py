@@ -198,12 +198,7 @@ def test_a_gripper_of_two_values_has_to_be_absolute(tmp_path: Path) -> None:
 )
 def test_groups_that_are_not_rebuilt_are_named(tmp_path: Path, changes: dict[str, Any], message: str | None) -> None:
     directory = relatives.save("groot", tmp_path)
-    for path in relatives.pipelines(directory):
-        pipeline = json.loads(path.read_text())
-        for step in pipeline["steps"]:
-            if "modality_config" in step["config"]:
-                step["config"]["modality_config"]["action"]["action_configs"][1] |= changes
-        change_json(path, steps=pipeline["steps"])
+    relatives.change_group(directory, 1, changes)
     if message is None:
         chunk = load_checkpoint_policy(directory)[1].chunk
         assert chunk.relative == Relative(STATE, (3, None, None, None, None))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 import onnxruntime
+import torch
 
 import ttscompile
 from ttscompile import Noise
@@ -77,3 +78,18 @@ def policy_groups(artifact: Path) -> tuple[int, ...]:
 
 def groups(program: Program) -> list[int]:
     return [block.group for block in program.blocks]
+
+
+def every_way(directory: Path, model: bytes, obs: Arrays, noise: Noise) -> dict[str, np.ndarray]:
+    """Actions of one dense call, by what makes them: each runtime, the single ONNX file, and ``to_module``."""
+    made: dict[str, np.ndarray] = {}
+    for name in ("onnxruntime", "torch", "reference"):
+        made[name] = ttscompile.load(directory, name).predict_action(obs, noise, plan="dense")["action_pred"]
+    cells = load_artifact(directory).plans["dense"].cells
+    assert isinstance(cells, np.ndarray)
+    made["file"] = Episode(model, len(noise.initial)).call(obs, noise, cells)["action_pred"]
+    module = ttscompile.to_module(directory, "dense")
+    with torch.inference_mode():
+        given = {key: torch.from_numpy(value) for key, value in obs.items()}
+        made["module"] = module(given, torch.from_numpy(noise.initial)).numpy()
+    return made

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import ttscompile
 from tests.artifact.tiny import tiny_spec
 from tests.calibration import policies
-from tests.lower.whole_call import Episode, inputs, make
+from tests.lower.whole_call import every_way, inputs, make
 from tests.once import Once
 from ttscompile import ChunkSpec, Noise, ObservationSpec, Plan, PolicySpec
 from ttscompile.artifact.golden import load_golden_plans
@@ -31,7 +30,7 @@ from ttscompile.report import facts
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.verification.record_golden import record_plans
 
-from .toys import toy_program
+from .toys import denoised_by, toy_program
 
 RELATIVE = Relative("obs", (1, None))
 ROWS = np.arange(1, 4, dtype=np.float32)[:, None]
@@ -59,15 +58,7 @@ def test_every_way_to_make_a_call_adds_it(tmp_path: Path, rows: bool) -> None:
     assert plain.normalizer is not None
     expected = (sample - plain.normalizer.offset) / plain.normalizer.scale
     expected[..., 0] += obs["obs"][:, None, 1]
-    made: dict[str, Any] = {
-        name: ttscompile.load(tmp_path / "artifact", name).predict_action(obs, noise, plan="dense")["action_pred"]
-        for name in ("onnxruntime", "torch", "reference")
-    }
-    made["file"] = Episode(model, 3).call(obs, noise, np.zeros((3, 2), np.int8))["action_pred"]
-    module = ttscompile.to_module(tmp_path / "artifact", "dense")
-    with torch.inference_mode():
-        made["module"] = module({"obs": torch.from_numpy(obs["obs"])}, torch.from_numpy(noise.initial)).numpy()
-    for name, found in made.items():
+    for name, found in every_way(tmp_path / "artifact", model, obs, noise).items():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5, err_msg=name)
     written = load_artifact(tmp_path / "artifact")
     assert written.manifest.spec.chunk.relative == RELATIVE
@@ -127,18 +118,10 @@ def test_every_rung_of_verify_holds(artifact: Path) -> None:
 
 
 def rest_alone(artifact: Path, obs: dict[str, np.ndarray], initial: np.ndarray) -> np.ndarray:
-    """The last two steps in torch, with the original network."""
+    """Actions of the last two steps, in torch."""
     spec = load_artifact(artifact).manifest.spec
-    rest, _ = rest_of(spec.sampler, 2)
-    seen, x = torch.from_numpy(spec.observations["obs"].normalized(obs["obs"])), torch.from_numpy(initial)
-    network = policies.Mixer(0).eval()
-    with torch.no_grad():
-        for k in range(2):
-            out = network(x, torch.full((len(x),), int(rest.timesteps[k])), seen)
-            x0 = float(rest.sample_to_x0[k]) * x + float(rest.out_to_x0[k]) * out
-            moved = float(rest.sample_to_next[k]) * x + float(rest.out_to_next[k]) * out
-            x = float(rest.x0_to_next[k]) * x0 + moved
-    return spec.chunk.unnormalized(x.numpy(), spec.chunk.reference(obs))
+    sample = denoised_by(policies.Mixer(0).eval(), rest_of(spec.sampler, 2)[0], spec, obs, initial)
+    return spec.chunk.unnormalized(sample, spec.chunk.reference(obs))
 
 
 @pytest.mark.parametrize("rows", [False, True])

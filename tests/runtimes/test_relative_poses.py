@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from click.testing import CliRunner
 from torch import nn
 
 import ttscompile
 from tests.calibration import policies
-from tests.lower.whole_call import Episode
+from tests.lower.whole_call import every_way
 from tests.once import Once
 from ttscompile import ChunkSpec, Noise, ObservationSpec, Plan, PolicySpec
 from ttscompile.artifact.load import load_artifact
@@ -32,6 +31,8 @@ from ttscompile.core.start import rest_of
 from ttscompile.errors import ArtifactError, ObservationError
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.verification.record_golden import record_plans
+
+from .toys import denoised_by
 
 T, DA, DO, RUNTIMES = policies.HORIZON, 12, 13, ("onnxruntime", "torch", "reference")
 RELATIVE = Relative("obs", (12, *[None] * 9, 0, None), (Pose(1, 2),))
@@ -109,15 +110,7 @@ def test_every_way_to_make_a_call_composes_it(made: Path) -> None:
     given = {"obs": spec().observations["obs"].normalized(obs["obs"])}
     sample, _ = reference._runtime.predict(given, noise, reference.plans["dense"])
     expected = literal(sample, obs["obs"])
-    found: dict[str, Any] = {
-        name: ttscompile.load(made / "artifact", name).predict_action(obs, noise, plan="dense")["action_pred"]
-        for name in RUNTIMES
-    }
-    model = (made / "whole.onnx").read_bytes()
-    found["file"] = Episode(model, 3).call(obs, noise, np.zeros((6, 6), np.int8))["action_pred"]
-    module = ttscompile.to_module(made / "artifact", "dense")
-    with torch.inference_mode():
-        found["module"] = module({"obs": torch.from_numpy(obs["obs"])}, torch.from_numpy(noise.initial)).numpy()
+    found = every_way(made / "artifact", (made / "whole.onnx").read_bytes(), obs, noise)
     for name, actions in found.items():
         np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-4, err_msg=name)
 
@@ -125,7 +118,7 @@ def test_every_way_to_make_a_call_composes_it(made: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_a_call_goes_on_with_the_actions_of_the_call_before(made: Path, runtime: str) -> None:
-    policy, (_, start) = ttscompile.load(made / "artifact", runtime), rest_of(spec().sampler, 2)
+    policy, (rest, start) = ttscompile.load(made / "artifact", runtime), rest_of(spec().sampler, 2)
     before = policy.predict_action(*observed(0))["action_pred"]
     for call in (1, 2):
         obs, noise = observed(call)
@@ -136,23 +129,10 @@ def test_a_call_goes_on_with_the_actions_of_the_call_before(made: Path, runtime:
             own[:] = [own[0] - state[12], *back[:3, 3], *back[:2, :3].ravel(), own[10] - state[0], own[11]]
         initial = start.action * (going_on - STAYS) * STEEP + start.noise * noise.initial
         before = policy.predict_action(obs, noise)["action_pred"]
-        expected = literal(rest_alone(obs["obs"], initial.astype(np.float32)), obs["obs"])
+        sample = denoised_by(Arm().eval(), rest, spec(), obs, initial.astype(np.float32))
+        expected = literal(sample, obs["obs"])
         np.testing.assert_allclose(before, expected, rtol=0, atol=1e-4)
         assert policy.last_report is not None and policy.last_report.plan_name == "warm"
-
-
-def rest_alone(obs: np.ndarray, initial: np.ndarray) -> np.ndarray:
-    """The last two steps in torch, with the original network."""
-    rest, _ = rest_of(spec().sampler, 2)
-    seen, x = torch.from_numpy(spec().observations["obs"].normalized(obs)), torch.from_numpy(initial)
-    network = Arm().eval()
-    with torch.no_grad():
-        for k in range(2):
-            out = network(x, torch.full((len(x),), int(rest.timesteps[k])), seen)
-            x0 = float(rest.sample_to_x0[k]) * x + float(rest.out_to_x0[k]) * out
-            moved = float(rest.sample_to_next[k]) * x + float(rest.out_to_next[k]) * out
-            x = float(rest.x0_to_next[k]) * x0 + moved
-    return x.numpy()
 
 
 @pytest.mark.slow

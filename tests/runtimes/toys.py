@@ -284,3 +284,17 @@ def pruner_weights(program: Program) -> dict[str, torch.Tensor]:
     pruner = program.pieces.pruner
     own = () if pruner is None else [name for name in pruner.constants if name.startswith("pruner.")]
     return {name: torch.from_numpy(np.array(program.weights[name])) for name in own}
+
+
+def denoised_by(
+    network: torch.nn.Module, table: SamplerTable, spec: PolicySpec, obs: Mapping[str, Any], initial: np.ndarray
+) -> np.ndarray:
+    """The sample after a loop without noise over an original network, step by step in torch, ``[B, T, D]``."""
+    seen, x = torch.from_numpy(spec.observations["obs"].normalized(obs["obs"])), torch.from_numpy(initial)
+    with torch.no_grad():
+        for k in range(table.steps):
+            out = network(x, torch.full((len(x),), int(table.timesteps[k])), seen)
+            x0 = float(table.sample_to_x0[k]) * x + float(table.out_to_x0[k]) * out
+            moved = float(table.sample_to_next[k]) * x + float(table.out_to_next[k]) * out
+            x = float(table.x0_to_next[k]) * x0 + moved
+    return x.numpy()

@@ -37,9 +37,7 @@ def main() -> None:
         numbers |= chunks(kind)
         (folder / "policy" / "model.safetensors").unlink()
         (folder / groots.BASE / "model.safetensors").unlink()
-        Path(make_lerobot_groot.BACKBONE, "video_preprocessor_config.json").unlink()
-        Path(make_lerobot_groot.BACKBONE).rename(groots.BACKBONE)
-        Path("nvidia").rmdir()
+        shutil.rmtree("nvidia")  # the backbone, which is that of ``groots``
     path = Path(__file__).with_name("lerobot_groot_eef.npz")
     np.savez_compressed(path, **numbers)
     print(path, path.stat().st_size, "bytes")
