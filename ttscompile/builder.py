@@ -52,7 +52,7 @@ def build(
 
     Tried are loops, numbers and places of computed steps with their corrections, eight bits by part, and the tokens of
     image encoders. All are judged on held-out episodes against the original, and timed on this machine. If
-    other plans take at most a tenth longer than the fastest, the nearest of them is chosen.
+    other plans take at most a fifth longer than the fastest, the nearest of them is chosen.
 
     Args:
         checkpoint: see ``convert``.

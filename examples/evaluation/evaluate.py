@@ -164,14 +164,19 @@ def _by_task(label: str, rollout: Rollout, baseline: Rollout) -> dict[str, Evalu
     return found
 
 
-def verdicts_of(evaluations: Sequence[Evaluation], margins: tuple[float, float]) -> list[tuple[Verdict, Verdict]]:
+def verdicts_of(
+    evaluations: Sequence[Evaluation], margins: tuple[float, float], looks: int = 1
+) -> list[tuple[Verdict, Verdict]]:
     """Of score and of success, for each variant but the first.
 
-    The variants share the error of 5 %. The two measures of a variant need not: it is called equivalent only if both
-    are.
+    The variants share the error of 5 %, and so do the looks. The two measures of a variant need not: it is called
+    equivalent only if both are.
+
+    Args:
+        looks: how often somebody looks at most, who drives more episodes where these do not settle it.
     """
     base_score, base_success = _columns(evaluations[0].rollout)
-    comparisons, found = len(evaluations) - 1, []
+    comparisons, found = looks * (len(evaluations) - 1), []
     for score, success in (_columns(each.rollout) for each in evaluations[1:]):
         by_score = verdict(score, base_score, margins[0], comparisons=comparisons)
         by_success = verdict(success, base_success, margins[1], shares=True, comparisons=comparisons)

@@ -3,15 +3,16 @@
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import demo
 import numpy as np
 import pytest
-from demo import ORIGINAL, Step, best_of, conclusion, drive, speed_table, steps_to, time_steps
+from demo import LOOKS, ORIGINAL, Step, best_of, conclusion, drive, settle, speed_table, steps_to, time_steps
 from episodes import Episodes
-from equivalence import SCORE_MARGIN, SUCCESS_MARGIN, TOO_FEW, WORSE, Verdict, verdict
+from equivalence import EQUIVALENT, SCORE_MARGIN, SUCCESS_MARGIN, TOO_FEW, WORSE, Verdict, joined, verdict
 from evaluate import Evaluation, summarise, verdict_table, verdicts_of
 from rollout import Episode, Rollout
 from variants import open_variant, run
@@ -100,6 +101,36 @@ def test_the_fastest_equivalent_plan_is_shown() -> None:
     assert best_of(verdicts(200, 100, 200)) == 1
     assert best_of(verdicts(200, 100, 100)) == 1  # none: the nearest
     assert best_of(verdicts(200, 100)) == 0
+
+
+FIRST, SECOND = (["schedule"], 400), (["schedule"], 800)
+
+
+@pytest.mark.parametrize(
+    ("solved", "looked"),
+    [
+        ([(200, 200)], [(["schedule"], 400)]),
+        ([(200, 180), (200, 199)], [(["schedule"], 400), (["schedule"], 800)]),
+        (
+            [(200, 100), (200, 100), (200, 100, 200)],
+            [(["schedule"], 400), (["schedule"], 800), (["schedule", SAFE], 800)],
+        ),
+    ],
+    ids=["at the first look", "in twice as many", "not before safe"],
+)
+def test_the_robot_is_driven_until_a_plan_is_equivalent(
+    solved: list[tuple[int, ...]], looked: list[tuple[list[str], int]]
+) -> None:
+    asked, coming = list[tuple[list[str], int]](), iter(solved)
+
+    def driven(plans: Sequence[str], count: int) -> list[Evaluation]:
+        asked.append((list(plans), count))
+        return evaluations(*next(coming))
+
+    _, said = settle(["schedule", SAFE], 400, driven)
+    assert asked == looked
+    assert joined(said[-1]) == EQUIVALENT
+    assert {each.comparisons for pair in said for each in pair} == {LOOKS * len(said)}  # they share the error
 
 
 def test_the_steps_to_a_plan_are_named_by_what_it_says() -> None:

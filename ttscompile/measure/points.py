@@ -132,9 +132,10 @@ def efficient(points: Sequence[AnyPoint]) -> tuple[AnyPoint, ...]:
     return tuple(best)
 
 
-ALIKE = 1.1
+ALIKE = 1.2
 """Plans that take at most so many times as long as the fastest count as equally fast: the nearest of them is chosen.
-Where little is left to compute, a further step costs less than timing is off, and makes a plan much nearer."""
+Where little is left to compute, a further step costs little and makes a plan much nearer: the fourth of the demo's ten
+steps takes an eighth longer, is 2.5 times as near, and saves a point of success."""
 
 
 def fastest(times_ms: Mapping[str, float], distances: Mapping[str, float]) -> str:
