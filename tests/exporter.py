@@ -8,14 +8,10 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any
 
 import onnx
-import onnx_ir as ir
 import pytest
 import torch
-from onnxscript.rewriter._basics import MatchResult
-from onnxscript.rewriter._matcher import SimplePatternMatcher
 from torch.onnx._internal.exporter import _fx_passes
 from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torch.onnx._internal.fx.passes.type_promotion import TypePromotionTable, get_type_promotion_rule
@@ -55,21 +51,8 @@ def exported_once(directory: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(program, "_export", once)
         patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib)))
-        patch.setattr(SimplePatternMatcher, "match", looking_first(SimplePatternMatcher.match))
         patch.setattr(_fx_passes, "insert_type_promotion_nodes", where_needed(_fx_passes.insert_type_promotion_nodes))
         yield
-
-
-def looking_first(match: Callable[..., MatchResult]) -> Callable[..., MatchResult]:
-    """onnxscript lists all nodes of a model, for each of them, before it sees that a rule is not about this one."""
-
-    def own(matcher: SimplePatternMatcher, model: object, graph: object, node: ir.Node, **options: Any) -> MatchResult:
-        wanted = matcher.pattern.output_nodes[0].op_identifier()
-        if wanted not in (None, node.op_identifier()):
-            return MatchResult().fail("another operation")
-        return match(matcher, model, graph, node, **options)
-
-    return own
 
 
 def where_needed(promote: Callable[[torch.fx.GraphModule], None]) -> Callable[[torch.fx.GraphModule], None]:

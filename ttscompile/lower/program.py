@@ -28,6 +28,7 @@ from .advance import advances, lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
 from .onnx_model import name_model, only
+from .simplify import simplify
 from .translations import TRANSLATIONS
 
 OPSET = 23
@@ -151,11 +152,13 @@ def _run_exporter(graphs: list[Graph]) -> onnx.ModelProto:
         given = _Arguments(sum(len(graph.outputs) for graph in graphs))
         program = torch.export.export(given, tuple(examples), dynamic_shapes=(tuple(dynamic),), strict=False)
         _write(program, graphs)
+        table = dict(TRANSLATIONS)
         result = torch.onnx.export(
-            program, (), dynamo=True, opset_version=OPSET, verbose=False, custom_translation_table=dict(TRANSLATIONS)
+            program, (), opset_version=OPSET, verbose=False, custom_translation_table=table, optimize=False
         )
-    assert result is not None
-    return result.model_proto
+        assert result is not None
+        simplify(result.model)
+        return result.model_proto
 
 
 class _Arguments(torch.nn.Module):
