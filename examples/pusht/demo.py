@@ -6,7 +6,7 @@ The policy pushes a T-shaped block onto its goal; LeRobot's own code trained it,
 action models are. The demo records 16 episodes, has ``ttscompile build`` find the fastest plan, drives 2,400
 paired episodes with it and with the original, and times it beside PyTorch. It ends with a verdict: equivalent to the
 original within a margin, or not. Where 2,400 episodes do not show that it is, as many again are driven, and where they
-do not either, ``safe`` is. That takes about a quarter of an hour on 2 cores; everything it makes is in
+do not either, ``safe`` is. That takes 15 to 20 minutes on 2 cores; everything it makes is in
 ``build/pusht/POLICY``.
 """
 
