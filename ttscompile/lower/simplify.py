@@ -20,9 +20,7 @@ _RULES = RewritePass(
         rules.remove_optional_bias_from_conv_rule,
     )
 )
-_UNUSED = ir.passes.Sequential(
-    common.RemoveUnusedNodesPass(), common.RemoveUnusedFunctionsPass(), common.RemoveUnusedOpsetsPass()
-)
+_UNUSED = ir.passes.Sequential(common.RemoveUnusedNodesPass(), common.RemoveUnusedOpsetsPass())
 _TIDY = ir.passes.Sequential(
     common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
     common.LiftSubgraphInitializersToMainGraphPass(),
