@@ -173,7 +173,7 @@ def verdicts_of(
     equivalent only if both are.
 
     Args:
-        looks: how often somebody looks at most, who drives more episodes where these do not settle it.
+        looks: how often at most the variants are judged, by more episodes each time, until a verdict is as hoped.
     """
     base_score, base_success = _columns(evaluations[0].rollout)
     comparisons, found = looks * (len(evaluations) - 1), []

@@ -5,9 +5,8 @@
 The policy pushes a T-shaped block onto its goal; LeRobot's own code trained it, by flow matching, as vision-language-
 action models are. The demo records 16 episodes, has ``ttscompile build`` find the fastest plan, drives 2,400
 paired episodes with it and with the original, and times it beside PyTorch. It ends with a verdict: equivalent to the
-original within a margin, or not. Where 2,400 episodes do not show that it is, as many again are driven, and where they
-do not either, ``safe`` is. That takes 15 to 20 minutes on 2 cores; everything it makes is in
-``build/pusht/POLICY``.
+original within a margin, or not. If 2,400 episodes do not show that it is, the demo drives as many again, and if those
+do not, ``safe`` as well. That takes 15 to 20 minutes on 2 cores; everything it makes is in ``build/pusht/POLICY``.
 """
 
 from __future__ import annotations
@@ -61,8 +60,7 @@ POLICIES: Mapping[str, tuple[Path, str | None]] = {
 """Checkpoints that push the T, and their instructions."""
 ORIGINAL = "original"
 LOOKS = 2
-"""Where the episodes do not show that the default is equivalent, so many times as many are driven. The looks share
-the error of 5 %."""
+"""How often at most it is asked whether the default is equivalent, of more episodes each time. They share the error."""
 BITS = {INT8: 8, BF16: 16, FP16: 16}
 """Of a weight, by its precision."""
 
@@ -123,17 +121,20 @@ def drive(artifact: Path, plans: Sequence[str], seeds: Sequence[int], batch: int
 def settle(
     plans: Sequence[str], episodes: int, driven: Callable[[Sequence[str], int], list[Evaluation]]
 ) -> tuple[list[Evaluation], list[tuple[Verdict, Verdict]]]:
-    """Drive until a plan is known to be equivalent: the first in so many episodes, in more, then all in as many.
+    """Drive the robot until a plan is known to be equivalent to the original.
+
+    The first plan is driven in more and more episodes, ``LOOKS`` times. If it is not known to be equivalent then, all
+    plans are driven in as many.
 
     Args:
         plans: fastest first.
-        episodes: of the first look.
-        driven: the evaluations of the original and of some plans, in so many episodes.
+        episodes: of the first look, and of each further one as many more.
+        driven: gives the evaluations of the original and of some plans, in so many episodes.
 
     Returns:
         The last evaluations, and what they say.
     """
-    tries = [(plans[:1], episodes), (plans[:1], LOOKS * episodes)]
+    tries = [(plans[:1], look * episodes) for look in range(1, LOOKS + 1)]
     if len(plans) > 1:
         tries.append((plans, LOOKS * episodes))
     for names, count in tries:
@@ -264,7 +265,9 @@ def main(
     print_frontier(built, artifact, console, threads=1)
 
     console.rule("3 of 4: drive the robot with the original and with the compiled policy")
-    plans = [built.manifest.default_plan, *(name for name in built.plans if name == SAFE)]
+    plans = [built.manifest.default_plan]
+    if SAFE in built.plans:
+        plans.append(SAFE)
 
     def driven(names: Sequence[str], count: int) -> list[Evaluation]:
         return drive(artifact, names, range(first_seed, first_seed + count), batch, jobs or machine["cores"])
