@@ -190,6 +190,8 @@ def verdict_table(evaluations: Sequence[Evaluation], verdicts: Sequence[tuple[Ve
     title = f"as good as {evaluations[0].label}? {score.episodes} paired episodes"
     allowed = f"{EQUIVALENT}: less than {score.margin:g} of the score and {success.margin:.0%} of success is lost"
     level = f"all {len(verdicts)} rows hold with 95 %" if len(verdicts) > 1 else "with 95 % confidence"
+    if (looks := score.comparisons // len(verdicts)) > 1:
+        level += f", in {looks} looks together"
     table = Table(title=title, caption=f"{allowed}, {level}")
     table.add_column("variant", overflow="fold")
     for column in ("verdict", "score", "success"):

@@ -127,10 +127,11 @@ def test_the_robot_is_driven_until_a_plan_is_equivalent(
         asked.append((list(plans), count))
         return evaluations(*next(coming))
 
-    _, said = settle(["schedule", SAFE], 400, driven)
+    last, said = settle(["schedule", SAFE], 400, driven)
     assert asked == looked
     assert joined(said[-1]) == EQUIVALENT
     assert {each.comparisons for pair in said for each in pair} == {LOOKS * len(said)}  # they share the error
+    assert "in 2 looks together" in str(verdict_table(last, said).caption)
 
 
 def test_the_steps_to_a_plan_are_named_by_what_it_says() -> None:

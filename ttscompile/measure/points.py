@@ -135,7 +135,7 @@ def efficient(points: Sequence[AnyPoint]) -> tuple[AnyPoint, ...]:
 ALIKE = 1.2
 """Plans that take at most so many times as long as the fastest count as equally fast: the nearest of them is chosen.
 Where little is left to compute, a further step costs little and makes a plan much nearer: the fourth of the demo's ten
-steps takes 9 to 13 % longer and is 2.3 times as near (``docs/evidence/results.md``, what the demo shows)."""
+steps takes 9 to 14 % longer and is 2.3 times as near (``docs/evidence/results.md``, what the demo shows)."""
 
 
 def fastest(times_ms: Mapping[str, float], distances: Mapping[str, float]) -> str:
