@@ -17,7 +17,7 @@ from ttscompile.ir.graph import Graph, TensorType
 TOKENS, WIDTH, HEADS, CONDITIONS = 6, 16, 4, 3
 
 
-def table(steps: int = 4, clip: float | None = 1.0, **columns: float) -> SamplerTable:
+def table(steps: int = 4, /, clip: float | None = 1.0, **columns: float) -> SamplerTable:
     """A sampler with the same coefficients at every step; those that are not named are zero."""
     values = {name: np.full(steps, columns.get(name, 0.0), np.float32) for name in SamplerTable.COLUMNS}
     return SamplerTable(name="ddpm", timesteps=np.arange(steps)[::-1].copy(), clip=clip, **values)

@@ -17,7 +17,7 @@ from ttscompile.lower.precision import lower_precision, quantize_model
 
 COUNT, CHANNELS = 3, 8
 WIDTH = COUNT * CHANNELS
-PLAIN = {"q_num_heads": COUNT, "kv_num_heads": COUNT}
+PLAIN: dict[str, Any] = {"q_num_heads": COUNT, "kv_num_heads": COUNT}
 WEIGHTS = {"w": np.eye(WIDTH, dtype=np.float32)}
 
 
@@ -178,7 +178,7 @@ def test_streams_and_heads_do_not_see_each_other() -> None:
 def test_nothing_saturates_on_any_processor() -> None:
     """The largest sums of two products of a query with a key: keys are as far from their mean as integers tell."""
     q = np.full((1, FEWEST, WIDTH), 3.0, np.float32)
-    k = np.repeat(np.tile(np.float32([-1, 1]), FEWEST // 2), WIDTH).reshape(1, FEWEST, WIDTH)
+    k = np.repeat(np.tile(np.array([-1, 1], np.float32), FEWEST // 2), WIDTH).reshape(1, FEWEST, WIDTH)
     found, exact = both(FEWEST, FEWEST, {"q": q, "k": k, "v": 2 * k + 1}, scale=0.01)
     np.testing.assert_allclose(found, exact, atol=0.01)
     assert np.ptp(k) > 0 and exact.mean() > 1.2, "keys that all score alike tell nothing"

@@ -93,13 +93,11 @@ def moving_graphs(draw: st.DrawFn) -> tuple[Graph, dict[str, torch.Tensor]]:  # 
         if choice == "permute":
             recorder.add("aten.permute.default", Ref(name), tuple(draw(st.permutations(range(rank)))))
         elif choice == "transpose" and rank:
-            axis = st.integers(-rank, rank - 1)
-            recorder.add("aten.transpose.int", Ref(name), draw(axis), draw(axis))
+            axes = st.integers(-rank, rank - 1)
+            recorder.add("aten.transpose.int", Ref(name), draw(axes), draw(axes))
         elif choice == "reshape" and product(shape) is not None:
-            numbers = [n for n in shape if not isinstance(n, Batch)]
-            batch = [n for n in shape if isinstance(n, Batch)]
-            target = draw(st.permutations([*numbers, *batch]))
-            recorder.add("aten.reshape.default", Ref(name), tuple(target))
+            target = tuple(draw(st.permutations(shape)))
+            recorder.add("aten.reshape.default", Ref(name), target)
         elif choice == "merge" and rank > 1:
             axis = draw(st.integers(0, rank - 2))
             if (size := product(shape[axis : axis + 2])) is not None:

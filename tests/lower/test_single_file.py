@@ -16,7 +16,7 @@ from onnx import GraphProto
 from torch import nn
 
 import ttscompile
-from tests.lower.whole_call import Arrays, Episode, groups, inputs, make, policy_groups
+from tests.lower.whole_call import Episode, groups, inputs, make, policy_groups
 from tests.passes.modules import MODULES, spec
 from tests.rounding import allowed, assert_equal_but_for_rounding, bound
 from tests.runtimes.agreement import call_terms
@@ -161,7 +161,7 @@ def test_what_is_not_kept_is_not_there(tmp_path: Path) -> None:
     obs, noise = inputs(policy, np.random.default_rng(0), 1)
     episode = Episode(model, 1)
     dense = np.zeros((5, 5), np.int8)
-    out = episode.call(obs, noise, dense, keep=False)
+    out = episode.call(obs, noise, dense, rollout_keep=np.zeros((5, 5), np.bool_))
     assert episode.rows.shape == (0, 1, 3, 4)
     assert (episode.index == -1).all()
     reads = np.full((5, 5), Source.ROLLOUT, np.int8)
@@ -261,7 +261,7 @@ def test_the_compiler_writes_it(name: str, compiled_module: Callable[[str], tupl
     written = np.zeros(episode.index.shape[1:], np.bool_)
     terms = call_terms(load_artifact(folder / "artifact"))
     for _ in range(3):
-        plan = random_plan(rng, *written.shape[:1], policy_groups(folder / "artifact"), written, 0.3)
+        plan = random_plan(rng, len(written), policy_groups(folder / "artifact"), written, 0.3)
         obs, noise = inputs(policy, rng, 2)
         expected = policy.predict_action(obs, noise=noise, plan=plan)
         found = episode.call(obs, noise, plan)
@@ -319,7 +319,7 @@ def test_the_real_policy_in_a_process_that_never_heard_of_us(
     assert (np.abs(found - expected) * np.abs(normalizer.scale) / 2).max() < allowed
 
 
-def recorded_episode(policy: CompiledPolicy, streams: int) -> tuple[Arrays, np.ndarray]:
+def recorded_episode(policy: CompiledPolicy, streams: int) -> tuple[dict[str, Any], np.ndarray]:
     """Four calls: dense, and three plans of all sources; inputs with one row a call, and the actions."""
     rng = np.random.default_rng(streams)
     program_groups = [0, 1, 2] * 8
@@ -331,7 +331,7 @@ def recorded_episode(policy: CompiledPolicy, streams: int) -> tuple[Arrays, np.n
         _, noise = inputs(policy, rng, streams)
         obs = rng.uniform(100, 400, (streams, 2, 20)).astype(np.float32)
         actions.append(policy.predict_action({"obs": obs}, noise=noise, plan=plan)["action"])
-        for name, value in zip(rows, (obs, noise.initial, noise.steps, plan), strict=True):
-            rows[name].append(value[None] if name == "plan" else np.asarray(value))
+        for name, value in zip(rows, (obs, noise.initial, noise.steps, plan[None]), strict=True):
+            rows[name].append(np.asarray(value))
         written |= plan == Source.COMPUTE
     return {name: np.stack(values) for name, values in rows.items()}, np.stack(actions)

@@ -54,8 +54,8 @@ def lowered(inner: tuple[int, ...], calls: Sequence[Call]) -> set[str]:
 @pytest.mark.parametrize("inner", [(5,), (4, 7)])
 def test_group_norm_is_one_normalisation(inner: tuple[int, ...]) -> None:
     size = (CHANNELS,)
-    with_weights = ("group_norm.default", {"w": size, "b": size}, (3, "w", "b", 1e-3, False))
-    without_bias = ("group_norm.default", {"w": size}, (2, "w", None, 1e-5, True))
+    with_weights: Call = ("group_norm.default", {"w": size, "b": size}, (3, "w", "b", 1e-3, False))
+    without_bias: Call = ("group_norm.default", {"w": size}, (2, "w", None, 1e-5, True))
     names = lowered(inner, [with_weights, without_bias, ("group_norm.default", {}, (3,))])
     assert "InstanceNormalization" in names and not names & {"ReduceMean", "GroupNormalization"}
 

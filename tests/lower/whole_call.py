@@ -44,13 +44,12 @@ class Episode:
         self.rows = np.zeros((0, *shapes["rollout_rows"][1:]), np.float32)
         self.index = np.full((streams, *shapes["rollout_index"][1:]), -1, np.int64)
 
-    def call(self, obs: Arrays, noise: Noise, plan: np.ndarray, keep: bool = True, **more: Any) -> Arrays:
+    def call(self, obs: Arrays, noise: Noise, plan: np.ndarray, **more: Any) -> Arrays:
         plans = plan.astype(np.int8).reshape(-1, *plan.shape[-2:])  # one for all streams, or one for each
-        feeds = {**obs, **more, "initial_noise": noise.initial, "plan": plans}
+        feeds = {"rollout_keep": np.ones(self.index.shape[1:], np.bool_), "plan": plans, **obs, **more}
         if self.takes_noise:
             feeds["step_noise"] = noise.steps
-        feeds |= {"rollout_rows": self.rows, "rollout_index": self.index}
-        feeds["rollout_keep"] = np.full(self.index.shape[1:], keep)
+        feeds |= {"rollout_rows": self.rows, "rollout_index": self.index, "initial_noise": noise.initial}
         names = [value.name for value in self.session.get_outputs()]
         out = dict(zip(names, self.session.run(names, feeds), strict=True))
         self.rows, self.index = out["rollout_rows_next"], out["rollout_index_next"]
