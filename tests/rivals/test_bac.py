@@ -34,7 +34,7 @@ def test_the_schedules_are_the_best_of_all(seed: int, steps: int) -> None:
 
 def test_a_block_that_changes_once_is_computed_there() -> None:
     """By hand: steps 0..2 are alike, and 3..5; everything else has similarity 0."""
-    similarity = np.kron(np.eye(2), np.ones((3, 3)))
+    similarity: np.ndarray = np.kron(np.eye(2), np.ones((3, 3)))
     one, two, _ = best_schedules(similarity, 3)
     assert (one.score, two.score) == (3, 6)
     np.testing.assert_array_equal(np.flatnonzero(two.computed), [0, 3])

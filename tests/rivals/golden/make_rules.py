@@ -136,7 +136,7 @@ def main() -> None:
         parser.add_argument(name, type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path(__file__).with_name("rules.npz"))
     given = parser.parse_args()
-    arrays = {**teacache(given.teacache), **dbcache(given.cache_dit), **taylorseer(given.taylorseer)}
+    arrays: dict[str, Any] = {**teacache(given.teacache), **dbcache(given.cache_dit), **taylorseer(given.taylorseer)}
     np.savez(given.output, **arrays)
 
 
