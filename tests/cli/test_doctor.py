@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ from ttscompile.core.finding import Finding, Level
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor, machine as doctor_machine
 from ttscompile.doctor.target import artifact_findings
+from ttscompile.measure.versions import release
 
 
 @pytest.fixture(scope="module")
@@ -105,15 +109,14 @@ def test_it_says_what_is_missing_where_hardly_anything_is_installed(calibrated: 
 
 
 def test_packages_that_are_too_old_or_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = doctor_machine.version
     versions = {"numpy": "1.26.4", "torch": None, "rich": None}
 
     def version(name: str) -> str:
         if name in versions:
             if versions[name] is None:
-                raise doctor_machine.PackageNotFoundError(name)
+                raise metadata.PackageNotFoundError(name)
             return str(versions[name])
-        return real(name)
+        return metadata.version(name)
 
     monkeypatch.setattr(doctor_machine, "version", version)
     findings = doctor_machine.package_findings()
@@ -130,7 +133,7 @@ def test_requirements_are_read_with_their_extras() -> None:
     wanted = doctor_machine.requirements()
     assert ("numpy", "2.0", "") in wanted
     assert ("torch", "2.11", "compile") in wanted
-    assert doctor_machine.release("2.13.0+cpu") == (2, 13)
+    assert release("2.13.0+cpu") == (2, 13)
 
 
 @pytest.mark.parametrize(
@@ -153,14 +156,14 @@ def test_requirements_are_read_with_their_extras() -> None:
 def test_what_the_system_says_of_itself(
     files: dict[str, str], what: str, level: Level, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor_machine.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     finding = found(what, doctor_machine.machine_findings(system(tmp_path, **files)))
     assert finding.level is level
     assert told in finding.found
 
 
 def test_arm_processors_have_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor_machine.platform, "machine", lambda: "aarch64")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     root = system(tmp_path, proc__cpuinfo="Features\t: fp asimd asimddp i8mm\n")
     assert found("instructions", doctor_machine.machine_findings(root)).found.startswith("NEON, dotprod, i8mm; not")
 
@@ -177,7 +180,7 @@ def test_hyperthreads_of_a_core_count_once(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_busy_machine_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     loads: Any = (1000.0, 0.0, 0.0)
-    monkeypatch.setattr(doctor_machine.os, "getloadavg", lambda: loads)
+    monkeypatch.setattr(os, "getloadavg", lambda: loads)
     assert found("load", doctor_machine.machine_findings()).level is Level.WARNING
 
 

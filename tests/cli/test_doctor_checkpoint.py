@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +26,9 @@ def checkpoint(tmp_path: Path) -> Path:
 def recorded(path: Path, state: np.ndarray) -> Path:
     count = len(state)
     tokens = np.zeros((count, 9), np.int64)
-    ends, meta = np.array([count // 2, count]), np.array('{"frames": true}')
-    rest = {"observation.language.tokens": tokens, "observation.language.attention_mask": tokens == 0}
-    np.savez(path, episode_ends=ends, meta=meta, **{"observation.state": state}, **rest)
+    arrays: dict[str, Any] = {"observation.state": state, "observation.language.tokens": tokens}
+    arrays |= {"observation.language.attention_mask": tokens == 0, "meta": '{"frames": true}'}
+    np.savez(path, episode_ends=[count // 2, count], **arrays)
     return path
 
 

@@ -176,7 +176,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     manifest = artifact.manifest
     spec = replace(manifest.spec, source={HOSTILE: HOSTILE}, sampler=replace(manifest.spec.sampler, name=HOSTILE))
     blocks = tuple(replace(block, kind=HOSTILE, reason=HOSTILE) for block in manifest.blocks)
-    record = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE}, "skipped": {HOSTILE: HOSTILE}}
+    record: dict[str, Any] = {HOSTILE: HOSTILE, "plans": {HOSTILE: SCORE}, "skipped": {HOSTILE: HOSTILE}}
     record |= {"told": {HOSTILE: HOSTILE}, "learned": [HOSTILE, HOSTILE]}
     tried = {"name": HOSTILE, "told": HOSTILE, "distance": 0.1, "interval": [0.0, 0.2], "milliseconds": 1.0}
     record |= {"frontier": [{**tried, "worst": 2.0, "near": True}], "default_plan": HOSTILE}

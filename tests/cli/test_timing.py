@@ -22,10 +22,11 @@ from ttscompile.runtimes.random_calls import Observation
 
 def test_policies_of_one_shape_are_told_apart_by_their_statistics() -> None:
     plain = toy_spec()
-    scaled = Affine(np.full(3, 2.0), np.zeros(3))
+    scaled = Affine(np.full(3, 2.0), np.zeros(3, np.float32))
     observed = replace(plain, observations={"obs": replace(plain.observations["obs"], normalizer=scaled)})
-    acting = replace(plain, chunk=replace(plain.chunk, normalizer=Affine(np.ones(2), np.ones(2))))
-    moved = replace(plain, chunk=replace(plain.chunk, normalizer=Affine(np.ones(2), np.zeros(2))))
+    one, zero = np.ones(2, np.float32), np.zeros(2, np.float32)
+    acting = replace(plain, chunk=replace(plain.chunk, normalizer=Affine(one, one)))
+    moved = replace(plain, chunk=replace(plain.chunk, normalizer=Affine(one, zero)))
     assert _different_statistics(plain, plain) == []
     assert _different_statistics(observed, observed) == []
     assert _different_statistics(plain, observed) == ["observation 'obs'"]

@@ -38,7 +38,7 @@ UNKIND = (
     "0x1",
 )
 
-NEEDED = {
+NEEDED: dict[str, list[tuple[str, ...]]] = {
     "bench": [
         ("A", "--calls", "1"),
         ("A", "--calls", "1", "--control-hz", "1"),
