@@ -11,6 +11,7 @@ from torch import nn
 import ttscompile
 from tests.once import Once
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.calibration.pipeline import CalibrationResult
 
 STEPS, HORIZON, CHANNELS, WIDTH, LAYERS = 10, 8, 2, 32, 3
 
@@ -89,3 +90,8 @@ def whole_steps(directory: Path, recording: Path) -> Path:
     """The artifact with a schedule that computes two of its ten steps."""
     ttscompile.calibrate(directory, [recording], 0.8, "interval", progress=False)
     return directory
+
+
+def errors(result: CalibrationResult) -> dict[str, float]:
+    """By plan, of those that were judged with the noise of the dense policy."""
+    return {name: score.error for name, score in result.plans.items() if score.error is not None}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from ttscompile.artifact.files import exchange, lock_folder
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import locked
 from ttscompile.calibration import pipeline
+from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.pipeline import CalibrationResult
 from ttscompile.errors import ArtifactError
 
@@ -32,7 +34,6 @@ def calibrate(artifact: Path, recording: Path) -> CalibrationResult:
 def test_a_calibration_refuses_all_others_from_its_beginning(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    load_episodes = pipeline.load_episodes
     began: list[str] = []
 
     def meanwhile(*arguments: Any) -> Any:
@@ -78,15 +79,13 @@ def test_a_folder_that_was_replaced_before_it_was_locked(
     artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What would be locked is no longer at this path, and whoever comes there next would have it to himself."""
-    from ttscompile.artifact import files
-
     (tmp_path / "other").mkdir()
-    flock = files.fcntl.flock
+    flock = fcntl.flock
 
     def late(descriptor: int, operation: int) -> None:
         exchange(artifact, tmp_path / "other")
         flock(descriptor, operation)
 
-    monkeypatch.setattr(files.fcntl, "flock", late)
+    monkeypatch.setattr(fcntl, "flock", late)
     with pytest.raises(BlockingIOError), lock_folder(artifact):
         pass

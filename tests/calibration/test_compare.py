@@ -48,7 +48,9 @@ def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def other_sampler(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same network with a deterministic sampler of five steps."""
     spec = policies.spec(noise=0.0)
-    rows = {name: np.ascontiguousarray(getattr(spec.sampler, name)[::2]) for name in SamplerTable.COLUMNS}
+    rows: dict[str, Any] = {
+        name: np.ascontiguousarray(getattr(spec.sampler, name)[::2]) for name in SamplerTable.COLUMNS
+    }
     sampler = replace(spec.sampler, name="five", timesteps=spec.sampler.timesteps[::2].copy(), **rows)
     directory = tmp_path_factory.mktemp("five") / "five"
     ttscompile.compile_denoiser(policies.Mixer(0).eval(), replace(spec, sampler=sampler), directory)
@@ -92,16 +94,22 @@ def test_nothing_is_written(planned: Path, recording: Path) -> None:
     assert {path.name: path.read_bytes() for path in planned.iterdir()} == before
 
 
-def test_the_truth_has_all_tokens(once: Once, tmp_path: Path) -> None:
-    """With a threshold that nothing passes the newest of two frames is taken for the one before."""
+@pytest.fixture
+def seen(once: Once, tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
+    """A policy with cameras, a recording for it, and what its cameras show in there."""
 
     def make(folder: Path) -> None:
         ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact")
 
-    folder, draw = shutil.copytree(once.folder("tokens in fp32", make) / "artifact", tmp_path / "own"), np.random
-    views = {key: draw.default_rng(0).random((8, 2, 3, cameras.SIDE, cameras.SIDE)) for key in cameras.CAMERAS}
-    recorded = tmp_path / "calls.npz"
-    np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
+    folder, size = once.folder("tokens in fp32", make) / "artifact", (8, 2, 3, cameras.SIDE, cameras.SIDE)
+    views: dict[str, Any] = {key: np.random.default_rng(0).random(size) for key in cameras.CAMERAS}
+    np.savez(tmp_path / "calls.npz", state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
+    return Path(shutil.copytree(folder, tmp_path / "own")), tmp_path / "calls.npz", views
+
+
+def test_the_truth_has_all_tokens(seen: tuple[Path, Path, dict[str, Any]]) -> None:
+    """With a threshold that nothing passes the newest of two frames is taken for the one before."""
+    folder, recorded, _ = seen
     dense = load_artifact(folder).plans["dense"]
     update_plans(folder, {"reusing": replace(dense, tokens=TokenReuse(100.0, 64))}, "reusing")
     whole, reusing = compare(folder, [recorded], calls=4).points
@@ -152,13 +160,13 @@ def test_the_frontier_is_what_nothing_beats() -> None:
 
 def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp_path: Path) -> None:
     path = tmp_path / "f.png"
-    arguments: tuple[Any, ...] = frontier.points, frontier.efficient()
-    write_picture(plot_frontier(*arguments, "title"), path)
+    figure = plot_frontier(frontier.points, frontier.efficient(), "title")
+    write_picture(figure, path)
     with Image.open(path) as picture:
-        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20) or ()}
     assert {(0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)} <= colours
     with pytest.raises(OutputError, match="folder that exists"):
-        write_picture(plot_frontier(*arguments, "title"), tmp_path / "none" / "f.png")
+        write_picture(figure, tmp_path / "none" / "f.png")
 
 
 def test_bench_prints_the_same_as_a_table_and_as_json(
@@ -232,16 +240,12 @@ def test_where_a_plan_is_far_by_number_of_the_action_and_by_call(frontier: Compa
     assert told["by_number"] == list(half.by_number)
 
 
-def test_the_furthest_calls_have_what_the_cameras_saw_and_are_drawn(once: Once, tmp_path: Path) -> None:
+def test_the_furthest_calls_have_what_the_cameras_saw_and_are_drawn(
+    seen: tuple[Path, Path, dict[str, Any]], tmp_path: Path
+) -> None:
     """Two artifacts of one checkpoint on one recording: ``bench A --with B -t FILE --plot``."""
-
-    def make(folder: Path) -> None:
-        ttscompile.compile_denoiser(*cameras.policy("clip"), folder / "artifact")
-
-    folder = shutil.copytree(once.folder("tokens in fp32", make) / "artifact", tmp_path / "own")
-    other, recorded = shutil.copytree(folder, tmp_path / "other"), tmp_path / "calls.npz"
-    views = {key: np.random.default_rng(0).random((8, 2, 3, cameras.SIDE, cameras.SIDE)) for key in cameras.CAMERAS}
-    np.savez(recorded, state=np.zeros((8, 2, 4), np.float32), episode_ends=np.array([4, 8]), **views)
+    folder, recorded, views = seen
+    other = shutil.copytree(folder, tmp_path / "other")
     far = compare(folder, [recorded], [other], calls=4).points[1].furthest[0]
     assert set(far.pictures) == set(cameras.CAMERAS)
     held_out = views[cameras.CAMERAS[0]][4 * far.episode + far.call, -1]

@@ -84,6 +84,7 @@ def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArra
 def test_the_same_calls_give_the_same_bytes(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=150)
     one, two = (fit_correction(task.executor, plan, task.calls, True) for _ in range(2))
+    assert one is not None and two is not None
     assert one.weights.tobytes() == two.weights.tobytes()
     assert one.bias.tobytes() == two.bias.tobytes()
     assert one.observed.tobytes() == two.observed.tobytes()

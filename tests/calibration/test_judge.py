@@ -137,8 +137,8 @@ def test_limits_of_a_difference_are_over_episodes() -> None:
         return Score(rooted(float(np.mean(gaps)), 1.0), (0, 0), None, None, 0, 0, 0, 1, gaps=(gaps, 1.0))
 
     near, far = score(0.04, 0.04, 0.04), score(0.09, 0.09, 0.09)
-    assert further(far, near) == (pytest.approx(0.1), pytest.approx(0.1))
-    assert further(near, far) == (pytest.approx(-0.1), pytest.approx(-0.1))
+    assert further(far, near) == pytest.approx((0.1, 0.1))
+    assert further(near, far) == pytest.approx((-0.1, -0.1))
     mixed = score(0.01, 0.04, 0.25)
     difference, limit = further(mixed, near)
     assert difference == pytest.approx(0.1**0.5 - 0.2)
@@ -196,13 +196,10 @@ def test_a_slow_original_answers_fewer_observations_evenly_spread(
 @pytest.fixture(scope="session")
 def flowing(once: Once) -> Path:
     """A policy whose sampler tells what its sample is made of in the middle."""
-
-    def make(directory: Path) -> None:
-        spec = policies.spec()
-        sampler = replace(flow_matching_table(policies.STEPS), timesteps=spec.sampler.timesteps)
-        ttscompile.compile_denoiser(policies.Mixer(0).eval(), replace(spec, sampler=sampler), directory)
-
-    return once.compiled("flowing mixer", make)[0]
+    spec = policies.spec()
+    sampler = replace(flow_matching_table(policies.STEPS), timesteps=spec.sampler.timesteps)
+    given = policies.Mixer(0).eval(), replace(spec, sampler=sampler)
+    return once.compiled("flowing mixer", lambda path: ttscompile.compile_denoiser(*given, path))[0]
 
 
 def warm(trials: Trials, last: int) -> Proposal:

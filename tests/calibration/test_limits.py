@@ -71,7 +71,8 @@ class _Slow:
 def test_the_search_ends_in_time_for_what_its_plan_still_takes() -> None:
     clock = _Hand(100.0)
     search: Any = _Slow(clock)
-    assert search_plan(search, clock) == ("found", 7, "time limit")
+    told: tuple[Any, int, str] = search_plan(search, clock)
+    assert told == ("found", 7, "time limit")
     assert clock.now == 95.0
 
 
@@ -167,12 +168,14 @@ def test_a_baseline_that_diverges_is_worse_than_any_plan(
 
     def diverging(self: Runtime, obs: Any, noise: Any, plan: Plan, prefix: Any = None) -> Any:
         sample, report = predict(self, obs, noise, plan, prefix)
-        return sample * float("nan") if np.array_equal(plan.cells, uniform_plan(10, 6, 5)) else sample, report
+        fails = plan.cells is not None and np.array_equal(plan.cells, uniform_plan(10, 6, 5))
+        return sample * float("nan") if fails else sample, report
 
     monkeypatch.setattr(Runtime, "predict", diverging)
     result = calibrate(artifact, [recording], 0.55, "deepcache", progress=False, max_minutes=1e-6)
-    assert result.plans["uniform"].error == pytest.approx(LARGEST)
-    assert result.plans[result.default_plan].error < 1
+    error = policies.errors(result)
+    assert error["uniform"] == pytest.approx(LARGEST)
+    assert error[result.default_plan] < 1
     record = load_artifact(artifact).manifest.calibration or {}
     assert record["plans"]["uniform"]["error"] == pytest.approx(LARGEST)
 
@@ -182,14 +185,17 @@ def test_a_negative_seed_is_refused(artifact: Path, recording: Path) -> None:
         calibrate(artifact, [recording], 0.7, seed=-1, progress=False)
     with pytest.raises(CalibrationError, match="found -1"):
         compare(artifact, [recording], seed=-1)
+    wrong: dict[str, Any]
     for name in ("seed", "threads", "max_intervals"):
+        wrong = {name: 0.5}
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found 0.5"):
-            calibrate(artifact, [recording], 0.7, **{name: 0.5}, progress=False)
+            calibrate(artifact, [recording], 0.7, **wrong, progress=False)
     with pytest.raises(CalibrationError, match="max_intervals must be an integer of at least 1; found 0"):
         calibrate(artifact, [recording], 0.7, max_intervals=0, progress=False)
     for name in ("calls", "seed", "threads"):
+        wrong = {name: True}
         with pytest.raises(CalibrationError, match=f"{name} must be an integer of at least .; found True"):
-            compare(artifact, [recording], **{name: True})
+            compare(artifact, [recording], **wrong)
 
 
 def test_a_state_that_cannot_be_removed_is_an_error(

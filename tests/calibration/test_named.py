@@ -15,6 +15,8 @@ from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
 
+from . import policies
+
 pytestmark = pytest.mark.slow
 
 
@@ -29,6 +31,7 @@ def calibrated(
 
 def computed(artifact: Path, name: str) -> list[int]:
     plan = load_artifact(artifact).plans[name].cells
+    assert plan is not None
     rows = (plan == Source.COMPUTE).all(1)
     np.testing.assert_array_equal((plan == Source.COMPUTE).any(1), rows)  # whole steps
     return [int(k) for k in np.flatnonzero(rows)]
@@ -44,7 +47,8 @@ def test_safe_computes_twice_as_much_and_fast_half_each_with_its_own_score(
         "schedule": 4,
         "fast": 2,
     }
-    assert result.plans["safe"].error < result.plans["schedule"].error < result.plans["fast"].error
+    error = policies.errors(result)
+    assert error["safe"] < error["schedule"] < error["fast"]
     assert result.plans["safe"].distance < result.plans["schedule"].distance < result.plans["fast"].distance
     corrections = [loaded.plans[name].correction for name in ("safe", "schedule", "fast")]
     weights = [one.weights.tobytes() for one in corrections if one is not None]

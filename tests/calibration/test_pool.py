@@ -24,7 +24,7 @@ from ttscompile.pool import Here, RayPool, Work
 from . import policies
 from .pools import Elsewhere, needs_ray
 
-SEARCH = {"target_sparsity": 0.7, "max_intervals": 6, "progress": False}
+SEARCH: dict[str, Any] = {"target_sparsity": 0.7, "max_intervals": 6, "progress": False}
 
 
 @pytest.fixture(scope="module")

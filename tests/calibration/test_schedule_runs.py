@@ -79,8 +79,8 @@ def test_what_is_judged_is_bounded_as_a_call_is(task: Task, monkeypatch: pytest.
     """A correction can leave what the sampler has clipped; a call clips that once more."""
     model, table = task.executor.model, task.executor.view.manifest.spec.sampler
     last = np.arange(table.steps) == table.steps - 1
-    columns = {name: np.where(last, float(name == "x0_to_next"), getattr(table, name)) for name in table.COLUMNS[2:]}
-    monkeypatch.setattr(model, "sampler", TorchSampler(replace(table, clip=0.05, **columns)))
+    rows: dict[str, Any] = {n: np.where(last, float(n == "x0_to_next"), getattr(table, n)) for n in table.COLUMNS[2:]}
+    monkeypatch.setattr(model, "sampler", TorchSampler(replace(table, clip=0.05, **rows)))
     judged, plan = task.executor.select(task.calls, range(30, 40)), task.whole.plan((0, 2, 5))
     correction = without_jumps(task, plan, reads=True)
     found = runs_of(task, reads=True).end((0, 2, 5)).samples

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,10 +35,8 @@ STEPS, LOOP = 8, "ddim-8"
 
 @pytest.fixture
 def folder(one_layer_checkpoint: Path, once: Once, tmp_path: Path) -> Path:
-    def convert(path: Path) -> None:
-        ttscompile.convert(one_layer_checkpoint, path, sampler="ddim", steps=STEPS)
-
-    compiled, _ = once.compiled("warm start", convert)
+    settings: dict[str, Any] = {"sampler": "ddim", "steps": STEPS}
+    compiled, _ = once.compiled("warm start", lambda path: ttscompile.convert(one_layer_checkpoint, path, **settings))
     return Path(shutil.copytree(compiled, tmp_path / "artifact"))
 
 

@@ -46,7 +46,7 @@ def recorded(path: Path, shaking: float = 0.0) -> list[Path]:
     frames = np.tile(still, (calls + 1, 1, 1, 1, 1))  # [N, camera, ...]
     for i, frame in enumerate(frames):
         frame[:, :, 4 * (i % 6) : 4 * (i % 6) + 4, 8:12] += 0.3
-    frames = np.clip(frames + (shaking * rng.standard_normal(frames.shape)).astype(np.float32), 0, 1)
+    frames = np.clip(frames + np.asarray(shaking * rng.standard_normal(frames.shape), np.float32), 0, 1)
     windows = np.stack([frames[:-1], frames[1:]], 1)
     views: dict[str, npt.NDArray[np.float32]] = {key: windows[:, :, i] for i, key in enumerate(cameras.CAMERAS)}
     state = rng.random((calls, 2, 4), dtype=np.float32)

@@ -44,7 +44,8 @@ from ttscompile.verification.reuse import ENGAGED
 
 from .trying import proposed, request, trials_of
 
-Noise, Trained = ttscompile.Noise, tuple[Path, CalibrationResult]
+Noise = ttscompile.Noise
+Trained = tuple[Path, CalibrationResult]
 UPDATES = 24
 
 

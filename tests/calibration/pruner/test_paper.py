@@ -149,7 +149,7 @@ def test_an_artifact_executes_it(
     )
     assert result.plans["pruner"].sparsity >= 0.6 - 1e-9
     artifact = load_artifact(directory)
-    assert artifact.manifest.calibration["computed_cells"]["mean"] <= 24
+    assert (artifact.manifest.calibration or {})["computed_cells"]["mean"] <= 24
     policy = ttscompile.load(directory, plan="pruner")
     draw = np.random.default_rng(0)
     for call in range(4):
