@@ -196,10 +196,13 @@ def test_a_slow_original_answers_fewer_observations_evenly_spread(
 @pytest.fixture(scope="session")
 def flowing(once: Once) -> Path:
     """A policy whose sampler tells what its sample is made of in the middle."""
-    spec = policies.spec()
-    sampler = replace(flow_matching_table(policies.STEPS), timesteps=spec.sampler.timesteps)
-    given = policies.Mixer(0).eval(), replace(spec, sampler=sampler)
-    return once.compiled("flowing mixer", lambda path: ttscompile.compile_denoiser(*given, path))[0]
+
+    def make(directory: Path) -> None:
+        spec = policies.spec()
+        sampler = replace(flow_matching_table(policies.STEPS), timesteps=spec.sampler.timesteps)
+        ttscompile.compile_denoiser(policies.Mixer(0).eval(), replace(spec, sampler=sampler), directory)
+
+    return once.folder("flowing mixer", make)
 
 
 def warm(trials: Trials, last: int) -> Proposal:

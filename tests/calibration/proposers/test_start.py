@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,9 +34,10 @@ STEPS, LOOP = 8, "ddim-8"
 
 @pytest.fixture
 def folder(one_layer_checkpoint: Path, once: Once, tmp_path: Path) -> Path:
-    settings: dict[str, Any] = {"sampler": "ddim", "steps": STEPS}
-    compiled, _ = once.compiled("warm start", lambda path: ttscompile.convert(one_layer_checkpoint, path, **settings))
-    return Path(shutil.copytree(compiled, tmp_path / "artifact"))
+    def convert(path: Path) -> None:
+        ttscompile.convert(one_layer_checkpoint, path, sampler="ddim", steps=STEPS)
+
+    return Path(shutil.copytree(once.folder("warm start", convert), tmp_path / "artifact"))
 
 
 def recorded(path: Path, episodes: int = 3, calls: int = 4) -> list[Path]:
