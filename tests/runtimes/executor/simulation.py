@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -143,7 +143,8 @@ class ScriptedPolicy:
     def __post_init__(self) -> None:
         spec, chunk = ObservationSpec((TO, 2), dtype="float64"), ChunkSpec(3, TO - 1, TO - 1 + TA)
         self.predicted = TO - 1 + TA + self.reserve
-        self.info = Facts({"obs": spec}, chunk, (self.predicted, 3), tuple(self.latency), next(iter(self.latency)))
+        plans = tuple(self.latency)
+        self.info: Any = Facts({"obs": spec}, chunk, (self.predicted, 3), plans, plans[0])  # for ``PolicyInfo``
         self._released = threading.Condition()
         self._hanging = False
 
@@ -217,11 +218,11 @@ class World:
         self.executor.observe(self.frame(at), self.start + at)
         self.clock.settle()
 
-    def tick(self, observe: bool = True, action: bool = True) -> np.ndarray | None:
-        """One tick of the control loop: observe, act, wait for the next."""
+    def tick(self, observe: bool = True, action: bool = True) -> np.ndarray:
+        """One tick of the control loop: observe, act, wait for the next; an action that is not wanted is empty."""
         if observe:
             self.observe()
-        made = self.executor.action() if action else None
+        made = self.executor.action() if action else np.zeros(0)
         self.clock.advance(1 / self.hz)
         return made
 
@@ -245,7 +246,7 @@ class World:
             self.clock.advance(1 / self.hz)
         raise AssertionError("never starved")
 
-    def __enter__(self) -> World:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -101,7 +101,7 @@ def test_a_frame_is_held_against_what_the_policy_takes_before_it_is_kept() -> No
     tokens = ObservationSpec((4,), dtype="int64", window=False, bounds=(0.0, 9.0))
     state = ObservationSpec((2, 1), Affine(np.array([2.0]), np.array([0.0])))
     frames = FrameSpec.of({"image": image, "tokens": tokens, "state": state}, 2)
-    good = {"image": np.ones((3, 4, 4), np.float32), "tokens": np.arange(4), "state": np.ones(1, np.float32)}
+    good: dict[str, Any] = {"image": np.ones((3, 4, 4), "f4"), "tokens": np.arange(4), "state": np.ones(1, "f4")}
     assert frames.check(good).keys() == good.keys()
     for key, values, message in (
         ("image", good["image"] * 255, r"'image' is an image .* of 0 to 1; found 255 to 255\. Divide by 255"),
@@ -134,4 +134,5 @@ def test_times_are_numbers(wrong: Any) -> None:
         with pytest.raises(ExecutorError, match="timeout is a number of seconds"):
             world.executor.action(None, wrong)
         world.tick()
-        world.executor.action(np.float32(world.clock.now()))
+        now: Any = np.float32(world.clock.now())
+        world.executor.action(now)

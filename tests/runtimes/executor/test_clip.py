@@ -133,7 +133,7 @@ def test_the_loop_goes_on_within_the_limits_after_a_hold_and_after_it_starved() 
         world.begin()
         for _ in range(40):
             try:
-                made.append(float(world.tick()[0]))  # type: ignore[index]
+                made.append(float(world.tick()[0]))
             except DeadlineMissedError:
                 world.clock.advance(0.1)
         counted = world.executor.statistics()
@@ -165,4 +165,4 @@ def test_what_was_changed_is_counted_when_it_is_given_out() -> None:
             counted = world.executor.statistics()
         assert counted.actions_clipped == clipped
         assert (counted.chunks_refused == 0) == clip
-        assert {float(action[0]) for action in made} == ({0.5, 1.0} if clip else set())  # type: ignore[index]
+        assert {float(action[0]) for action in made} == ({0.5, 1.0} if clip else set())

@@ -122,10 +122,9 @@ def test_a_robot_that_keeps_moving_evenly_has_not_stopped() -> None:
     for channels, stalls in (((), 1), ((0,), 0)):
         robot = Robot(ExecutorSettings(refuse_infeasible=False, displacements=channels, **made))  # type: ignore[arg-type]
         with robot:
-            robot.answer = None  # type: ignore[assignment, method-assign]
-            robot.policy.actions = lambda obs: np.tile(np.float32([0.1, GOAL, 0.0]), (TO - 1 + TA + RESERVE, 1))
+            robot.policy.actions = lambda obs: np.tile([0.1, GOAL, 0.0], (TO - 1 + TA + RESERVE, 1))
             robot.drive(30)
             assert (robot.executor.statistics().stalls > 0) == bool(stalls)
-            robot.policy.actions = lambda obs: np.tile(np.float32([0.0, GOAL, 0.0]), (TO - 1 + TA + RESERVE, 1))
+            robot.policy.actions = lambda obs: np.tile([0.0, GOAL, 0.0], (TO - 1 + TA + RESERVE, 1))
             robot.drive(40)
             assert robot.executor.statistics().stalls > 0

@@ -116,7 +116,7 @@ def test_closing_twice_is_closing_once() -> None:
 
 def test_the_policy_may_close_the_executor_that_calls_it() -> None:
     policy = Calling(lambda: executor.close())
-    executor = opened(policy)
+    executor: AsyncExecutor = opened(policy)
     start_a_call(executor)
     assert policy.done.wait(REAL_LIMIT)
     until_no_thread_is_left()

@@ -48,7 +48,8 @@ def test_it_is_the_weighted_mean_of_all_that_was_predicted_for_a_tick(
                 predicted[tick].append(rows[tick - start])
             assert made.end == max(max(t for t in predicted if t >= seam) + 1, new.end)
             for tick in range(made.start, made.end):
-                np.testing.assert_allclose(made.at(tick), weighted(predicted[tick], coefficient), atol=1e-5)
+                found = np.asarray(made.at(tick))
+                np.testing.assert_allclose(found, weighted(predicted[tick], coefficient), atol=1e-5)
                 assert made.chunks[tick - made.start] == len(predicted[tick])
             timeline = made
         seam += consumed

@@ -7,6 +7,7 @@ import random
 import threading
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -241,7 +242,8 @@ def test_a_jump_at_the_seam_is_refused() -> None:
 def test_only_a_normaliser_that_knows_the_range_of_the_actions_bounds_them(ranged: bool) -> None:
     """By mean and deviation, an action five deviations out is rare; by range it was never seen in training."""
     policy = ScriptedPolicy(FakeClock())
-    chunk = replace(policy.info.action, normalizer=Affine(np.ones(3), np.zeros(3)), ranged=ranged)
+    ones = np.ones(3, np.float32)
+    chunk = replace(policy.info.action, normalizer=Affine(ones, 0 * ones), ranged=ranged)
     policy.info = replace(policy.info, action=chunk)
     policy.actions = lambda obs: np.full((16, 3), 5.0)
     with World(policy=policy) as world:
@@ -288,7 +290,7 @@ def test_a_reset_before_a_call_reaches_the_policy_before_that_call() -> None:
         def reset(self, seed: int | None = None) -> None:
             order.append(f"reset {seed}")
 
-        def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+        def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
             order.append(f"call {obs_dict['obs'][0, -1, 0]:.0f}")
             return super().predict_action(obs_dict, plan=plan)
 
@@ -345,7 +347,7 @@ def test_two_threads_may_observe_and_act() -> None:
     """In real time: a camera at 200 Hz on one thread, a control loop at 100 Hz on another."""
 
     class Quick(ScriptedPolicy):
-        def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+        def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
             time.sleep(0.005)
             chunk = np.zeros((1, 16, 3)) + obs_dict["obs"][0, -1, 0]
             return {"action_pred": chunk}

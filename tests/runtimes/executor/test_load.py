@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def test_threads_that_observe_as_fast_as_they_can_starve_nobody() -> None:
     """In real time: no call waits for a frame that came, and no tick for the lock for long."""
 
     class Quick(ScriptedPolicy):
-        def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+        def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
             return {"action_pred": np.zeros((1, 16, 3))}
 
     settings = ExecutorSettings(max_hold=1000, policy_hz=50)

@@ -149,7 +149,7 @@ def test_the_path_does_not_jump_with_the_state(once: Once, seam: str) -> None:
 def test_latencies_are_measured_where_the_middle_of_a_range_is_no_rotation() -> None:
     """With a prefix of a pose that is the measured one."""
     policy = ScriptedPolicy(FakeClock(), reserve=RESERVE)
-    action = ChunkSpec(10, 1, 1 + TA, Affine(np.ones(10), np.zeros(10)), relative=RELATIVE)
+    action = ChunkSpec(10, 1, 1 + TA, Affine(np.ones(10, np.float32), np.zeros(10, np.float32)), relative=RELATIVE)
     info = replace(policy.info, action=action, observation={"obs": ObservationSpec((2, 9))}, sample=(TA + 2, 10))
     given: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -157,7 +157,7 @@ def test_latencies_are_measured_where_the_middle_of_a_range_is_no_rotation() -> 
         def predict_action(self, obs: Any, *, plan: str, prefix: np.ndarray) -> None:
             given.append((obs["obs"], prefix))
 
-    settings = resolve(ExecutorSettings(seam="prefix", warm_up=1, measured_calls=1, n_obs_steps=2), info, HZ)  # type: ignore[arg-type]
+    settings = resolve(ExecutorSettings(seam="prefix", warm_up=1, measured_calls=1, n_obs_steps=2), info, HZ)
     once = Prefixed()
     once.info = info  # type: ignore[attr-defined]
     measure_latencies(once, policy.clock, settings)  # type: ignore[arg-type]

@@ -49,7 +49,7 @@ class Recorded:
         self.info, self.reset, self._policy = policy.info, policy.reset, policy
         self.calls: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str, prefix: np.ndarray) -> dict[str, Any]:
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str, prefix: Any = None) -> dict[str, Any]:
         predicted = self._policy.predict_action(obs_dict, plan=plan, prefix=prefix)
         self.calls.append((prefix[0], predicted["action_pred"][0]))
         return predicted

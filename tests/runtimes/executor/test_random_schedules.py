@@ -5,6 +5,7 @@ A short run is part of every test run; ``pytest tests/runtimes/executor -m soak`
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
-from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, ExecutorError, ObservationError, WorkerDeadError
+from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, ObservationError, WorkerDeadError
 from ttscompile.runtimes.executor import ExecutorSettings
 
 from .simulation import TA, FakeClock, ScriptedPolicy, World, workers
@@ -26,6 +27,7 @@ class Schedule(RuleBasedStateMachine):
     """One executor after another; ``self.good`` counts ticks since something last went wrong."""
 
     ticks = 0
+    last: tuple[int, np.ndarray] | None
 
     @initialize(
         seam=st.sampled_from(["replace", "blend", "ensemble"]),
@@ -143,9 +145,7 @@ class Schedule(RuleBasedStateMachine):
 
     # What must be true
 
-    def use(  # type: ignore[no-untyped-def]
-        self, call, allowed: type[ExecutorError] | tuple[()] = (), always: bool = False
-    ) -> bool:
+    def use(self, call: Callable[[], object], allowed: type[Exception] | tuple[()] = (), always: bool = False) -> bool:
         """Make a call; whether it came back.
 
         What the policy raised must come out of every call, and nothing else may.

@@ -105,7 +105,7 @@ def test_the_report_has_differences_by_dimension_the_worst_call_and_times(toys: 
     found = shadow.report()
     assert (found.calls, found.compared, found.dropped, found.failed) == (4, 4, 0, 0)
     assert found.mean == pytest.approx((0.375, 1.5))
-    assert found.worst == (pytest.approx(1.875), 2)
+    assert found.worst == pytest.approx((1.875, 2))
     assert shadow.worst_observation is not None and shadow.worst_observation["obs"].tolist() == [[2.0]]
     assert found.late == 1, "the last one took longer than the original"
     assert found.original_ms is not None and found.original_ms.p50 == pytest.approx(500)

@@ -59,7 +59,7 @@ def policy(dense: float = 0.1, **given: object) -> Stalling:
 
 def drive(world: World, ticks: int) -> np.ndarray:
     world.begin()
-    return np.stack([world.tick() for _ in range(ticks)])  # type: ignore[arg-type]
+    return np.stack([world.tick() for _ in range(ticks)])
 
 
 @pytest.mark.parametrize("seam", ["replace", "blend", "ensemble"])
@@ -174,7 +174,7 @@ def test_the_reach_is_in_normalised_units() -> None:
     assert made.stall is not None
     assert (made.stall.ticks, made.stall.reach.tolist(), made.stall.plan) == (40, [0.5] * 3, "dense")
     assert made.plans == ("fast", "dense")
-    normalizer = Affine(np.array([0.5, -0.1, 2.0]), np.zeros(3))
+    normalizer = Affine(np.array([0.5, -0.1, 2.0]), np.zeros(3, np.float32))
     made = resolve(
         replace(SETTINGS, stall_range=0.5), replace(info, action=replace(info.action, normalizer=normalizer)), 20.0
     )
@@ -205,12 +205,9 @@ def test_its_latency_has_to_be_known_or_is_measured() -> None:
         ExecutorError, match=r"latencies lacks the plan 'dense'; give one for each of \('fast', 'dense'\)"
     ):
         AsyncExecutor(stalling, 10.0, SETTINGS, clock=stalling.clock, latencies={"fast": 0.05})
-    done = threading.Event()
-    opener = threading.Thread(
-        target=lambda: (AsyncExecutor(stalling, 10, SETTINGS, clock=stalling.clock).close(), done.set())
-    )
+    opener = threading.Thread(target=lambda: AsyncExecutor(stalling, 10, SETTINGS, clock=stalling.clock).close())
     opener.start()
-    while not done.is_set():
+    while opener.is_alive():
         stalling.clock.advance(0.05)
     opener.join()
     assert stalling.plans.count("fast") == stalling.plans.count("dense") == SETTINGS.warm_up + SETTINGS.measured_calls

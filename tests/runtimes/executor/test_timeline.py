@@ -114,7 +114,7 @@ def test_a_schedule_has_no_hole_and_starts_at_or_after_the_seam(
     assert made.end == new.end
     assert len(made.rows) == len(made.observed)
     for tick in range(made.start, made.end):
-        (value,) = made.at(tick)
+        (value,) = np.asarray(made.at(tick))
         both = old.at(tick) is not None and tick >= new_start
         first = max(seam, new_start)
         if tick < new_start:

@@ -52,7 +52,7 @@ class Loop:
         """Calls, counts, and the arithmetic of the first plan."""
         plans = tuple(self.latency)
         spec, chunk = ObservationSpec((2, 1)), ChunkSpec(1, 1, 1 + self.horizon)
-        facts = Facts({"obs": spec}, chunk, (1 + self.horizon + self.beyond, 1), plans, plans[0])
+        facts: Any = Facts({"obs": spec}, chunk, (1 + self.horizon + self.beyond, 1), plans, plans[0])
         given = ExecutorSettings(max_hold=10**6, tiers=plans, **self.settings)
         resolved = resolve(given, facts, self.control_hz)
         windows = {plan: LatencyWindow(given.latency_window) for plan in plans}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -43,7 +45,7 @@ def test_the_first_axis_of_a_history_is_time() -> None:
 
 def test_an_observation_is_stacked_and_has_a_batch_of_one() -> None:
     spec = FrameSpec.of(SPECS, 2)
-    frames = [
+    frames: list[dict[str, Any]] = [
         {"obs": np.full(3, v, np.float32), "image": np.full((4, 4), v, np.uint8), "goal": np.full(5, v, np.float32)}
         for v in (1, 2)
     ]

@@ -47,13 +47,13 @@ SETTINGS = ExecutorSettings(max_hold=1000)
 
 
 class Quick(ScriptedPolicy):
-    def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+    def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
         time.sleep(0.002)
         return {"action_pred": np.full((1, 16, 3), obs_dict["obs"][0, -1, 0])}
 
 
 class Broken(Quick):
-    def predict_action(self, obs_dict, *, plan):  # type: ignore[no-untyped-def, override]
+    def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
         raise ZeroDivisionError("scripted")
 
 

@@ -189,7 +189,12 @@ def test_tokens_are_compared_in_constant_time(monkeypatch: pytest.MonkeyPatch) -
     """By their hashes, so that neither the place of a difference nor the length can be measured; and none is kept."""
     compared: list[tuple[bytes, bytes]] = []
     compare = hmac.compare_digest
-    monkeypatch.setattr(hmac, "compare_digest", lambda a, b: compared.append((a, b)) or compare(a, b))
+
+    def noted(a: bytes, b: bytes) -> bool:
+        compared.append((a, b))
+        return compare(a, b)
+
+    monkeypatch.setattr(hmac, "compare_digest", noted)
     lock = Lock(hashed(TOKEN, "test"))
     assert [lock.opens(f"Bearer {each}") for each in (TOKEN, OTHER, "a")] == [True, False, False]
     assert [len(each) for pair in compared for each in pair] == 6 * [32]
@@ -221,7 +226,7 @@ def test_a_certificate_that_cannot_be_used_is_told(papers: Path, tmp_path: Path)
     assert tls_context(papers / "both.pem").minimum_version == ssl.TLSVersion.TLSv1_2
     locked = tmp_path / "locked.pem"
     command = ["openssl", "ec", "-aes128", "-passout", "pass:secret", "-in", papers / "key.pem", "-out", locked]
-    subprocess.run(command, check=True, capture_output=True)
+    subprocess.run(list(map(str, command)), check=True, capture_output=True)
     for certificate, key in (
         (papers / "certificate.pem", None),
         (papers / "certificate.pem", papers / "other_key.pem"),

@@ -20,7 +20,7 @@ def test_requests_are_read_and_frames_converted() -> None:
     assert (request.id, request.method, request.params["t"]) == (1, "observe", 2)
     frames = FrameSpec.of({"image": ObservationSpec((2, 1, 2), dtype="uint8")}, 2)
     image = read_arrays(request.params["obs"], frames.specs)["image"]
-    assert (image.dtype, image.tolist()) == (np.uint8, [[255, 0]])
+    assert (image.dtype.name, image.tolist()) == ("uint8", [[255, 0]])
     for wrong in ([[256, 0]], [[-1, 0]], [[1.5, 0]], [["1", 0]], [[10**30, 0]]):
         with pytest.raises(ProtocolError, match="image"):
             read_arrays({"image": wrong}, frames.specs)
@@ -33,7 +33,7 @@ def test_a_mask_is_of_true_and_false() -> None:
     frames = FrameSpec.of({"mask": ObservationSpec((3,), dtype="bool", window=False)}, 1)
     for given_as in ([True, False, True], [1, 0, 1], [1, False, True]):
         mask = read_arrays({"mask": given_as}, frames.specs)["mask"]
-        assert (mask.dtype, mask.tolist()) == (np.bool_, [True, False, True])
+        assert (mask.dtype.name, mask.tolist()) == ("bool", [True, False, True])
     for wrong in ([2, 0, 1], [-1, 0, 1], [0.5, 0.0, 1.0], ["true", "false", "true"]):
         with pytest.raises(ProtocolError, match="mask"):
             read_arrays({"mask": wrong}, frames.specs)
