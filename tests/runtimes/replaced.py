@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -173,7 +174,7 @@ def prepared_by_commands(folder: Path) -> tuple[Path, list[Path], dict[str, byte
         convert(path, steps)
         spec = read_manifest(path).spec
         windows = [obs for obs, _ in random_calls(spec, 24, seed=1)]
-        arrays = {key: np.concatenate([window[key] for window in windows]) for key in spec.observations}
+        arrays: dict[str, Any] = {key: np.concatenate([window[key] for window in windows]) for key in spec.observations}
         np.savez(folder / "calls.npz", **arrays, episode_ends=np.array([6, 12, 18, 24]))
         for calibrated in (False, True):
             if calibrated:

@@ -41,7 +41,7 @@ class Eye(nn.Module):
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """See the class."""
         seen = torch.relu(self.second(torch.relu(self.first(observations["image"]))))
-        return self.last(seen.flatten(2).transpose(1, 2)).mean(1)  # type: ignore[no-any-return]
+        return self.last(seen.flatten(2).transpose(1, 2)).mean(1)
 
 
 class Hand(nn.Module):
@@ -60,7 +60,7 @@ class Hand(nn.Module):
         x = self.enter(sample)
         for read, mix, block in zip(self.reads, self.mixes, self.blocks, strict=True):
             x = x + block(x + mix(torch.relu(read(seen) + timestep[:, None]))[:, None])
-        return self.leave(x)  # type: ignore[no-any-return]
+        return self.leave(x)
 
 
 def compiled(once: Once) -> tuple[Path, Program]:

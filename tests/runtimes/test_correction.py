@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_it_belongs_to_the_plan_of_its_name(corrected: tuple[Path, Correction, n
     obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
     policy = ttscompile.load(path, runtime=runtime)
 
-    def call(**options: object) -> np.ndarray:
+    def call(**options: Any) -> np.ndarray:
         policy.reset()
         return np.asarray(policy.predict_action(obs, noise=Noise(noise.initial, noise.steps), **options)["action_pred"])
 

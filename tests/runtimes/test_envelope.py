@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,9 +160,12 @@ def test_the_prologue_is_computed_once(made: tuple[Path, bytes], runtime: str, m
     artifact = load_artifact(made[0])
     opened, given = open_runtime(artifact, runtime), two_calls(artifact)
     started, start = [], type(opened.backend).start
-    monkeypatch.setattr(
-        type(opened.backend), "start", lambda self, call: (started.append(sorted(call.obs)), start(self, call))[1]
-    )
+
+    def noted(self: Any, call: Any) -> Any:
+        started.append(sorted(call.obs))
+        return start(self, call)
+
+    monkeypatch.setattr(type(opened.backend), "start", noted)
     opened.predict(*some(given, [1]), artifact.plans["fast"])
     assert started == [sorted(given[0]), []]
 

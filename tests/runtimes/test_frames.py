@@ -219,7 +219,7 @@ def test_memory_is_bounded(policy: CompiledPolicy) -> None:
     for number in range(12):
         act(policy, window(frame(number), frame(number + 1)))
         policy.prepare_frame(frame(number + 50))
-    memory: Any = policy._runtime._used.frames._memory  # type: ignore[attr-defined]
+    memory: Any = policy._runtime._used.frames._memory
     assert sorted(len(one) for one in memory.values()) == [1, WINDOWS * 4]
 
 

@@ -52,10 +52,10 @@ def policy(request: pytest.FixtureRequest, normed: Artifact) -> CompiledPolicy:
 
 def actions(policy: CompiledPolicy, obs: Any = OBS, noise: Any = None, plan: Any = PLAN) -> np.ndarray:
     policy.reset(seed=0)
-    return policy.predict_action({"obs": obs}, noise=noise or some_noise(), plan=plan)["action_pred"]  # type: ignore[no-any-return]
+    return policy.predict_action({"obs": obs}, noise=noise or some_noise(), plan=plan)["action_pred"]
 
 
-def masked(array: np.ndarray, under: float = np.nan) -> np.ma.MaskedArray:
+def masked(array: Any, under: float = np.nan) -> np.ma.MaskedArray:
     """With its first number under the mask, and another one in its place."""
     data, mask = array.copy(), np.zeros(array.shape, np.bool_)
     data.flat[0], mask.flat[0] = under, True
@@ -73,10 +73,11 @@ def test_masked_arrays_come_through_nowhere(policy: CompiledPolicy) -> None:
             {"obs_dict": obs, "prefix": masked(np.zeros((2, 1, 2), np.float32), under)},
         ):
             with pytest.raises(ObservationError, match="is a masked array"):
-                policy.predict_action(**arguments)  # type: ignore[arg-type]
+                policy.predict_action(**arguments)
         for call in (policy.select_action, policy.predict_action_chunk):
             with pytest.raises(ObservationError, match="is a masked array"):
                 call({"obs": masked(OBS, under)})
+    plan: Any
     for plan in (masked(PLAN, 0), [masked(row, 0) for row in PLAN]):
         with pytest.raises(IllegalPlanError, match="plan is a masked array"):
             policy.predict_action(obs, plan=plan)
@@ -85,10 +86,10 @@ def test_masked_arrays_come_through_nowhere(policy: CompiledPolicy) -> None:
         with pytest.raises(IllegalPlanError, match="plan is a masked array"):
             legalize(plan, range(5), np.zeros((5, 5), np.bool_))
     with pytest.raises(ttscompile.TtscompileError, match="normaliser scale is a masked array"):
-        Affine(masked(np.ones(2), 2.0), np.zeros(2))
+        Affine(masked(np.ones(2), 2.0), np.zeros(2, np.float32))
 
 
-def layouts(array: np.ndarray) -> dict[str, np.ndarray]:
+def layouts(array: np.ndarray) -> dict[str, Any]:
     """The same numbers as memory may hold them, and with what numpy wraps around them."""
     locked, wide = array.copy(), np.zeros((*array.shape[:-1], 2 * array.shape[-1]), array.dtype)
     locked.flags.writeable = False
@@ -147,12 +148,13 @@ def test_plans_of_anything_else_are_refused_everywhere(policy: CompiledPolicy, p
 
 
 def test_a_plan_and_what_is_written_must_fit() -> None:
-    for plan, groups, written in (
+    wrong: tuple[tuple[Any, range, Any], ...] = (
         (PLAN, range(4), PLAN == 0),
         (PLAN, range(5), PLAN[:4] == 0),
         (PLAN[0], range(5), PLAN[0] == 0),
         (np.zeros(()), range(5), np.zeros(())),
-    ):
+    )
+    for plan, groups, written in wrong:
         with pytest.raises(IllegalPlanError, match="expected plan and written of the same shape|dtype float64"):
             legalize(plan, groups, written)
 
@@ -194,15 +196,13 @@ def test_what_is_written_after_the_check_changes_nothing(
 ) -> None:
     """As another thread of the caller's may: the numbers that were looked at are those that are computed with."""
     expected, obs, noise, plan = actions(policy), OBS.copy(), some_noise(), PLAN.copy()
+    own: dict[str, Any] = {"observation": obs, "noise.initial": noise.initial, "noise.steps": noise.steps, "plan": plan}
     done = []
 
     def spoil(what: str) -> None:
-        assert noise.steps is not None
         if what.startswith(spoiled):
             done.append(what)
-            {"observation": obs, "noise.initial": noise.initial, "noise.steps": noise.steps, "plan": plan}[spoiled][
-                :
-            ] = 99
+            own[spoiled][:] = 99
 
     def checked(array: Any, normalizer: Any, what: str, *others: Any) -> Any:
         spoil(what)
@@ -279,7 +279,7 @@ def refused_or_finite(both: list[CompiledPolicy], data: st.DataObject) -> None:
         return array
 
     obs, noise = some(2, 2), Noise(some(2, 3, 2), some(5, 2, 3, 2))
-    plan = data.draw(st.sampled_from([PLAN, uniform_plan(5, 5, 3), "dense"]))
+    plan: Any = data.draw(st.sampled_from([PLAN, uniform_plan(5, 5, 3), "dense"]))
     assert noise.steps is not None
     normalized = obs * np.array([2, 0.5]) + np.array([0.1, -0.2])
     seen = all(np.abs(each).max() < 0.99 * LARGEST for each in (normalized, noise.initial, noise.steps))
@@ -344,7 +344,7 @@ def test_four_thousand_streams_are_each_what_they_are_alone(policy: CompiledPoli
     def episode(obs: np.ndarray, noise: Noise) -> np.ndarray:
         policy.reset()
         policy.predict_action({"obs": obs}, noise=noise, plan="dense")
-        return policy.predict_action({"obs": obs}, noise=noise, plan=rollout)["action_pred"]  # type: ignore[no-any-return]
+        return policy.predict_action({"obs": obs}, noise=noise, plan=rollout)["action_pred"]
 
     together = episode(obs, noise)
     for stream in (0, 1, 2048, 4095):
@@ -373,5 +373,6 @@ def test_threads_and_seeds_are_whatever_says_that_it_is_whole(normed: Artifact, 
     other = load(normed.path, seed=7)
     other.reset(seed=value)
     np.testing.assert_array_equal(other.predict_action({"obs": OBS})["action"], first)
+    wrong: Any = value.astype(bool) if isinstance(value, np.ndarray) else True
     with pytest.raises(TtscompileError, match=r"threads must be an integer of at least 1 and at most 1024; found"):
-        load(normed.path, threads=value.astype(bool) if isinstance(value, np.ndarray) else True)
+        load(normed.path, threads=wrong)

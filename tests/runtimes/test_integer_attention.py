@@ -44,7 +44,7 @@ class Long(nn.Module):
             else:
                 q, k, v = (y.unflatten(-1, (COUNT, -1)).transpose(1, 2) for y in split(3 * x).chunk(3, dim=-1))
             x = x + merge(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
-        return self.leave(x)  # type: ignore[no-any-return]
+        return self.leave(x)
 
 
 @pytest.fixture(scope="module")

@@ -110,6 +110,7 @@ def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Arti
     runtime, reference = open_runtime(scheduled), open_runtime(scheduled, "reference")
     rng = np.random.default_rng(0)
     plain = scheduled.plans["plain"].cells
+    assert plain is not None
     for name in ("dense", "plain"):
         obs, noise = random_inputs(scheduled, rng, 1)
         for each in (runtime, reference):
@@ -129,6 +130,7 @@ def test_a_first_matrix_after_a_plan_of_the_artifact_is_told_what_was_not_kept(s
     runtime = open_runtime(scheduled)
     obs, noise = random_inputs(scheduled, np.random.default_rng(0), 1)
     plain = scheduled.plans["plain"].cells
+    assert plain is not None
     (k,) = np.flatnonzero((plain == C).all(axis=1))[1:]
     reads = plain.copy()
     reads[k] = R

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -99,7 +100,7 @@ def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> N
 @pytest.mark.parametrize(
     "variant", [{}, {"sequence_first": True}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}]
 )
-def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, int]) -> None:
+def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, Any]) -> None:
     artifact = make_artifact(toy_program(**variant, pruner=False))
     runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
     allowed = bound(call_terms(artifact))
@@ -147,7 +148,7 @@ def test_the_report_says_what_was_done(runtime: Runtime, toy_artifact: Artifact)
 
 
 def test_the_pruners_plan_is_legalised_and_counted(runtime: Runtime, toy_artifact: Artifact) -> None:
-    reference = open_runtime(toy_artifact, "reference")
+    reference: Any = open_runtime(toy_artifact, "reference")
     manifest = toy_artifact.manifest
     rng = np.random.default_rng(1)
     written = np.zeros((2, 5, 5), np.bool_)
@@ -188,6 +189,7 @@ def test_an_illegal_plan_names_its_stream_and_changes_nothing(runtime: Runtime, 
     bad = np.stack([dense_plan(5, 5), np.full((5, 5), T, np.int8)])
     with pytest.raises(IllegalPlanError, match="stream 1 is illegal at step 0"):
         runtime.predict(obs, noise, Plan(cells=bad))
+    plan: Any
     for plan, message in [
         (np.zeros((5, 4), np.int8), r"\(5, 4\); expected"),
         (np.zeros((5, 5)), "dtype float64"),
@@ -386,4 +388,5 @@ np.save(OUT, samples)
 """
     body = body.replace("OUT", repr(str(tmp_path / "samples.npy")))
     python(THREADS.format(path=str(toy_artifact.path), body=body))
-    assert_equal_but_for_rounding(*np.load(tmp_path / "samples.npy"), call_terms(toy_artifact))
+    one, other = np.load(tmp_path / "samples.npy")
+    assert_equal_but_for_rounding(one, other, call_terms(toy_artifact))

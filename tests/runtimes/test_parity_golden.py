@@ -99,7 +99,7 @@ def test_an_episode_with_their_plans_is_what_the_authors_code_gives(
         assert worst_of_range(out["action_pred"], recorded["action_pred"][r], policy.info) < PROMISED
         report = policy.last_report
         assert report is not None
-        assert report.computed == (np.count_nonzero(plan == Source.COMPUTE),)
+        assert report.computed == (int(np.count_nonzero(plan == Source.COMPUTE)),)
         assert report.legalised == (0,)
 
 

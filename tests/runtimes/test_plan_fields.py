@@ -74,7 +74,7 @@ def artifact(once: Once) -> Artifact:
         plans = {"dense": plain.plans["dense"], **held}
         update_plans(path, plans, "dense", weights={"trained": BlockWeights(moved, lower)}, starts=STARTS)
 
-    return load_artifact(once.compiled("all fields of a plan", convert)[0])
+    return load_artifact(once.folder("all fields of a plan", convert))
 
 
 def random_fields(rng: np.random.Generator) -> dict[str, Any]:

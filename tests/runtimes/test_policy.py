@@ -88,7 +88,7 @@ def test_the_default_plan_is_dense_until_calibration(quick: CompiledPolicy) -> N
     assert report is not None
     assert (report.plan_name, report.computed, report.legalised) == ("dense", (25, 25), (0, 0))
     with pytest.raises(AttributeError):
-        quick.last_report = None  # type: ignore[misc]
+        quick.last_report = None
 
 
 def test_plans_of_the_artifact_by_name(own_artifact: Artifact) -> None:
@@ -140,6 +140,7 @@ def test_the_callers_plan_stays_the_callers(policy: CompiledPolicy) -> None:
 
 
 def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
+    plan: Any
     for plan in ([[0, 0], [0]], torch.zeros(5, 5, dtype=torch.bfloat16), torch.zeros(5, 5), object()):
         with pytest.raises(IllegalPlanError, match="int8|integer"):
             policy.predict_action({"obs": OBS}, plan=plan)
@@ -165,11 +166,11 @@ def test_torch_in_gives_torch_out(policy: CompiledPolicy) -> None:
     policy.reset()
     noise = some_noise()
     assert noise.steps is not None
-    tensors = Noise(torch.from_numpy(noise.initial), torch.from_numpy(noise.steps))  # type: ignore[arg-type]
+    tensors: Any = Noise(torch.from_numpy(noise.initial), torch.from_numpy(noise.steps))  # type: ignore[arg-type]
     out = policy.predict_action({"obs": torch.from_numpy(OBS).requires_grad_()}, noise=tensors)
     for key, value in out.items():
         assert isinstance(value, torch.Tensor)
-        assert value.device == tensors.initial.device  # type: ignore[attr-defined]
+        assert value.device == tensors.initial.device
         assert not value.requires_grad
         assert np.array_equal(value.numpy(), plain[key])
 
@@ -293,7 +294,7 @@ def test_observations_that_disagree_about_the_streams_are_refused() -> None:
     from ttscompile.runtimes.arrays import check_observation
 
     specs = {"a": ObservationSpec((2,)), "b": ObservationSpec((1, 2), dtype="int64")}
-    fits = {"a": OBS, "b": np.zeros((2, 1, 2), np.int64)}
+    fits: dict[str, np.ndarray] = {"a": OBS, "b": np.zeros((2, 1, 2), np.int64)}
     assert list(check_observation(fits, specs)) == ["a", "b"]
     with pytest.raises(ObservationError, match=r"\{'a': 1, 'b': 2\}"):
         check_observation(fits | {"a": OBS[:1]}, specs)

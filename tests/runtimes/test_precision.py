@@ -49,7 +49,7 @@ def test_fp32_of_an_int8_artifact_is_the_fp32_artifact(int8: Path, fp32: Path) -
     with_both, plain = load_artifact(int8), load_artifact(fp32)
     obs, noise = random_inputs(plain, np.random.default_rng(0), 2)
     samples = [open_runtime(one).predict(obs, noise, one.plans["dense"])[0] for one in (with_both, plain)]
-    np.testing.assert_array_equal(*samples)
+    np.testing.assert_array_equal(samples[0], samples[1])
     assert not np.array_equal(open_runtime(with_both).predict(obs, noise, with_both.plans["full"])[0], samples[0])
 
 

@@ -97,7 +97,7 @@ def test_it_is_the_reference_within_the_tolerance_of_eight_bits_whatever_the_thr
         obs, noise = random_inputs(artifact, np.random.default_rng(1), 2)
         runtime.reset()
         samples.append(runtime.predict(obs, noise, full)[0])
-    np.testing.assert_array_equal(*samples)
+    np.testing.assert_array_equal(samples[0], samples[1])
     statuses = {rung.name: rung.status for rung in ttscompile.verify(int8).rungs}
     assert "failed" not in statuses.values() and statuses["precision"] == "passed"
 

@@ -81,7 +81,7 @@ def episodes(
     return reads, plans
 
 
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {"steps": 6},
     "batch in the middle": {"steps": 5, "blocks": 7, "sequence_first": True, "normed": True},
     "no step values": {"blocks": 2},
@@ -180,8 +180,8 @@ def graphs(graph: GraphModule) -> Iterator[GraphModule]:
             yield from graphs(inner)
 
 
-def called(graph: GraphModule, name: str) -> list[torch.fx.Node]:
-    """The nodes that call an operation."""
+def called(graph: GraphModule, name: str) -> list[Any]:
+    """The nodes of torch.fx that call an operation; what their arguments are is for the caller to know."""
     return [node for node in graph.graph.nodes if node.op == "call_function" and str(node.target) == name]
 
 

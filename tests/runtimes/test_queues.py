@@ -42,7 +42,7 @@ def window(queues: Queues) -> list[float]:
     """The frames of the first stream, one number each."""
     state = queues.observation(queues._frames)["observation.state"]
     assert state.shape[1:] == (3, 2)
-    return state[0, :, 0].tolist()  # type: ignore[no-any-return]
+    return state[0, :, 0].tolist()
 
 
 def test_the_first_frame_stands_for_those_before_it() -> None:
@@ -112,12 +112,13 @@ PIXELS = RNG.integers(0, 256, (1, 3, 8, 9)).astype(np.uint8)
 def test_images_are_what_the_policy_was_trained_on(bytes_per_pixel: str) -> None:
     """The same picture as 0..255, as bytes, as -1..1 and with its channels last, in a window and as one frame."""
     good = PIXELS.astype(np.float32) / 255
-    bad, message = {
+    wrong: dict[str, tuple[np.ndarray, str]] = {
         "as float": (PIXELS.astype(np.float32), r"'camera' is an image .* of 0 to 1; found 0 to 25\d\. Divide by 255,"),
         "as they are": (PIXELS, r"uint8.*Divide by 255, channels first: image\.astype\(np\.float32\) / 255\."),
         "normalised": (good * 2 - 1, r"'camera' .* of 0 to 1; found -\S+ to \S+\. Give what the camera measures"),
         "channels last": (np.moveaxis(good, 1, -1), r"np\.moveaxis\(image, -1, -3\)"),
-    }[bytes_per_pixel]
+    }
+    bad, message = wrong[bytes_per_pixel]
     with pytest.raises(ObservationError, match=message):
         check_observation({"camera": np.stack((bad, bad), 1)}, {"camera": IMAGE})
     with pytest.raises(ObservationError, match=message):

@@ -14,8 +14,8 @@ from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.program import Program
-from ttscompile.runtimes.reference.model import ReferenceModel, RolloutCache
-from ttscompile.runtimes.reference.reuse import Caches, Cell, reuse
+from ttscompile.runtimes.reference.model import ReferenceModel
+from ttscompile.runtimes.reference.reuse import Caches, Cell, RolloutCache, reuse
 
 from .literal import Episode
 from .plans import random_plan

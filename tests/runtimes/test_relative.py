@@ -62,7 +62,7 @@ def test_every_way_to_make_a_call_adds_it(tmp_path: Path, rows: bool) -> None:
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5, err_msg=name)
     written = load_artifact(tmp_path / "artifact")
     assert written.manifest.spec.chunk.relative == RELATIVE
-    told = dict(facts.policy(written).tables[0].rows)["action"]
+    told = {row[0]: row[1] for row in facts.policy(written).tables[0].rows}["action"]
     assert told == "2 numbers, 3 steps predicted, 1..2 executed; 1 of the numbers are relative to 'obs'"
 
 
@@ -81,7 +81,7 @@ def artifact(once: Once) -> Path:
         plans, starts = {"dense": dense, "warm": warm, "sparse": sparse}, {warm.loop: StartRecord("original", 2)}
         update_plans(path, plans, "warm", {}, starts=starts, golden=record_plans)
 
-    return once.compiled("relative and warm", convert)[0]
+    return once.folder("relative and warm", convert)
 
 
 def observed(seed: int, streams: int = 2) -> tuple[dict[str, np.ndarray], Noise]:
@@ -179,7 +179,8 @@ def test_it_is_written_where_there_is_some_and_read_strictly() -> None:
     plain = tiny_spec()
     assert "relative" not in to_json(plain)["chunk"]
     key, channels = next(iter(plain.observations)), plain.chunk.action_dim
-    rows = Affine(np.ones((plain.sample[0], channels)), np.arange(plain.sample[0] * channels).reshape(-1, channels))
+    numbers = np.arange(plain.sample[0] * channels, dtype=np.float32).reshape(-1, channels)
+    rows = Affine(np.ones_like(numbers), numbers)
     relative = Relative(key, (0, *[None] * (channels - 1)))
     spec = replace(plain, chunk=replace(plain.chunk, normalizer=rows, relative=relative))
     written = to_json(spec)
@@ -216,10 +217,11 @@ def test_what_has_no_numbers_to_add() -> None:
         with pytest.raises(SpecError, match="actions are relative to observation 'obs'"):
             replace(spec, observations={"obs": one}, chunk=chunk)
     replace(spec, observations={"obs": ObservationSpec((4, 2))}, chunk=chunk)
+    two = np.ones((2, 2), np.float32)
     with pytest.raises(
         SpecError, match=r"normaliser: expected \[2\], or a row for each of 3 steps; found shape \[2, 2\]"
     ):
-        replace(spec, chunk=replace(chunk, normalizer=Affine(np.ones((2, 2)), np.ones((2, 2)))))
+        replace(spec, chunk=replace(chunk, normalizer=Affine(two, two)))
 
 
 def test_no_range_is_known_of_actions_whose_place_is_not() -> None:

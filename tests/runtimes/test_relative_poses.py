@@ -73,7 +73,7 @@ def made(once: Once) -> Path:
         plans, starts = {"dense": dense, "warm": warm, "sparse": sparse}, {warm.loop: StartRecord("original", 2)}
         update_plans(path / "artifact", plans, "warm", {}, starts=starts, golden=record_plans)
 
-    return once.compiled("relative poses", convert)[0]
+    return once.folder("relative poses", convert)
 
 
 def observed(seed: int, streams: int = 2) -> tuple[dict[str, np.ndarray], Noise]:

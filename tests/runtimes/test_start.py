@@ -54,7 +54,7 @@ def whole(one_layer_checkpoint: Path, once: Once) -> Path:
         ttscompile.convert(one_layer_checkpoint, path, sampler="ddpm", steps=STEPS)
         add_start(path)
 
-    return once.compiled("start", convert)[0]
+    return once.folder("start", convert)
 
 
 @pytest.fixture

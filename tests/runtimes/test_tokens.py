@@ -193,7 +193,7 @@ def test_nothing_is_kept_afterwards(policy: CompiledPolicy, forget: str) -> None
 def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact: Artifact) -> None:
     first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
     act(policy, first, first)
-    frames: Any = policy._runtime._used.frames  # type: ignore[attr-defined]
+    frames: Any = policy._runtime._used.frames
     (tower,) = frames._tokens.values()
     plain = tower._renew
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def replaying(lines: list[Line]) -> Callable[[Line], Line]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
-def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, int]) -> None:
+def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, Any]) -> None:
     """Batches of one to four streams, each with a plan of its own or all with the same."""
     artifact = make_artifact(toy_program(**variant, pruner=False))
     runtimes = open_runtime(artifact, "torch"), open_runtime(artifact, "reference")
@@ -74,7 +75,7 @@ def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
     runtimes = [open_runtime(artifact, name) for name in ("torch", "reference")]
     written = np.zeros((3, manifest.steps, len(manifest.groups)), np.bool_)
     for _ in range(4):
-        one, other = (random_plan(rng, manifest.steps, manifest.groups, written.all(axis=0)) for _ in range(2))
+        one, other = (random_plan(rng, manifest.steps, manifest.groups, np.all(written, axis=0)) for _ in range(2))
         plans = np.stack([one, other, one])
         obs, noise = random_inputs(artifact, rng, 3)
         ours, theirs = (runtime.predict(obs, noise, Plan(cells=plans))[0] for runtime in runtimes)
@@ -128,7 +129,7 @@ def test_the_first_call_of_an_episode_is_captured_too(calibrated: Artifact) -> N
         for runtime in runtimes:
             runtime.reset()
             samples.append(runtime.predict(obs, noise, calibrated.plans["mixed"])[0])
-        assert_equal_but_for_rounding(*samples, call_terms(calibrated))
+        assert_equal_but_for_rounding(samples[0], samples[1], call_terms(calibrated))
     assert len(lines) == 1
 
 
@@ -264,7 +265,7 @@ def test_frames_are_computed_in_fewer_bits(once: Once) -> None:
         ),
     ],
 )
-def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, options: dict[str, object], message: str) -> None:
+def test_what_cannot_be_had_is_refused(toy_artifact: Artifact, options: dict[str, Any], message: str) -> None:
     with pytest.raises(RuntimeUnavailableError, match=message):
         ttscompile.load(toy_artifact.path, **({"runtime": "torch"} | options))
 
@@ -285,9 +286,14 @@ def test_settings_of_torch_are_as_they_were_after_a_call(toy_artifact: Artifact)
     policy = ttscompile.load(toy_artifact.path, "torch", threads=1, seed=0)
     assert torch.get_num_threads() == 2
     during: list[int] = []
-    backend = policy._runtime.backend
+    backend: Any = policy._runtime.backend
     original = backend._lines.run
-    backend._lines.run = lambda *given, **kwargs: (during.append(torch.get_num_threads()), original(*given, **kwargs))
+
+    def run(*given: Any, **kwargs: Any) -> Any:
+        during.append(torch.get_num_threads())
+        return original(*given, **kwargs)
+
+    backend._lines.run = run
     policy.predict_action({"obs": np.zeros((1, 2), np.float32)}, plan="dense")
     assert (set(during), torch.get_num_threads()) == ({1}, 2)
     assert torch.is_grad_enabled() and not torch.is_inference_mode_enabled()

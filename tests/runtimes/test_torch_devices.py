@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from contextlib import nullcontext
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -42,9 +43,12 @@ def test_what_a_caller_told_torch_about_precision_changes_no_action(
     np.testing.assert_array_equal(found, expected)
 
 
+BACKENDS: Any = torch.backends  # the precisions of single operations are not in its types
+
+
 def by_the_newer_name() -> None:
-    torch.backends.cuda.matmul.fp32_precision = "tf32"
-    torch.backends.cudnn.conv.fp32_precision = "ieee"
+    BACKENDS.cuda.matmul.fp32_precision = "tf32"
+    BACKENDS.cudnn.conv.fp32_precision = "ieee"
 
 
 TOLD = {
@@ -57,7 +61,7 @@ TOLD = {
 
 @pytest.mark.parametrize("told", TOLD)
 def test_nothing_is_computed_in_tf32_and_the_settings_are_as_they_were(told: str) -> None:
-    cuda, cudnn, mkldnn = torch.backends.cuda, torch.backends.cudnn, torch.backends.mkldnn
+    cuda, cudnn, mkldnn = BACKENDS.cuda, BACKENDS.cudnn, BACKENDS.mkldnn
     several = (cuda.matmul, cudnn.conv, cudnn.rnn, mkldnn.matmul, mkldnn.conv, mkldnn.rnn)
 
     def settings() -> list[str]:
@@ -88,7 +92,12 @@ def test_a_call_on_another_gpu_makes_it_the_current_one(
 ) -> None:
     entered: list[torch.device] = []
     backend = TorchBackend(view_of(toy_artifact), Placed(torch.device("cpu")))
-    monkeypatch.setattr(torch.cuda, "device", lambda device: entered.append(device) or nullcontext())
+
+    def enter(device: torch.device) -> nullcontext[None]:
+        entered.append(device)
+        return nullcontext()
+
+    monkeypatch.setattr(torch.cuda, "device", enter)
     with backend._settings():
         assert entered == []
     backend.device = torch.device("cuda:1")

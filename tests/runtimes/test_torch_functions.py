@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dis
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def test_a_function_computes_what_its_graph_says_and_nothing_of_constants_alone(
         ({"args": (Ref("x"), Enum("dtype", "Tensor"))}, "no such dtype"),
     ],
 )
-def test_a_graph_that_cannot_be_written_is_refused(change: dict[str, object], message: str) -> None:
+def test_a_graph_that_cannot_be_written_is_refused(change: dict[str, Any], message: str) -> None:
     one = replace(node("y", "tanh.default", f32(B, 4), Ref("x")), **change)
     with pytest.raises(CaptureError, match=message):
         write_function(Graph({"x": f32(B, 4)}, {}, (one,), ("y",)), {}, [torch.zeros(1, 4)], 1, None)

@@ -29,7 +29,7 @@ def calibrated(artifact: Artifact) -> Artifact:
     """With a schedule that reads residuals of this call alone and has a correction, one that does not, and a pruner."""
     manifest, rng = artifact.manifest, np.random.default_rng(0)
     shape = (manifest.steps, len(manifest.groups))
-    plans = {
+    plans: dict[str, np.ndarray] = {
         "evenly": uniform_plan(*shape, 2),
         "mixed": random_plan(rng, shape[0], manifest.groups, np.zeros(shape, np.bool_), 0.3),
         "rollout": np.where(np.arange(shape[0])[:, None] == 0, Source.COMPUTE, Source.ROLLOUT) + np.zeros(shape),

@@ -122,7 +122,7 @@ def test_a_plan_and_a_correction_do_not_see_the_prefix(once: Once) -> None:
     obs = {"obs": torch.randn(2, 4)}
     contexts = [model.prologue(obs | count) for count in ({}, {"committed": torch.full((2, 1), 3)})]
     told = [np.concatenate([one.numpy().ravel() for one in each.condition.values()]) for each in contexts]
-    assert not np.array_equal(*told)
+    assert not np.array_equal(told[0], told[1])
     for read in (model.condition, model.logits):
         assert torch.equal(*(read(each) for each in contexts))
 
@@ -148,7 +148,7 @@ def test_no_noise_is_put_where_a_prefix_is() -> None:
     prefix = np.ones((1, 2, ACTIONS), np.float32)
     known = known_samples(spec, prefix, np.full((1, *spec.sample), np.nan, np.float32))
     assert known is not None
-    np.testing.assert_array_equal(known.values, np.broadcast_to(np.float32([1, 1, 0]), (9, 1, 2, 3)))
+    np.testing.assert_array_equal(known.values, np.broadcast_to(np.array([1, 1, 0], np.float32), (9, 1, 2, 3)))
 
 
 def test_channels_that_share_matrices_and_tables_without_noise_levels_are_no_reason_to_refuse(

@@ -40,14 +40,14 @@ def sampler(steps: int, noise: float = 0.0, **columns: float) -> SamplerTable:
 
 def random_sampler(steps: int, seed: int, memories: int, clip: float | None) -> SamplerTable:
     rng = np.random.default_rng(seed)
-    columns = {name: rng.uniform(-0.6, 0.6, steps) for name in SamplerTable.COLUMNS}
+    columns = {name: rng.uniform(-0.6, 0.6, steps).astype(np.float32) for name in SamplerTable.COLUMNS}
     return SamplerTable(
         "random",
         np.arange(steps)[::-1].copy(),
         clip=clip,
         **columns,
-        memory_to_next=rng.uniform(-0.4, 0.4, (steps, memories)),
-        to_memory=rng.uniform(-0.4, 0.4, (steps, memories, 3 + memories)),
+        memory_to_next=rng.uniform(-0.4, 0.4, (steps, memories)).astype(np.float32),
+        to_memory=rng.uniform(-0.4, 0.4, (steps, memories, 3 + memories)).astype(np.float32),
     )
 
 
