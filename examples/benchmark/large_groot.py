@@ -14,15 +14,15 @@ from safetensors.torch import save_file
 Shapes = Iterator[tuple[str, torch.Size]]
 BASE, BACKBONE = "GR00T-N1.7-3B", "Cosmos-Reason2-2B"
 _MARKS = ("<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>")
-_FIRST_MARK, _IMAGE_TOKEN = 151643, 151655
-_PADDED, _HORIZON, _EMBODIMENTS, _OWN = 132, 40, 32, 10
+_FIRST_MARK, IMAGE_TOKEN = 151643, 151655
+_PADDED, _HORIZON, _EMBODIMENTS, EMBODIMENT = 132, 40, 32, 10
 _LAYERS, _WORDS, _SEEN, _IMAGES, _MERGED = 16, 2048, 24, 1024, 4096
 """Layers of the language model that are used, its width; of the image encoder, its width, and that of four patches."""
 _HEAD, _HEAD_LAYERS, _INSIDE = 1536, 32, 1024
 
 MODEL: dict[str, Any] = {
     "model_type": "qwen3_vl",
-    "image_token_id": _IMAGE_TOKEN,
+    "image_token_id": IMAGE_TOKEN,
     "text_config": {
         "hidden_size": _WORDS,
         "intermediate_size": 6144,
@@ -80,13 +80,13 @@ def save(directory: Path) -> None:
         each.mkdir(parents=True, exist_ok=True)
     write_json(base / "config.json", BASE_ENTRIES)
     write_json(base / "processor_config.json", {"processor_kwargs": _GEOMETRY})
-    write_json(base / "embodiment_id.json", {"new_embodiment": _OWN})
+    write_json(base / "embodiment_id.json", {"new_embodiment": EMBODIMENT})
     write_json(model / "config.json", MODEL)
     write_json(model / "tokenizer_config.json", {})
     pixels = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "do_normalize": True, "do_rescale": True}
     sizes = {"size": {"longest_edge": 2**24, "shortest_edge": 2**16}, "do_resize": True, "resample": 3}
     write_json(model / "preprocessor_config.json", {**pixels, **sizes, "patch_size": 16, "merge_size": 2})
-    save_letters(model, {mark: _FIRST_MARK + i for i, mark in enumerate(_MARKS[:-1])} | {_MARKS[-1]: _IMAGE_TOKEN})
+    save_letters(model, {mark: _FIRST_MARK + i for i, mark in enumerate(_MARKS[:-1])} | {_MARKS[-1]: IMAGE_TOKEN})
     entries = {
         "type": "groot",
         "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
@@ -105,7 +105,7 @@ def _write_processors(directory: Path) -> None:
     bounds = {f"{key}.{end}": torch.full((6,), at) for key in (STATE, ACTION) for end, at in (("min", -1), ("max", 1))}
     save_file({name: value.float() for name, value in bounds.items()}, directory / "statistics.safetensors")
     sides = {"max_state_dim": _PADDED, "max_action_dim": _PADDED}
-    robot = {"embodiment_tag": "new_embodiment", "embodiment_mapping": {"new_embodiment": _OWN}}
+    robot = {"embodiment_tag": "new_embodiment", "embodiment_mapping": {"new_embodiment": EMBODIMENT}}
     pack = {"action_horizon": _HORIZON, "valid_action_horizon": _HORIZON, "normalize_min_max": True, **sides, **robot}
     encode = {"model_name": f"nvidia/{BACKBONE}", **_GEOMETRY}
     unpack = {"env_action_dim": FEATURES[ACTION]["shape"][0], "normalize_min_max": True}

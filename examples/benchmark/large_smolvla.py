@@ -86,7 +86,7 @@ def random_weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.
     if len(shape) > 1:  # GR00T's, of all embodiments, are [kinds, before, after]
         read = shape[1] if name.endswith(".W") else shape[1:].numel()
         return torch.randn(shape, generator=draw) * read**-0.5
-    return torch.ones(shape) if "norm" in name and name.endswith("weight") else torch.zeros(shape)
+    return torch.ones(shape) if name.endswith("weight") else torch.zeros(shape)  # a norm's, whatever it is called
 
 
 def save_drawn(path: Path, shapes: Mapping[str, torch.Size]) -> None:

@@ -1,0 +1,136 @@
+"""A policy beside OpenVINO (github.com/openvinotoolkit/openvino), the same weights and the same call, taking turns.
+
+    pip install openvino nncf
+    python examples/benchmark/large.py --smolvla --output DIR        # or --pi0, or --groot
+    python examples/benchmark/openvino_beside.py DIR [--threads 1]
+
+``DIR`` is what ``large.py`` leaves. OpenVINO converts the original network as two models: what the original evaluates
+once a call, and one step. The loop between them is the original's. It runs with floats as it chooses, which is
+bf16 where the processor has it, and in eight bits as NNCF quantises both models on a few random observations. See
+``beside.py`` for what is timed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import nncf
+import numpy as np
+import openvino
+import torch
+from beside import Array, observed, policy_of, race
+from large import saved
+from torch import nn
+
+from ttscompile import Noise, PolicySpec
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.runtimes.random_calls import random_calls
+
+POLICIES = ("smolvla", "pi0", "groot")
+
+LEARNED = 4
+"""Random observations that a quantisation learns its ranges from: a call of a large policy takes seconds."""
+
+
+class Encoder(nn.Module):
+    """The encoder of a policy as a function of its arguments, in their order."""
+
+    def __init__(self, encoder: nn.Module, names: tuple[str, ...]) -> None:
+        super().__init__()
+        self.encoder, self.names = encoder, names
+
+    def forward(self, *values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """What the denoiser reads, one after the other."""
+        return tuple(self.encoder(dict(zip(self.names, values, strict=True))))
+
+
+class Denoiser(nn.Module):
+    """One step as a function of tensors."""
+
+    def __init__(self, denoiser: nn.Module) -> None:
+        super().__init__()
+        self.denoiser = denoiser
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, *encoded: torch.Tensor) -> torch.Tensor:
+        """``[B, T, D]``."""
+        made: torch.Tensor = self.denoiser(sample, timestep, encoded)
+        return made
+
+
+class Compiled(nn.Module):
+    """A model of OpenVINO in place of a part of the policy; ``seconds`` is what its evaluations took."""
+
+    def __init__(self, model: Any, threads: int) -> None:
+        super().__init__()
+        settings = {"INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY"}
+        self._model = openvino.Core().compile_model(model, "CPU", settings)
+        self.seconds = 0.0
+
+    def forward(self, *values: Any) -> Any:
+        """Of the encoder's arguments by name what it gives; of sample, timestep and this, the velocity."""
+        one, *others = values
+        given = list(one.values()) if isinstance(one, dict) else [one, *others[:1], *others[1]]
+        start = time.perf_counter()
+        made = self._model([np.ascontiguousarray(value) for value in given])
+        self.seconds += time.perf_counter() - start
+        found = tuple(torch.from_numpy(np.array(made[i])) for i in range(len(self._model.outputs)))
+        return found if isinstance(one, dict) else found[0]
+
+
+class OpenVino:
+    """OpenVINO with both models; see ``beside.Rival``."""
+
+    parts = "before the loop, loop"
+
+    def __init__(self, encoder: Any, denoiser: Any, spec: PolicySpec, threads: int) -> None:
+        self._encoder = Compiled(encoder, threads)
+        self._run = eager_policy(EncodedDenoiser(self._encoder, Compiled(denoiser, threads)), spec)
+
+    def predict(self, obs: Mapping[str, Array], noise: Noise) -> tuple[Array, list[float]]:
+        """The sample ``[T, D]``, and seconds."""
+        given = {key: torch.from_numpy(value) for key, value in obs.items()}
+        start, self._encoder.seconds = time.perf_counter(), 0.0
+        sample = self._run(given, noise).numpy()[0]
+        return sample, [self._encoder.seconds, time.perf_counter() - start - self._encoder.seconds]
+
+
+@click.command(context_settings={"show_default": True})
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--threads", default=1, type=click.IntRange(1))
+@click.option("--rounds", default=5, type=click.IntRange(1), help="That are counted.")
+@click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory.")
+def main(folder: Path, threads: int, rounds: int, fp32: bool) -> None:
+    """Time calls of the policy in FOLDER, and of OpenVINO with the same weights."""
+    directory, task = saved(folder, policy_of(folder, POLICIES))
+    module: Any
+    module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
+    obs, noise = observed(folder)
+    named = {spec.arguments[key]: torch.from_numpy(value) for key, value in obs.items()}
+    with torch.inference_mode():
+        encoder = openvino.convert_model(Encoder(module.encoder, tuple(named)), example_input=tuple(named.values()))
+        encoded = tuple(module.encoder(named))
+        step = (torch.from_numpy(noise.initial), torch.from_numpy(spec.sampler.timesteps[:1]), *encoded)
+        denoiser = openvino.convert_model(Denoiser(module.denoiser), example_input=step)
+        learned = [
+            tuple(np.ascontiguousarray(seen[key]) for key in obs) for seen, _ in random_calls(spec, LEARNED, seed=3)
+        ]
+        steps = [(step[0].numpy(), np.array([t]), *(each.numpy() for each in encoded)) for t in spec.sampler.timesteps]
+    rivals = {"OpenVINO": OpenVino(encoder, denoiser, spec, threads)}
+    quantized = (
+        nncf.quantize(model, nncf.Dataset(data), model_type=nncf.ModelType.TRANSFORMER, subset_size=len(data))
+        for model, data in ((encoder, learned), (denoiser, steps))
+    )
+    rivals["OpenVINO, int8 by NNCF"] = OpenVino(*quantized, spec, threads)
+    print(f"OpenVINO {openvino.__version__}, NNCF {nncf.__version__}")
+    race(folder, rivals, threads, rounds, fp32)
+
+
+if __name__ == "__main__":
+    main()

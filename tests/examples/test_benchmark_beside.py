@@ -1,0 +1,94 @@
+"""Policies beside other engines: what is timed and told, and what vla.cpp is given."""
+
+import ctypes
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import beside
+import numpy as np
+import pytest
+import released_groot
+import vla_cpp
+from beside import Array
+from click.testing import CliRunner
+from large_groot import BASE
+
+from tests.families import cameras
+from tests.once import Once
+from ttscompile import Noise, load
+
+
+class Late:
+    """A rival that answers as the dense plan does, and says that it took a second."""
+
+    parts = "all of it"
+
+    def __init__(self, artifact: Path) -> None:
+        self._policy = load(artifact, plan="dense")
+        self.shown: list[Array] = []
+
+    def predict(self, obs: Mapping[str, Array], noise: Noise) -> tuple[Array, list[float]]:
+        self.shown.append(obs[cameras.CAMERAS[0]])
+        return self._policy.predict_action(obs, noise=noise)["action_pred"][0], [1.0]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_everybody_sees_new_pictures_and_is_told_beside_the_first(
+    once: Once, tmp_path: Path, capsys: pytest.CaptureFixture[str], whole: bool
+) -> None:
+    (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
+    rival = Late(tmp_path / "compiled")
+    beside.race(tmp_path, {"late": rival}, threads=1, rounds=1, whole=whole)
+    assert len({each.tobytes() for each in rival.shown}) == 1 + beside.UNCOUNTED
+    first, *others = capsys.readouterr().out.splitlines()
+    assert first.split()[:3] == ["1.00", "s", "1.00"] and first.endswith("late: all of it: 1.00")
+    precisions = ["fp32", "int8"] if whole else ["int8"]
+    told = [f"{name}, {bits}" for bits in precisions for name in ("dense", "2 of 3 steps")]
+    timed = [line for line in others if " s " in line]
+    assert [line.split("  ")[-1].split(":")[0] for line in timed] == [*told, "2 of 3 steps, int8, tokens reused"]
+    off = {line.split("  ")[-1].split(":")[0]: float(line.split()[0]) for line in others[len(timed) :]}
+    assert list(off) == (["late", "dense, int8"] if whole else [])
+    if whole:
+        assert off["late"] < 1e-6 < off["dense, int8"]
+
+
+def test_medians_are_of_the_calls_that_count() -> None:
+    uncounted = [[9.0, 9.0]] * beside.UNCOUNTED
+    times = {"theirs": [*uncounted, [3.0, 1.0], [4.0, 2.0], [30.0, 3.0]], "ours": [*uncounted, [1.0, 0.5]]}
+    assert [line.split("  ")[-1] for line in beside.told(times)] == ["theirs: 4.00, 2.00", "ours: 1.00, 0.50"]
+    assert [line.split()[:3] for line in beside.told(times)] == [["6.00", "s", "1.00"], ["1.50", "s", "4.00"]]
+
+
+def test_one_policy_is_in_the_folder(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="expected one folder of smolvla, pi0, groot"):
+        beside.policy_of(tmp_path, vla_cpp.POLICIES)
+    (tmp_path / "pi0").mkdir()
+    assert beside.policy_of(tmp_path, vla_cpp.POLICIES) == "pi0"
+
+
+def test_the_structures_have_the_sizes_of_the_interface() -> None:
+    assert (ctypes.sizeof(vla_cpp.Image), ctypes.sizeof(vla_cpp.Inputs)) == (24, 80)
+
+
+def test_words_of_smolvla_are_those_that_were_observed() -> None:
+    obs = {"observation.language.tokens": np.array([[3, 1, 2]]), "state": np.ones((1, 2), np.float32)}
+    prompt = vla_cpp.prompt_of(Path(), "smolvla", obs)
+    assert prompt.tokens.tolist() == [3, 1, 2] and prompt.tokens.dtype == np.int32
+
+
+def test_weights_of_a_release_are_the_same_bytes_under_its_names(tmp_path: Path) -> None:
+    names = ("_groot_model.backbone.model.lm_head.weight", "_groot_model.action_head.vlln.weight")
+    header = json.dumps({name: {"data_offsets": [i, i + 1]} for i, name in enumerate(names)}).encode()
+    for folder in ("groot", BASE):
+        (tmp_path / folder).mkdir()
+    saved = len(header).to_bytes(8, "little") + header + b"ab"
+    (tmp_path / "groot" / "model.safetensors").write_bytes(saved)
+    assert CliRunner().invoke(released_groot.main, [str(tmp_path)]).exit_code == 0
+    made = (tmp_path / BASE / "model.safetensors").read_bytes()
+    assert len(made) == len(saved) and made[:8] == saved[:8] and made.endswith(b"ab")
+    found = json.loads(made[8:-2])
+    assert list(found) == ["backbone.model.model.language_model.embed_tokens.weight", "action_head.vlln.weight"]
+    assert [each["data_offsets"][0] for each in found.values()] == [0, 1]
+    index = json.loads((tmp_path / BASE / "model.safetensors.index.json").read_text())
+    assert set(index["weight_map"]) == set(found)
