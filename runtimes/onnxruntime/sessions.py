@@ -5,9 +5,9 @@ cannot change, its workers spin, and every other session of the process that wan
 robot runs other things beside the policy. So threads belong to sessions.
 
 Steps that compute all blocks run in one session, at any number of threads. Single blocks are in sessions of their own
-with one thread, the caller's. With more, one session holds all of them (``ir.pieces``). Its threads and those of the
-whole steps, ``threads - 1`` each, stay awake from one block to the next: they look for work for ``SPIN_US`` after each,
-and then sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
+with one thread, the caller's. With more, one session holds all of them (``ir.pieces``). Threads of a session,
+``threads - 1`` each, stay awake from one operation to the next: they look for work for ``SPIN_US`` after each, and then
+sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
 
 A session keeps its weights as its products read them, so sessions of single blocks, which most calibrated plans do not
 need, are opened when some plan does.
@@ -46,9 +46,10 @@ FIRST_STEP = "first_step"
 """Name of the session that computes step 0: that of ``dense_step``, but for a plan with weights of its own."""
 
 SPIN_US = 50
-"""How long a thread of the blocks' session looks for work before it sleeps: longer than what lies between most blocks
-of a step, shorter than the end of a call. Push-T at 4 threads: 38.7 ms a call with 0, 27.7 with 50, 27.2 with 1000; and
-the processor time that threads take after the call: none, none, 20 ms; 94 ms with onnxruntime's own setting."""
+"""How long a thread of a session looks for work before it sleeps: longer than what lies between most blocks of a step,
+shorter than the end of a call. Push-T at 4 threads: 38.7 ms a call with 0, 27.7 with 50, 27.2 with 1000; and
+the processor time that threads take after the call: none, none, 20 ms; 94 ms with onnxruntime's own setting. An image
+encoder of SmolVLA in int8 on two threads: 223 ms with 0, 207 with 50, 204 with 1000."""
 
 EXACT_INTEGERS = "session.x64quantprecision"
 """Option of onnxruntime's sessions: sum products of integers exactly, slower than in fp32, rather than in 16 bits that
@@ -65,7 +66,7 @@ class Sessions:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._known: dict[tuple[str, int, bool], Any] = {}
+        self._known: dict[tuple[str, int], Any] = {}
         self._careful: dict[str, bool] = {}
 
     def of(self, view: View, blocks: bool = True) -> dict[str, Any]:
@@ -124,14 +125,12 @@ class Sessions:
     def _session(self, view: View, piece: str, contents: Mapping[str, bytes], first_step: bool = False) -> Any:
         file = view.onnx_file(piece, first_step)
         threads = 1 if piece in SINGLE_THREADED else self.threads
-        spins = piece in kinds.OF_ALL_BLOCKS
-        if (file, threads, spins) not in self._known:
+        if (file, threads) not in self._known:
             precision = view.precision.get(str(kinds.part_of(piece)), FP32)
             if precision not in self._careful:
                 self._careful[precision] = needs_care(precision)
-            session = _open_file(view, file, threads, spins, self._careful[precision], contents)
-            self._known[file, threads, spins] = session
-        return self._known[file, threads, spins]
+            self._known[file, threads] = _open_file(view, file, threads, self._careful[precision], contents)
+        return self._known[file, threads]
 
 
 def _contents(view: View) -> dict[str, bytes]:
@@ -145,7 +144,7 @@ def _contents(view: View) -> dict[str, bytes]:
     return {name: read_file(view.artifact.files / name, size) for name, size in sizes.items()} if small else {}
 
 
-def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool, contents: Mapping[str, bytes]) -> Any:
+def _open_file(view: View, file: str, threads: int, careful: bool, contents: Mapping[str, bytes]) -> Any:
     try:
         import onnxruntime as ort
     except ImportError as error:
@@ -154,7 +153,7 @@ def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool, 
     if os.environ.get(CONFIG_FROM_MODEL) not in (None, "", "0"):
         problem = f"the environment variable {CONFIG_FROM_MODEL} has onnxruntime ignore the threads and options that"
         raise RuntimeUnavailableError(f"{problem} a policy is loaded with. Unset it.")
-    path, options = view.artifact.files / file, _options(ort, threads, spins, careful)
+    path, options = view.artifact.files / file, _options(ort, threads, careful)
     if contents and (give := getattr(options, "add_external_initializers_from_files_in_memory", None)):  # from 1.24 on
         give(list(contents), list(contents.values()), [len(content) for content in contents.values()])
     try:
@@ -177,16 +176,13 @@ def _open_file(view: View, file: str, threads: int, spins: bool, careful: bool, 
     return session
 
 
-def _options(ort: Any, threads: int, spin: bool, careful: bool) -> Any:
+def _options(ort: Any, threads: int, careful: bool) -> Any:
     options = ort.SessionOptions()
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    if spin:
-        options.add_session_config_entry("session.intra_op.spin_duration_us", str(SPIN_US))
-    else:  # twenty-odd pools that spin made a call ten times slower, and would take the processor from everything else
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.intra_op.spin_duration_us", str(SPIN_US))
     if careful:
         options.add_session_config_entry(EXACT_INTEGERS, "1")
     return options
