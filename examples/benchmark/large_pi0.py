@@ -22,7 +22,19 @@ VISION = SiglipConfig(
     patch_size=14,
 )
 """PaliGemma's, in front of Gemma 2B; its expert has the width of Gemma 300M."""
-_PADDED = 32
+_PADDED, _PERIODS = 32, (4e-3, 4.0)
+_SIZES = {
+    "chunk_size": 50,
+    "n_action_steps": 50,
+    "num_inference_steps": 10,
+    "max_state_dim": _PADDED,
+    "max_action_dim": _PADDED,
+    "tokenizer_max_length": 48,
+    "min_period": _PERIODS[0],
+    "max_period": _PERIODS[1],
+}
+"""Lerobot's own, which a saved configuration has, and other programs read."""
+_TEXT = "paligemma_with_expert.paligemma.model.language_model."
 
 
 def save(directory: Path) -> None:
@@ -32,14 +44,20 @@ def save(directory: Path) -> None:
         "type": "pi0",
         "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
         "output_features": {ACTION: FEATURES[ACTION]},
-        "chunk_size": 50,
-        "num_inference_steps": 10,
+        **_SIZES,
     }
     write_json(directory / "config.json", entries)
     write_processors(directory)
     config = PiConfig(
-        vision=VISION, text=GEMMA, vocabulary=257152, expert=EXPERT, state=_PADDED, actions=_PADDED, periods=(4e-3, 4.0)
+        vision=VISION, text=GEMMA, vocabulary=257152, expert=EXPERT, state=_PADDED, actions=_PADDED, periods=_PERIODS
     )
     with torch.device("meta"):
-        shapes = {f"model.{name}": value.shape for name, value in Pi(config).state_dict().items()}
+        shapes = {f"model.{_saved(name)}": value.shape for name, value in Pi(config).state_dict().items()}
+    shapes[f"model.{_TEXT}norm.weight"] = torch.Size((GEMMA.width,))  # no action depends on it
     save_drawn(directory / "model.safetensors", shapes)
+
+
+def _saved(name: str) -> str:
+    """A weight's name in a file of lerobot's, which has the head that is tied to the embedding of words."""
+    head = name.replace(f"{_TEXT}embed_tokens", "paligemma_with_expert.paligemma.lm_head")
+    return head.replace(".vision_tower.", ".vision_tower.vision_model.")
