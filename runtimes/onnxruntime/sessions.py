@@ -34,6 +34,7 @@ from ttscompile.ir import pieces as kinds
 from ttscompile.ir.graph import TensorType
 from ttscompile.ir.pieces import Joint, join
 from ttscompile.measure.machine import has_integer_dot_product
+from ttscompile.measure.versions import release
 from ttscompile.runtimes.contexts import ContextValues
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -50,6 +51,9 @@ SPIN_US = 50
 shorter than the end of a call. Push-T at 4 threads: 38.7 ms a call with 0, 27.7 with 50, 27.2 with 1000; and
 the processor time that threads take after the call: none, none, 20 ms; 94 ms with onnxruntime's own setting. An image
 encoder of SmolVLA in int8 on two threads: 223 ms with 0, 207 with 50, 204 with 1000."""
+
+TIMED = (1, 26)
+"""The first onnxruntime that can be told how long. Threads of an older one sleep at once."""
 
 EXACT_INTEGERS = "session.x64quantprecision"
 """Option of onnxruntime's sessions: sum products of integers exactly, slower than in fp32, rather than in 16 bits that
@@ -182,7 +186,10 @@ def _options(ort: Any, threads: int, careful: bool) -> Any:
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    options.add_session_config_entry("session.intra_op.spin_duration_us", str(SPIN_US))
+    if release(ort.__version__) >= TIMED:
+        options.add_session_config_entry("session.intra_op.spin_duration_us", str(SPIN_US))
+    else:  # it would look for work for tens of milliseconds, and take the processor from everything else
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     if careful:
         options.add_session_config_entry(EXACT_INTEGERS, "1")
     return options

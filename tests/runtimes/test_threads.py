@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from tests.rounding import bound
@@ -41,6 +42,22 @@ def test_one_thread_has_a_session_a_block_and_more_have_one_for_all(toy_artifact
     assert all(isinstance(block, JointBlock) and block.session is joint[0].session for block in joint)
     for name in SINGLE_THREADED & alone.keys():
         assert alone[name].get_session_options().intra_op_num_threads == 1
+
+
+@pytest.mark.parametrize(("version", "found"), [("1.25.1", ("", "0")), ("1.26.0", ("50", "")), ("1.31.1", ("50", ""))])
+def test_a_version_that_knows_no_time_does_not_look_for_work(
+    toy_artifact: Artifact, monkeypatch: pytest.MonkeyPatch, version: str, found: tuple[str, str]
+) -> None:
+    monkeypatch.setattr(onnxruntime, "__version__", version)
+    options = Sessions(2).of(view_of(toy_artifact))[DENSE_STEP].get_session_options()
+    names = "session.intra_op.spin_duration_us", "session.intra_op.allow_spinning"
+    told = []
+    for name in names:
+        try:
+            told.append(options.get_session_config_entry(name))
+        except RuntimeError:  # there is none
+            told.append("")
+    assert tuple(told) == found
 
 
 def test_threads_sleep_between_calls(toy_artifact: Artifact) -> None:
