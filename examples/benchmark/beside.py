@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from large_calls import lowered, plans_of
 from large_smolvla import call
-from moving import REUSE, arm, picture
+from moving import REUSE, arm, backgrounds
 
 from ttscompile import Noise, Plan
 from ttscompile.artifact.load import load_artifact
@@ -25,11 +25,11 @@ from ttscompile.runtimes.policy import CompiledPolicy
 
 Array = npt.NDArray[np.float32]
 
+POLICIES = ("smolvla", "pi0", "groot")
+"""Of ``large.py``, that another engine runs."""
+
 COMPUTED = 2
 """Steps of the sparse plans."""
-
-FRAMES = 5
-"""Axes of what a camera shows: ``[B, frames, 3, H, W]``."""
 
 UNCOUNTED = 2
 """Rounds: where tokens are reused, the first frame is whole, and the second may be the first of its size."""
@@ -42,14 +42,15 @@ class Rival(Protocol):
     """What ``predict`` takes the seconds of."""
 
     def predict(self, obs: Mapping[str, Array], noise: Noise) -> tuple[Array, list[float]]:
-        """The sample ``[T, D]`` that a call ends with, and the seconds of its parts."""
+        """The actions ``[T, D]`` of a call, of padded channels too, and the seconds of its parts."""
 
 
-def policy_of(folder: Path, known: Sequence[str]) -> str:
-    """Which of these policies ``large.py`` left in the folder."""
-    found = [name for name in known if (folder / name).is_dir()]
+def policy_of(folder: Path) -> str:
+    """Which policy ``large.py`` left in the folder."""
+    found = [name for name in POLICIES if (folder / name).is_dir()]
     if len(found) != 1:
-        raise SystemExit(f"{folder}: found {found}; expected one folder of {', '.join(known)}, as large.py leaves it.")
+        wanted = f"one folder of {', '.join(POLICIES)}, as large.py leaves it"
+        raise SystemExit(f"{folder}: found {', '.join(found) or 'none'}; expected {wanted}.")
     return found[0]
 
 
@@ -59,23 +60,23 @@ def observed(folder: Path) -> tuple[dict[str, Array], Noise]:
     return {key: np.ones_like(value) if key.endswith("mask") else value for key, value in obs.items()}, noise
 
 
-def race(folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, whole: bool = True) -> None:
-    """Time calls of everybody, in turn, and print medians; and how far samples are from ours in fp32.
+def race(folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, fp32: bool = True) -> None:
+    """Time calls of everybody, in turn, and print medians; and how far actions are from ours in fp32.
 
     Args:
         folder: with the artifact.
         rivals: by name. The times of the first are what the others are told in.
         threads: of ours.
         rounds: that are counted.
-        whole: whether ours in fp32 runs, too, which takes memory; samples are then compared.
+        fp32: whether ours in fp32 runs, too, which takes memory; actions are then compared.
     """
     artifact = load_artifact(folder / "compiled")
     (obs, noise), rng, bits = observed(folder), np.random.default_rng(1), lowered(artifact)
-    plans = {name: plans_of(artifact, name, COMPUTED) for name in (("fp32", bits) if whole else (bits,))}
+    plans = {name: plans_of(artifact, name, COMPUTED) for name in (("fp32", bits) if fp32 else (bits,))}
     policies = {name: open_policy(artifact, threads=threads, plan=own["dense"]) for name, own in plans.items()}
     few, reused = list(plans_of(artifact, bits, COMPUTED, REUSE).items())[-1]
     reusing = open_policy(artifact, threads=threads, plan=reused)
-    still = {key: picture(value.shape[-1], rng) for key, value in obs.items() if value.ndim == FRAMES}
+    still = backgrounds(obs, rng)
     times, found, off = dict[str, list[list[float]]](), dict[str, Array](), dict[str, list[float]]()
     for number in range(rounds + UNCOUNTED):
         for place, (key, background) in enumerate(still.items()):
@@ -90,7 +91,7 @@ def race(folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, w
                 times.setdefault(f"{name}, {precision}: before the loop, loop", []).append(seconds)
         _, seconds = timed(reusing, obs, noise, reused)
         times.setdefault(f"{few}, {bits}, tokens reused: before the loop, loop", []).append(seconds)
-        if whole:
+        if fp32:
             exact = found["dense, fp32"]
             for name in (*rivals, f"dense, {bits}"):
                 off.setdefault(name, []).append(float(np.abs(found[name][:, : exact.shape[1]] - exact).mean()))

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from large_smolvla import call
-from moving import REUSE, arm, picture
+from moving import REUSE, arm, backgrounds
 from rate import rates, run_all
 
 import ttscompile
@@ -207,8 +207,7 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
     times, rng = Times(Arithmetic(artifact)), np.random.default_rng(1)
     obs, noise = call(spec)
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
-    cameras = [key for key, value in obs.items() if value.ndim == 5]  # [1, frames, 3, H, W]
-    still = {key: picture(obs[key].shape[-1], rng) for key in cameras}
+    still = backgrounds(obs, rng)
     shares, off, changes = list[float](), dict[str, list[float]](), dict[str, list[float]]()
     for number in range(len(plans) * (rounds + 2)):
         times.next_round()

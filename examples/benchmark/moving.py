@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,6 +18,11 @@ REUSE = TokenReuse(threshold=0.02, refresh=10**6)
 def picture(size: int, rng: np.random.Generator) -> Array:
     """Eight by eight squares of random colours ``[3, size, size]``, in 0..1."""
     return rng.random((3, 8, 8)).repeat(size // 8, 1).repeat(size // 8, 2).astype(np.float32)
+
+
+def backgrounds(obs: Mapping[str, np.ndarray], rng: np.random.Generator) -> dict[str, Array]:
+    """A picture for each camera of an observation, whose values are ``[1, frames, 3, S, S]``."""
+    return {key: picture(value.shape[-1], rng) for key, value in obs.items() if value.ndim == 5}
 
 
 def arm(still: Array, angle: float) -> Array:

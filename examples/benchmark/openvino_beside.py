@@ -33,8 +33,6 @@ from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.runtimes.random_calls import random_calls
 
-POLICIES = ("smolvla", "pi0", "groot")
-
 LEARNED = 4
 """Random observations that a quantisation learns its ranges from: a call of a large policy takes seconds."""
 
@@ -64,24 +62,39 @@ class Denoiser(nn.Module):
         return made
 
 
-class Compiled(nn.Module):
-    """A model of OpenVINO in place of a part of the policy; ``seconds`` is what its evaluations took."""
+class Part(nn.Module):
+    """A model of OpenVINO in place of a part of the policy."""
 
     def __init__(self, model: Any, threads: int) -> None:
         super().__init__()
         settings = {"INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY"}
         self._model = openvino.Core().compile_model(model, "CPU", settings)
-        self.seconds = 0.0
 
-    def forward(self, *values: Any) -> Any:
-        """Of the encoder's arguments by name what it gives; of sample, timestep and this, the velocity."""
-        one, *others = values
-        given = list(one.values()) if isinstance(one, dict) else [one, *others[:1], *others[1]]
-        start = time.perf_counter()
+    def run(self, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """All outputs of the model."""
         made = self._model([np.ascontiguousarray(value) for value in given])
-        self.seconds += time.perf_counter() - start
-        found = tuple(torch.from_numpy(np.array(made[i])) for i in range(len(self._model.outputs)))
-        return found if isinstance(one, dict) else found[0]
+        return tuple(torch.from_numpy(np.array(made[i])) for i in range(len(self._model.outputs)))
+
+
+class EncoderPart(Part):
+    """In place of the encoder; ``seconds`` is what its last evaluation took."""
+
+    seconds = 0.0
+
+    def forward(self, named: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """What the denoiser reads of arguments by name."""
+        start = time.perf_counter()
+        found = self.run(*named.values())
+        self.seconds = time.perf_counter() - start
+        return found
+
+
+class DenoiserPart(Part):
+    """In place of one step."""
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, encoded: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """``[B, T, D]``."""
+        return self.run(sample, timestep, *encoded)[0]
 
 
 class OpenVino:
@@ -90,15 +103,15 @@ class OpenVino:
     parts = "before the loop, loop"
 
     def __init__(self, encoder: Any, denoiser: Any, spec: PolicySpec, threads: int) -> None:
-        self._encoder = Compiled(encoder, threads)
-        self._run = eager_policy(EncodedDenoiser(self._encoder, Compiled(denoiser, threads)), spec)
+        self._encoder, self._spec = EncoderPart(encoder, threads), spec
+        self._run = eager_policy(EncodedDenoiser(self._encoder, DenoiserPart(denoiser, threads)), spec)
 
     def predict(self, obs: Mapping[str, Array], noise: Noise) -> tuple[Array, list[float]]:
-        """The sample ``[T, D]``, and seconds."""
+        """The actions ``[T, D]``, and seconds."""
         given = {key: torch.from_numpy(value) for key, value in obs.items()}
-        start, self._encoder.seconds = time.perf_counter(), 0.0
-        sample = self._run(given, noise).numpy()[0]
-        return sample, [self._encoder.seconds, time.perf_counter() - start - self._encoder.seconds]
+        start = time.perf_counter()
+        actions = self._spec.chunk.unnormalized(self._run(given, noise).numpy())[0]
+        return actions, [self._encoder.seconds, time.perf_counter() - start - self._encoder.seconds]
 
 
 def quantized(model: Any, seen: list[tuple[Array, ...]]) -> Any:
@@ -114,7 +127,7 @@ def quantized(model: Any, seen: list[tuple[Array, ...]]) -> Any:
 @click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory.")
 def main(folder: Path, threads: int, rounds: int, fp32: bool) -> None:
     """Time calls of the policy in FOLDER, and of OpenVINO with the same weights."""
-    directory, task = saved(folder, policy_of(folder, POLICIES))
+    directory, task = saved(folder, policy_of(folder))
     module: Any
     module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
     obs, noise = observed(folder)

@@ -33,8 +33,6 @@ from ttscompile import Noise
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 
-POLICIES = ("smolvla", "pi0", "groot")
-
 FLOATS = 1
 """Of vla.cpp's interface (``vla.h``): pixels are floats from 0 to 1."""
 
@@ -162,7 +160,7 @@ class VlaCpp:
 @click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory.")
 def main(folder: Path, library: Path, model: Path, threads: int, rounds: int, fp32: bool) -> None:
     """Time calls of the policy in FOLDER, and of vla.cpp with the same weights."""
-    prompt = prompt_of(folder, policy_of(folder, POLICIES), observed(folder)[0])
+    prompt = prompt_of(folder, policy_of(folder), observed(folder)[0])
     race(folder, {"vla.cpp": VlaCpp(library, model, threads, prompt)}, threads, rounds, fp32)
 
 

@@ -33,23 +33,23 @@ class Late:
         return self._policy.predict_action(obs, noise=noise)["action_pred"][0], [1.0]
 
 
-@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("fp32", [True, False])
 def test_everybody_sees_new_pictures_and_is_told_beside_the_first(
-    once: Once, tmp_path: Path, capsys: pytest.CaptureFixture[str], whole: bool
+    once: Once, tmp_path: Path, capsys: pytest.CaptureFixture[str], fp32: bool
 ) -> None:
     (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
     rival = Late(tmp_path / "compiled")
-    beside.race(tmp_path, {"late": rival}, threads=1, rounds=1, whole=whole)
+    beside.race(tmp_path, {"late": rival}, threads=1, rounds=1, fp32=fp32)
     assert len({each.tobytes() for each in rival.shown}) == 1 + beside.UNCOUNTED
     first, *others = capsys.readouterr().out.splitlines()
     assert first.split()[:3] == ["1.00", "s", "1.00"] and first.endswith("late: all of it: 1.00")
-    precisions = ["fp32", "int8"] if whole else ["int8"]
+    precisions = ["fp32", "int8"] if fp32 else ["int8"]
     told = [f"{name}, {bits}" for bits in precisions for name in ("dense", "2 of 3 steps")]
     timed = [line for line in others if " s " in line]
     assert [line.split("  ")[-1].split(":")[0] for line in timed] == [*told, "2 of 3 steps, int8, tokens reused"]
     off = {line.split("  ")[-1].split(":")[0]: float(line.split()[0]) for line in others[len(timed) :]}
-    assert list(off) == (["late", "dense, int8"] if whole else [])
-    if whole:
+    assert list(off) == (["late", "dense, int8"] if fp32 else [])
+    if fp32:
         assert off["late"] < 1e-6 < off["dense, int8"]
 
 
@@ -62,9 +62,9 @@ def test_medians_are_of_the_calls_that_count() -> None:
 
 def test_one_policy_is_in_the_folder(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="expected one folder of smolvla, pi0, groot"):
-        beside.policy_of(tmp_path, vla_cpp.POLICIES)
+        beside.policy_of(tmp_path)
     (tmp_path / "pi0").mkdir()
-    assert beside.policy_of(tmp_path, vla_cpp.POLICIES) == "pi0"
+    assert beside.policy_of(tmp_path) == "pi0"
 
 
 def test_the_structures_have_the_sizes_of_the_interface() -> None:
