@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from rollout import Episode
-from variants import PINNED, Variant
+from variants import OTHER, PINNED, Variant
 
 from ttscompile.core.plan import DENSE, FULL
 
@@ -41,9 +41,8 @@ class Episodes:
         plan = variant.plan or info.default_plan
         as_converted = plan in (DENSE, FULL) and not info.reuses_tokens and not info.follows
         identity = info.model_identity if as_converted else info.identity
-        key = "\n".join(
-            (FORMAT, environment, identity, info.precision, plan, runtime) + (PINNED,) * variant.noise.pinned
-        )
+        noise = (PINNED,) * variant.noise.pinned + (OTHER,) * variant.noise.other
+        key = "\n".join((FORMAT, environment, identity, info.precision, plan, runtime, *noise))
         self._folder = root / hashlib.sha256(key.encode()).hexdigest()[:16]
 
     def read(self, seed: int) -> Episode | None:

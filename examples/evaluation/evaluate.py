@@ -307,7 +307,8 @@ def main(  # noqa: C901  # checks each option in turn
 ) -> None:
     """Compare artifacts and plans: DIR takes the artifact's own plan, DIR:dense is the original policy.
 
-    With DIR:dense:pinned all calls of an episode share noise.
+    With DIR:dense:pinned all calls of an episode share noise. DIR:dense:other has other noise than all others: the
+    original against itself shows what chance does.
     """
     if (jobs > 1 or ray) and no_cache:
         raise click.UsageError("--jobs and --ray hand episodes over through the cache: leave out --no-cache.")

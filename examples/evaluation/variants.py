@@ -17,8 +17,9 @@ from ttscompile.cli.output import results_console as results_console, run as run
 from ttscompile.core.plan import DENSE, FULL
 from ttscompile.runtimes.info import PolicyInfo
 
-PINNED = "pinned"
-"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls."""
+PINNED, OTHER = "pinned", "other"
+"""What may stand after a directory beside a plan: the noise of an episode's first call in all of its calls, and noise
+that nobody else has. The original with other noise shows what chance alone makes of an episode."""
 
 Plan: TypeAlias = str | npt.NDArray[np.int8]
 """The name of a plan in the artifact, or a matrix ``[K, blocks]``."""
@@ -49,12 +50,14 @@ class NoiseShape:
         sample: ``(T, D)``.
         stochastic: whether the sampler draws noise at its steps.
         pinned: whether all calls of an episode have the noise of its first.
+        other: whether it is not the noise that all policies share.
     """
 
     steps: int
     sample: tuple[int, int]
     stochastic: bool
     pinned: bool = False
+    other: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,8 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
     Args:
         text: ``DIR`` for the artifact's default plan, ``DIR:dense``, or ``DIR:NAME`` for a plan that it holds, also in
             another precision: ``DIR:NAME@int8+blocks``.
-            With ``:pinned`` after it all calls of an episode have the same noise.
+            With ``:pinned`` after it all calls of an episode have the same noise, with ``:other`` another than all
+            policies share.
         runtime: of ``ttscompile.load``.
         threads: of ``ttscompile.load``.
 
@@ -101,7 +105,7 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
         The variant, its label being the text.
     """
     directory, *words = text.split(":")
-    plans = [word for word in words if word != PINNED]
+    plans = [word for word in words if word not in (PINNED, OTHER)]
     if len(plans) > 1:
         raise click.BadParameter(f"{text}: expected one plan; found {':'.join(words)}.")
     policy = ttscompile.load(Path(directory), runtime=runtime, threads=threads, plan=plans[0] if plans else None)
@@ -110,14 +114,15 @@ def open_variant(text: str, runtime: str, threads: int) -> Variant:
     shape = noise_shape(policy.info)
     if whole is not None and whole.cells is not None:
         shape = replace(shape, steps=len(whole.cells))
-    return Variant(text, policy, plans[0] if plans else None, replace(shape, pinned=PINNED in words))
+    shape = replace(shape, pinned=PINNED in words, other=OTHER in words)
+    return Variant(text, policy, plans[0] if plans else None, shape)
 
 
 def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompile.Noise:
     """The noise of the ``call``-th call of each episode.
 
-    A function of seed and call only: any two policies see the same numbers, in whatever batches they run. Policies
-    with another number of steps share the initial noise.
+    A function of seed and call only: any two policies see the same numbers, in whatever batches they run, unless one
+    is to have others. Policies with another number of steps share the initial noise.
 
     Args:
         shape: sizes.
@@ -127,7 +132,8 @@ def seeded_noise(shape: NoiseShape, seeds: Sequence[int], call: int) -> ttscompi
     Returns:
         ``initial [N, T, D]`` and ``steps [K, N, T, D]`` (None for a deterministic sampler), float32.
     """
-    generators = [np.random.default_rng([seed, 0 if shape.pinned else call]) for seed in seeds]
+    key = (0 if shape.pinned else call, *(1,) * shape.other)
+    generators = [np.random.default_rng([seed, *key]) for seed in seeds]
     initial = np.stack([g.standard_normal(shape.sample, dtype=np.float32) for g in generators])
     if not shape.stochastic:
         return ttscompile.Noise(initial, None)

@@ -111,9 +111,10 @@ def test_calibration_does_not_change_what_a_conversion_makes(tmp_path: Path, pla
     assert cached(tmp_path, variant(plan, follows=True)).read(7) is None, "its calls begin otherwise"
 
 
-def test_pinned_noise_has_episodes_of_its_own(tmp_path: Path) -> None:
+@pytest.mark.parametrize("noise", [replace(SHAPE, pinned=True), replace(SHAPE, other=True)])
+def test_noise_that_is_not_shared_has_episodes_of_its_own(tmp_path: Path, noise: NoiseShape) -> None:
     cached(tmp_path, variant()).write(episode())
-    assert cached(tmp_path, replace(variant(), noise=replace(SHAPE, pinned=True))).read(7) is None
+    assert cached(tmp_path, replace(variant(), noise=noise)).read(7) is None
 
 
 def test_a_damaged_file_is_as_good_as_none(tmp_path: Path) -> None:

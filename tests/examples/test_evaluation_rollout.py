@@ -75,6 +75,14 @@ def test_pinned_noise_is_that_of_the_first_call() -> None:
     np.testing.assert_array_equal(later.steps, first.steps)
 
 
+def test_other_noise_is_in_no_call_that_is_shared() -> None:
+    shared = [seeded_noise(SHAPE, [4, 5], call=call).initial for call in range(4)]
+    for shape in (replace(SHAPE, other=True), replace(SHAPE, other=True, pinned=True)):
+        again, other = (seeded_noise(shape, [4, 5], call=1).initial for _ in range(2))
+        np.testing.assert_array_equal(again, other)
+        assert not np.isin(other, shared).any()
+
+
 def test_another_sampler_starts_from_the_same_noise() -> None:
     fewer = seeded_noise(NoiseShape(steps=2, sample=(16, 2), stochastic=False), [4], call=0)
     np.testing.assert_array_equal(fewer.initial, seeded_noise(SHAPE, [4], call=0).initial)

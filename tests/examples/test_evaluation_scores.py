@@ -96,4 +96,6 @@ def test_processes_fill_the_cache_with_the_episodes_of_one(compiled_pusht: Path,
     assert told == [(text, 2)]
     pinned = open_variant(f"{text}:pinned", "onnxruntime", 1)
     assert (pinned.plan, pinned.noise.pinned) == ("one", True)
+    other = open_variant(f"{text}:other", "onnxruntime", 1)
+    assert (other.plan, other.noise.pinned, other.noise.other) == ("one", False, True)
     assert not open_variant(text, "onnxruntime", 1).noise.pinned
