@@ -24,6 +24,8 @@ def layers(program: Program) -> dict[str, str]:
         before = original.get(node.name)
         if before is None or (before.op, before.types) != (node.op, node.types) or node.name in block.outputs:
             continue
+        if len(node.types) > 1:  # a graph gives one value by a name: of a batch normalisation the first is taken later
+            continue
         name = _weights(block, producers, node) or (node.name if node_flops(node, types) > 0 else None)
         if name is not None:
             found[name if name not in {**found, **types} else f"{name}, {node.name}"] = node.name
