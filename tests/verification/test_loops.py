@@ -25,7 +25,7 @@ from ttscompile.verification.record_golden import record_original
 from ttscompile.verification.reuse import check_engaged
 from ttscompile.verification.rung import PASSED
 
-from .test_engaged import Timed
+from .timed import Timed
 
 pytestmark = pytest.mark.slow
 
