@@ -12,7 +12,7 @@ from ttscompile.core.spec import ORIGINAL, SamplerTable
 from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import graph_flops
-from ttscompile.ir.graph import Graph, Node, Ref, TensorType, backward_slice
+from ttscompile.ir.graph import Graph, Node, Ref, backward_slice
 from ttscompile.ir.program import Binding, Cut, Pieces, Program, mapped
 from ttscompile.ir.rows import crossing_inputs, unfold
 
@@ -80,18 +80,17 @@ def _sink(piece: Graph, prologue: Graph, known: Mapping[str, Binding]) -> Graph:
     That is concatenation, and choice by a mask. Hoisted they would be a copy for each of the K steps, computed or not,
     and their rows would fill the cache: a mask of tokens, and rows that all tokens share, make a row for each token.
     """
-    producers, types = prologue.producers(), prologue.types()
-    moved = []
-    inputs: dict[str, TensorType] = {}
-    for name, type_ in piece.inputs.items():
-        node = producers.get(name)
-        whole = known.get(name) is Binding.STEP and node is not None and node.op in _MOVES
-        if node is not None and whole and any(known[part] is not Binding.STEP for part in node.refs()):
-            moved.append(node)
-            for part in node.refs():
-                inputs.setdefault(part, types[part])
-        else:
-            inputs[name] = type_
+    types = prologue.types()
+    moved = [
+        node
+        for node in prologue.nodes
+        if node.name in piece.inputs and node.op in _MOVES and known[node.name] is Binding.STEP
+        if any(known[part] is not Binding.STEP for part in node.refs())
+    ]
+    inputs, made = dict(piece.inputs), {node.name for node in moved}
+    for part in (part for node in moved for part in node.refs() if part not in made):
+        inputs.setdefault(part, types[part])
+    inputs = {name: type_ for name, type_ in inputs.items() if name not in made}
     return replace(piece, inputs=inputs, nodes=(*moved, *piece.nodes)) if moved else piece
 
 

@@ -119,9 +119,11 @@ class Runtime:
         if plan.variant not in self._views:
             self._views[plan.variant] = view_of(self._artifact, plan)
         view = self._views[plan.variant]
-        if (plan.otherwise is None) is (view.start is not None):
-            expected = "none" if view.start is None else "the plan of a call that has no chunk to begin with"
-            raise IllegalPlanError(f"a plan of loop {plan.loop!r}: expected {expected} as otherwise.")
+        record, other = self._artifact.manifest.starts.get(plan.loop), plan.otherwise
+        if (None if other is None else other.loop) != (None if record is None else record.loop):
+            expected = "the plan of a call that has no chunk to begin with" if record else "none"
+            loop = f", which is in loop {record.loop!r}" if record else ""
+            raise IllegalPlanError(f"a plan of loop {plan.loop!r}: expected {expected} as otherwise{loop}.")
         return view
 
     @property

@@ -70,6 +70,8 @@ def test_by_hand() -> None:
     assert distance(x, y) == pytest.approx(((0.09 + 0.16) / 2) ** 0.5)
     assert distance(y, y) == 0
     assert distance(y[:1] + 0.05, y[:1]) == pytest.approx(0.05 / TENTH), "of one observation the unit is that of 1"
+    alike = np.repeat(y[:1], 3, axis=0)
+    assert distance(alike + 0.05, alike) == pytest.approx(0.05 / TENTH), "and so it is of several that are the same"
 
 
 def test_rounding_is_no_noise_and_little_noise_is() -> None:

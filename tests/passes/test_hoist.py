@@ -6,7 +6,9 @@ from tests.passes.graphs import B
 from tests.passes.modules import SHAPE, compiled, graph_inputs, hoisted
 from ttscompile import ObservationSpec
 from ttscompile.ir.flops import graph_flops
+from ttscompile.ir.graph import Ref
 from ttscompile.ir.program import Binding
+from ttscompile.ir.verify import verify
 
 
 @pytest.mark.slow
@@ -52,3 +54,25 @@ def test_a_network_without_products_is_hoisted() -> None:
     residual = b.op("f", "tanh.default", SHAPE, b.op("g", "mul.Tensor", SHAPE, sample, gate))
     program = hoisted(b, b.op("y", "add.Tensor", SHAPE, sample, residual), ObservationSpec((3,)))
     assert [graph_flops(piece.graph) for piece in program.pieces.blocks] == [0]
+
+
+def test_a_concatenation_of_another_one_is_made_in_the_loop_with_it() -> None:
+    """A block reads both: the inner one, along tokens, and the outer one, along features."""
+    b, sample, obs = graph_inputs("float32")
+    time, first = b.op("time", "mul.Tensor", (B,), Ref("timestep"), 0.5), b.op("first", "mean.dim", (B,), obs, (1,))
+    rows = []
+    for name, value in (("t", time), ("o", first)):
+        one = b.op(name, "reshape.default", (B, 1, 1), value, (B, 1, 1))
+        rows.append(b.op(f"{name}.rows", "expand.default", (B, 2, 2), one, (B, 2, 2)))
+    inner = b.op("inner", "cat.default", SHAPE, tuple(rows), 1)
+    own = b.op("own", "expand.default", SHAPE, Ref("o"), SHAPE)
+    outer = b.op("outer", "cat.default", (B, 4, 4), (inner, own), 2)
+    twice = b.op("twice", "cat.default", (B, 4, 4), (sample, sample), 2)
+    product = b.op("p", "mul.Tensor", (B, 4, 4), twice, outer)
+    narrow = b.op("f", "linear.default", SHAPE, product, b.constant("w", 2, 4))
+    residual = b.op("g", "mul.Tensor", SHAPE, narrow, inner)
+    program = hoisted(b, b.op("y", "add.Tensor", SHAPE, sample, residual), ObservationSpec((3,)))
+    verify(program)
+    (block,) = program.pieces.blocks
+    assert [node.name for node in block.graph.nodes if node.op == "aten.cat.default"] == ["inner", "outer", "twice"]
+    assert program.pieces.step is None and set(block.contexts) == {"t.rows", "o.rows", "own"}

@@ -176,3 +176,11 @@ def test_a_copy_is_the_same(artifact: Artifact, tmp_path: Path) -> None:
     manifest = update_plans(tmp_path / "copy", again.plans, "four")
     assert manifest.plans == artifact.manifest.plans
     assert manifest.identity != artifact.manifest.identity
+
+
+def test_what_a_plan_falls_back_on_is_in_the_precision_that_is_named(artifact: Artifact) -> None:
+    for name, other in (("start-3", "four"), ("start-2", "dense")):
+        for precision in ("int8", "int8+blocks", "bf16", "fp32"):
+            plan, first = artifact.plan(f"{name}@{precision}"), artifact.plan(f"{other}@{precision}")
+            assert plan.otherwise is first and artifact.told(first) == f"{other}@{precision}"
+            assert dict(plan.precision) == dict(first.precision)

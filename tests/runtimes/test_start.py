@@ -246,6 +246,10 @@ def test_what_cannot_go_together_is_refused(whole: Path, warm: CompiledPolicy, t
         warm.predict_action(obs, noise, prefix=np.zeros((2, 1, 2), np.float32))
     with pytest.raises(IllegalPlanError, match="expected the plan of a call that has no chunk to begin with"):
         warm.predict_action(obs, noise, plan=replace(warm.plans[WARM], otherwise=None))
+    # One that begins with a chunk itself would begin with noise in the middle of the loop.
+    again = replace(warm.plans[WARM], otherwise=warm.plans[WARM])
+    with pytest.raises(IllegalPlanError, match="as otherwise, which is in loop 'ddpm-8'"):
+        warm.predict_action(obs, noise, plan=again)
     with pytest.raises(IllegalPlanError, match="expected none as otherwise"):
         warm.predict_action(obs, noise, plan=replace(warm.plans["full"], otherwise=warm.plans["dense"]))
     shutil.copytree(whole, tmp_path / "own")

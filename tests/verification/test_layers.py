@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 import ttscompile
 from tests.passes.modules import MODULES, compiled
@@ -17,10 +18,12 @@ from ttscompile.artifact.golden import load_golden, probe_stream, project
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.artifact.view import View, view_of
 from ttscompile.core.spec import PolicySpec
+from ttscompile.driver import transform
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.layers import layers, layers_graph
 from ttscompile.ir.operations import operation
 from ttscompile.ir.program import Program
+from ttscompile.lower.program import lower_program
 from ttscompile.runtimes.onnxruntime import sessions
 from ttscompile.verification.network import RESIDUAL, Probe, relative
 from ttscompile.verification.rung import Rung
@@ -141,3 +144,23 @@ def test_a_policy_of_several_blocks_has_no_layers() -> None:
     """Its blocks are named already."""
     _, program = compiled("tokens")
     assert layers(program) == {} and layers_graph(program) is None
+
+
+class Normalized(nn.Module):
+    """A network without a residual, with a batch normalisation, which gives several values, inside."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.norm, self.last = nn.Conv1d(2, 4, 3, padding=1), nn.BatchNorm1d(4), nn.Conv1d(4, 2, 1)
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        h = self.norm(self.first(sample.transpose(1, 2))) * obs.mean((1, 2))[:, None, None]
+        return self.last(torch.tanh(h)).transpose(1, 2)
+
+
+def test_a_layer_that_gives_several_values_is_not_recorded() -> None:
+    program = transform(Normalized().eval(), spec())
+    assert list(layers(program)) == ["first", "last"]
+    inside = program.pieces.blocks[0].graph
+    assert any(len(node.types) > 1 for node in inside.nodes)
+    assert set(lower_program(program)) >= {"block_00", "layers"}

@@ -5,19 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import ttscompile
 from tests.passes.loops import LOOPS, module_of, program_of, spec
+from ttscompile import Plan
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.golden import DIGITS, Golden, load_golden
 from ttscompile.artifact.load import Artifact
-from ttscompile.artifact.write import write_artifact
+from ttscompile.artifact.write import update_plans, write_artifact
+from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.driver import transform
 from ttscompile.errors import ArtifactError
 from ttscompile.lower.program import lower_program
 from ttscompile.verification.record_golden import record_original
+from ttscompile.verification.reuse import check_engaged
+from ttscompile.verification.rung import PASSED
+
+from .timed import Timed
 
 pytestmark = pytest.mark.slow
 
@@ -110,3 +118,15 @@ def test_a_record_that_does_not_fit_is_refused(
     monkeypatch.setattr("ttscompile.artifact.tensors.read", lambda path: arrays)
     with pytest.raises(ArtifactError, match=message):
         load_golden(artifact)
+
+
+def test_a_plan_that_draws_noise_is_timed_where_the_original_draws_none(tmp_path: Path) -> None:
+    module = module_of("tokens")
+    loops = {name: LOOPS[name] for name in ("ddpm-4", "ddim-3")}
+    program = transform(module, replace(spec(), sampler=loops.pop("ddim-3"), loops=loops))
+    write_artifact(program, lower_program(program), tmp_path, golden=record_original(module, program))
+    fast = Plan("ddpm-4", whole_steps_plan(4, len(program.blocks), [0]))
+    update_plans(tmp_path, {"dense": load_artifact(tmp_path).plans["dense"], "fast": fast}, "fast")
+    artifact, policy = load_artifact(tmp_path), Timed(ttscompile.load(tmp_path), {"dense": 1.0, "fast": 0.25}, 0.0)
+    rung = check_engaged(artifact, load_golden(artifact), policy, lambda: policy.now)  # type: ignore[arg-type]
+    assert rung.status == PASSED and rung.details["fast"]["executed"] == 0.75

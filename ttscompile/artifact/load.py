@@ -129,7 +129,7 @@ class Artifact:
 
         In fp32 all tokens are computed, too, which every runtime can do. int8 is of all parts that the artifact has
         such models of. bf16 and fp16, which torch makes of the weights, are of all parts. Parts may be named in place
-        of these: ``NAME@int8+PART+PART``.
+        of these: ``NAME@int8+PART+PART``. What it falls back on (``Plan.otherwise``) is in the same.
 
         Raises:
             IllegalPlanError: there is none of this name.
@@ -149,7 +149,9 @@ class Artifact:
             having = () if record is None else record.kept
             held = names.parts_of(having if precision in (INT8, INT4) else self.manifest.pieces)
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
-            self._derived[name] = replace(plan)  # another object than the one in fp32 may be
+            first = self.plans[own].otherwise
+            otherwise = None if first is None else self.plan(f"{self.name_of(first)}@{rest}")
+            self._derived[name] = replace(plan, otherwise=otherwise)  # another object than the one in fp32 may be
         return self._derived[name]
 
     def name_of(self, plan: Plan) -> str | None:

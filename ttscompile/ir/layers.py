@@ -22,7 +22,8 @@ def layers(program: Program) -> dict[str, str]:
     found: dict[str, str] = {}
     for node in block.nodes:
         before = original.get(node.name)
-        if before is None or (before.op, before.types) != (node.op, node.types) or node.name in block.outputs:
+        # Of several values, as a batch normalisation gives, none has the name of the node.
+        if before is None or (before.op, before.types) != (node.op, (node.type,)) or node.name in block.outputs:
             continue
         name = _weights(block, producers, node) or (node.name if node_flops(node, types) > 0 else None)
         if name is not None:

@@ -24,7 +24,7 @@ def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
     """h, and how far two answers of the original are apart, mean over the pairs of draws of each call.
 
     Where noise changes nothing: the square of how far the plan is off, and that of a ``TENTH`` of how far answers to
-    two observations are apart (of 1, where there is one), of which ``rooted`` makes a root mean square in this unit.
+    two observations are apart (of 1, where they are not), of which ``rooted`` makes a root mean square in this unit.
 
     Args:
         x: what a plan answers, ``[N, R, A]``.
@@ -39,7 +39,8 @@ def pairs(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
         apart = _far(y[:, i], y[:, j])
         found.append((crossed - _far(x[:, i], x[:, j]) - apart, apart))
     h, far = np.mean(found, axis=0)
-    observed = np.mean([_far(y[:, 0], np.roll(y[:, 0], n, 0)).mean() for n in range(1, min(len(y), 33))] or [1.0])
+    others = [_far(y[:, 0], np.roll(y[:, 0], n, 0)).mean() for n in range(1, min(len(y), 33))]
+    observed = np.mean(others or [0.0]) or 1.0
     if far.mean() > SAME * observed:
         return h, far
     return np.square(_far(x, y)).mean(1), np.full(len(x), (TENTH * observed) ** 2)

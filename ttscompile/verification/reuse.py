@@ -271,7 +271,7 @@ def _measure(
 ) -> dict[str, Engagement]:
     manifest = artifact.manifest
     obs = {key: value[:1] for key, value in golden.raw_observations(manifest.spec).items()}
-    noise = Noise(golden.initial[:1], None if golden.draws is None else golden.draws[:, :1].copy())
+    noise = random_noise(manifest.spec, np.random.default_rng(0))  # for any loop; the record's is for the original's
     names = (DENSE, *manifest.plans)
     reports, timer = dict[str, CallReport](), Timer(len(names), warm_up=1, clock=clock)
 
