@@ -101,6 +101,15 @@ def test_dense_is_the_original_and_fewer_steps_are_further(trials: Trials) -> No
     assert judge(trials, again, LEARNED) != two
 
 
+def test_a_single_held_out_episode_is_not_certain(compiled: Path, recording: Path, tmp_path: Path) -> None:
+    artifact = load_artifact(compiled)
+    episodes = load_episodes(artifact.manifest.spec, [recording], None)[:3]
+    few = Trials.of(artifact, episodes, StateFile(tmp_path, {}))
+    assert len(few.split.validation) == 1
+    score = judge(few, Plan(cells=whole_steps_plan(10, 6, (0, 9))))
+    assert 0 < score.interval[0] < score.distance < score.interval[1]
+
+
 def test_errors_are_of_calls_with_the_same_noise(trials: Trials, compiled: Path) -> None:
     """Call by call through the public interface."""
     plan, policy, sample = Plan(cells=uniform_plan(10, 6, 5)), ttscompile.load(compiled), trials.held_out

@@ -266,7 +266,8 @@ def _scored(
     x = np.nan_to_num(x, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST).clip(-LARGEST, LARGEST)
     h, apart = pairs(x, y)
     numbers = np.unique(sample.episodes)
-    gaps = np.array([h[sample.episodes == one].mean() for one in numbers])
+    # Of a single episode calls are drawn anew: one number would be as certain as can be.
+    gaps = np.array([h[sample.episodes == one].mean() for one in numbers]) if len(numbers) > 1 else h
     low, high = np.quantile(_resampled(gaps, float(apart.mean())), (0.025, 0.975))
     error = error_p90 = None
     original = trials.executor.view.artifact.manifest.spec.sampler
@@ -297,7 +298,7 @@ def _scored(
 
 
 def _resampled(gaps: Numbers, apart: float) -> Numbers:
-    """The distance with episodes drawn anew, of the mean h of each; the same draws for equally many episodes."""
+    """The distance with episodes drawn anew, of the mean h of each, or calls of one; the same draws for as many."""
     drawn = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLED, len(gaps)))
     share = gaps[drawn].mean(1) / max(apart, 1e-12)
     return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))
