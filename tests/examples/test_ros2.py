@@ -176,6 +176,16 @@ def test_joints_come_in_any_order_and_pictures_as_rows_of_bytes(node_module: Mod
         node_module.from_picture(ros.Image(encoding="bgr8"), "float32")
 
 
+def test_messages_that_hold_less_than_they_say_are_refused(node_module: ModuleType) -> None:
+    efforts = ros.JointState(name=["wrist", "elbow"], position=array("d"))  # its positions may be left out
+    with pytest.raises(ObservationError, match="2 joints and 0 positions"):
+        node_module.from_joints(efforts, ["elbow"], "float32")
+    for step, size in ((6, 5), (3, 3)):
+        half = ros.Image(height=1, width=2, encoding="rgb8", step=step, data=array("B", bytes(size)))
+        with pytest.raises(ObservationError, match=f"1 rows of {step} bytes, and 2 pixels in each; found {size} bytes"):
+            node_module.from_picture(half, "float32")
+
+
 def test_the_program_drives_an_artifact_and_says_what_is_wrong(
     once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
