@@ -125,6 +125,8 @@ class PolicyNode(Node):
         now, before = self._executor.statistics(), self._told
         late = {name: getattr(now, name) - getattr(before, name) for name in LATE} | {"refused": self._refused}
         level, message = DiagnosticStatus.OK, "on time" if self._executor.ready else "waiting for observations"
+        if trouble := self._executor.trouble:
+            level, message = DiagnosticStatus.WARN, trouble
         if any(late.values()):
             level, message = DiagnosticStatus.WARN, self._why or now.last_refusal or "chunks come late"
         if late["starved"]:

@@ -127,6 +127,17 @@ def test_a_late_chunk_is_a_warning(node_module: ModuleType) -> None:
         assert (level, told["chunks_refused"]) in [(b"\x01", "1"), (b"\x02", "1")]
 
 
+def test_frames_that_make_no_window_are_a_warning(node_module: ModuleType) -> None:
+    with robot(node_module) as one:
+        assert one.diagnosis()[1]["message"] == "waiting for observations"
+        for _ in range(5):  # half as many a second as the policy wants
+            one.tick()
+            one.tick(observed=False)
+        level, told = one.diagnosis()
+        assert level == b"\x01"
+        assert "the policy wants 2 frames every 0.1 s" in told["message"]
+
+
 def test_a_message_that_does_not_fit_is_refused_and_told(node_module: ModuleType) -> None:
     with robot(node_module) as one:
         one.node.deliver(TOPIC, ros.Float64MultiArray(array("d", [1.0])))
