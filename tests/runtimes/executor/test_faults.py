@@ -65,7 +65,8 @@ def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
 
 
 def test_frames_at_another_rate_than_the_policys_are_a_trouble_until_one_fits() -> None:
-    with World(hz=50.0, latency={"dense": 0.01}) as world:  # policy_hz was left out, and the camera gives 30 frames a second
+    """The rate of the policy was left out, and the camera gives 30 frames a second."""
+    with World(hz=50.0, latency={"dense": 0.01}) as world:
         for number in range(10):
             assert (world.executor.trouble == "") is (number < 2)
             world.observe()
