@@ -125,6 +125,8 @@ class PolicyNode(Node):
         now, before = self._executor.statistics(), self._told
         late = {name: getattr(now, name) - getattr(before, name) for name in LATE} | {"refused": self._refused}
         level, message = DiagnosticStatus.OK, "on time" if self._executor.ready else "waiting for observations"
+        if trouble := self._executor.trouble:
+            level, message = DiagnosticStatus.WARN, trouble
         if any(late.values()):
             level, message = DiagnosticStatus.WARN, self._why or now.last_refusal or "chunks come late"
         if late["starved"]:
@@ -177,6 +179,8 @@ def from_joints(message: Any, joints: Sequence[str], dtype: str) -> Array:
     places = {name: place for place, name in enumerate(message.name)}
     if lacking := [name for name in joints if name not in places]:
         raise ObservationError(f"joints {lacking} are not in the message, which has {sorted(places)}.")
+    if len(message.position) < len(places):  # a driver may send velocities or efforts alone
+        raise ObservationError(f"the message has {len(places)} joints and {len(message.position)} positions.")
     return np.asarray([message.position[places[name]] for name in joints], dtype)
 
 
@@ -184,6 +188,9 @@ def from_picture(message: Any, dtype: str) -> Array:
     """``[3, H, W]`` in 0..1 from ``rgb8``; rows may be longer than what they show."""
     if message.encoding != "rgb8":
         raise ObservationError(f"expected a picture of encoding 'rgb8'; found {message.encoding!r}.")
+    if len(message.data) != message.height * message.step or message.step < 3 * message.width:
+        size = f"{message.height} rows of {message.step} bytes, and {message.width} pixels in each"
+        raise ObservationError(f"expected a picture of {size}; found {len(message.data)} bytes.")
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
     pixels = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)
     picture = np.ascontiguousarray(pixels.transpose(2, 0, 1)).astype(dtype)

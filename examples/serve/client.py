@@ -167,6 +167,15 @@ def main() -> None:
         sys.exit(f"error: nobody listens at {arguments.url}: start 'ttscompile serve DIR --control-hz 10' first")
     except OSError as error:  # also another certificate than the server's
         sys.exit(f"error: {error}")
+    try:
+        drive(call, arguments.seconds)
+    except OSError as error:  # the server ended, or does not answer
+        sys.exit(f"error: {error}. Stop the robot safely.")
+    call.close()
+
+
+def drive(call: Client, seconds: float) -> None:
+    """Observe and act for so many seconds, and print the statistics."""
     info = call("info")
 
     def zeros(shape: list[int]) -> Any:
@@ -175,7 +184,7 @@ def main() -> None:
     frame = {key: zeros(spec["shape"]) for key, spec in info["observation"].items()}
     period = 1 / info["control_hz"]
     start = time.monotonic()
-    for tick in range(round(arguments.seconds / period)):
+    for tick in range(round(seconds / period)):
         time.sleep(max(start + tick * period - time.monotonic(), 0))
         call("observe", obs=frame)
         try:
@@ -185,7 +194,6 @@ def main() -> None:
                 raise
             print(error, file=sys.stderr)
     print(json.dumps(call("statistics")))
-    call.close()
 
 
 if __name__ == "__main__":

@@ -231,11 +231,14 @@ class AsyncExecutor:
 
     @property
     def trouble(self) -> str:
-        """Why no action will come any more, for whoever watches; empty where some may."""
+        """Why no action comes, for whoever watches; empty where some may: also where frames make no window."""
         failure = self._worker.failure
         if failure is not None:
             return f"the thread that owns the policy has ended: a call raised {type(failure).__name__}: {failure}"
-        return "the executor was closed" if self._closed else ""
+        if self._closed:
+            return "the executor was closed"
+        with self._here().lock:
+            return self._state.trouble
 
     @property
     def frames(self) -> FrameSpec:

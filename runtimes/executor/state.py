@@ -88,6 +88,11 @@ class ExecutorState:
         """Whether a chunk of this episode has been scheduled."""
         return self._schedule.timeline is not None
 
+    @property
+    def trouble(self) -> str:
+        """Why no call can start though frames come; empty where it can, or might with the next frame."""
+        return self._window.trouble
+
     def reset(self) -> None:
         """A new episode: nothing from before is given out any more."""
         self.epoch += 1

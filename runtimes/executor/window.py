@@ -118,6 +118,7 @@ class ObservationWindow:
         self._apart = 2 * steps * period / MOST_FRAMES  # of frames in a row, from one to the next but one
         self._times: list[float] = []
         self._frames: list[Frame] = []
+        self._first = float("inf")  # time of the first frame
         self.complete: Window | None = None
         self.delay = 0.0
 
@@ -142,6 +143,7 @@ class ObservationWindow:
             return "replaced"
         if time < now - self._keep:
             return "late"
+        self._first = min(self._first, time)
         if place == len(times):
             self.delay = max(now - time, 0.0)
         times.insert(place, time)
@@ -157,6 +159,17 @@ class ObservationWindow:
             return "late"
         self.complete = self._newest(place - gone)
         return "added"
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no complete window, where frames came for longer than one takes; else empty."""
+        return self.why_incomplete() if self.complete is None and self._waited else ""
+
+    @property
+    def _waited(self) -> bool:
+        """Whether frames came for longer than a window takes."""
+        lasts = (self._steps - 1) * self._period + self._slack
+        return bool(self._times) and self._times[-1] - self._first > lasts + 1e-9
 
     @property
     def newest(self) -> float | None:
@@ -180,12 +193,13 @@ class ObservationWindow:
     def why_incomplete(self) -> str:
         """What a complete window lacks, for people."""
         found = len(self._times)
-        if found < self._steps:
+        if found < self._steps and not self._waited:
             return f"{found} of {self._steps} frames came"
         gaps = np.diff(self._times[-self._steps :])
+        apart = ", ".join(f"{gap:.4g}" for gap in gaps) or f"more than {self._keep:.2g}"
         return (
             f"the policy wants {self._steps} frames every {self._period:.4g} s, to within {self._slack:.2g} s; the"
-            f" newest came {', '.join(f'{gap:.4g}' for gap in gaps)} s apart"
+            f" newest came {apart} s apart. Set policy_hz to the rate of training, and give frames at a multiple of it"
         )
 
     def _newest(self, changed: int) -> Window | None:

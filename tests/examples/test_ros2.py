@@ -127,6 +127,17 @@ def test_a_late_chunk_is_a_warning(node_module: ModuleType) -> None:
         assert (level, told["chunks_refused"]) in [(b"\x01", "1"), (b"\x02", "1")]
 
 
+def test_frames_that_make_no_window_are_a_warning(node_module: ModuleType) -> None:
+    with robot(node_module) as one:
+        assert one.diagnosis()[1]["message"] == "waiting for observations"
+        for _ in range(5):  # half as many a second as the policy wants
+            one.tick()
+            one.tick(observed=False)
+        level, told = one.diagnosis()
+        assert level == b"\x01"
+        assert "the policy wants 2 frames every 0.1 s" in told["message"]
+
+
 def test_a_message_that_does_not_fit_is_refused_and_told(node_module: ModuleType) -> None:
     with robot(node_module) as one:
         one.node.deliver(TOPIC, ros.Float64MultiArray(array("d", [1.0])))
@@ -174,6 +185,16 @@ def test_joints_come_in_any_order_and_pictures_as_rows_of_bytes(node_module: Mod
     np.testing.assert_allclose(picture, np.array([[[0, 0.6]], [[0.2, 0.8]], [[0.4, 1]]]), rtol=1e-6)
     with pytest.raises(ObservationError, match="found 'bgr8'"):
         node_module.from_picture(ros.Image(encoding="bgr8"), "float32")
+
+
+def test_messages_that_hold_less_than_they_say_are_refused(node_module: ModuleType) -> None:
+    efforts = ros.JointState(name=["wrist", "elbow"], position=array("d"))  # its positions may be left out
+    with pytest.raises(ObservationError, match="2 joints and 0 positions"):
+        node_module.from_joints(efforts, ["elbow"], "float32")
+    for step, size in ((6, 5), (3, 3)):
+        half = ros.Image(height=1, width=2, encoding="rgb8", step=step, data=array("B", bytes(size)))
+        with pytest.raises(ObservationError, match=f"1 rows of {step} bytes, and 2 pixels in each; found {size} bytes"):
+            node_module.from_picture(half, "float32")
 
 
 def test_the_program_drives_an_artifact_and_says_what_is_wrong(

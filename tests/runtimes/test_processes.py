@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import pickle
 import shutil
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +157,20 @@ def test_a_policy_is_neither_copied_nor_sent(pruned: Path) -> None:
     policy = load(pruned)
     with pytest.raises(TtscompileError, match=r"nor sent to another process\. Load it again, where it is called"):
         pickle.dumps(policy)
+
+
+def test_a_plan_can_be_copied_and_sent(pruned: Path) -> None:
+    policy = load(pruned)
+    start = replace(policy.plans["dense"], precision={"blocks": "int8"}, otherwise=policy.plans["dense"])
+    for sent in (pickle.loads(pickle.dumps(start)), copy.deepcopy(start)):
+        assert sent.variant == start.variant
+        assert sent.otherwise is not None
+        np.testing.assert_array_equal(sent.cells, start.cells)
+        answers = []
+        for plan in (sent.otherwise, "dense"):
+            policy.reset(seed=0)
+            answers.append(policy.predict_action({"obs": OBS}, plan=plan)["action"])
+        np.testing.assert_array_equal(*answers)
 
 
 def test_the_exit_status_is_the_programs_though_a_daemon_thread_calls_the_policy(pruned: Path) -> None:

@@ -7,7 +7,7 @@ what the fields mean; no runtime has another way of being told what to compute.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -82,6 +82,11 @@ class Plan:
             if not isinstance(getattr(self, name), str):
                 raise IllegalPlanError(f"a plan's {name}: expected a name; found {getattr(self, name)!r:.80}.")
         object.__setattr__(self, "precision", MappingProxyType(dict(self.precision)))
+
+    def __reduce__(self) -> tuple[type[Plan], tuple[object, ...]]:
+        """Sent to another process, or copied: another plan with the same fields. A read-only mapping cannot be sent."""
+        own = {one.name: getattr(self, one.name) for one in fields(self)}
+        return Plan, tuple({**own, "precision": dict(self.precision)}.values())
 
     @property
     def pruned(self) -> bool:

@@ -124,6 +124,27 @@ def test_slower_frames_make_no_window_and_the_reason_is_told() -> None:
     made = window(times=[0.0, 0.2, 0.4])
     assert made.complete is None
     assert "every 0.1 s, to within 0.03 s; the newest came 0.2 s apart" in made.why_incomplete()
+    assert made.trouble == made.why_incomplete()
+
+
+@pytest.mark.parametrize("period", [0.0665, 0.14, 0.5, 3.0])
+def test_frames_at_another_rate_are_a_trouble_that_is_told(period: float) -> None:
+    made = window(2)
+    assert made.trouble == ""
+    for number in range(5):
+        made.add(number * period, frame(number), number * period)
+        assert (made.trouble == "") is (number * period < 0.13)
+    apart = f"{period:.4g}" if period < 0.43 else "more than 0.43"
+    assert f"the newest came {apart} s apart. Set policy_hz" in made.trouble
+
+
+def test_frames_that_make_a_window_are_no_trouble() -> None:
+    made = window(2)
+    for number in range(20):
+        made.add(number * 0.01, frame(number), number * 0.01)
+        assert made.trouble == ""
+    made.add(3.0, frame(3.0), 3.0)
+    assert made.trouble == ""
 
 
 @pytest.mark.parametrize(("time", "complete"), [(0.1299, True), (0.1301, False), (0.0701, True), (0.0699, False)])

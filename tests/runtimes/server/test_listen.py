@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +18,7 @@ from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.server.admission import Admission, AdmittingSocket
 from ttscompile.runtimes.server.executor_server import ExecutorServer
 
-from .serving import Quick
+from .serving import CLIENT, Quick, serving
 
 V4, V6 = ("127.0.0.1",), ("::1",)
 
@@ -92,3 +94,17 @@ def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
         socket.create_connection(each.getsockname(), 5).close()  # it listens already
     for each in made:
         each.close()
+
+
+def test_the_example_client_says_that_the_server_ended(tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    with told.open("w") as errors, serving() as url:
+        words = [sys.executable, str(CLIENT), url, "--seconds", "60"]
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=errors, text=True)
+        assert process.stdout is not None
+        process.stdout.readline()  # of an action, or the end: it has connected
+    with process:
+        assert process.wait(30) == 1
+    assert told.read_text().splitlines()[-1].startswith("error: the ")
+    assert told.read_text().endswith("Stop the robot safely.\n")
+    assert "Traceback" not in told.read_text()
