@@ -290,7 +290,7 @@ def library() -> Any:
     Raises:
         RuntimeUnavailableError: it is not installed.
     """
-    with needing("a name that begins with hf://", "hub"):
+    with needing("the Hugging Face hub", "hub"):
         import huggingface_hub
         import huggingface_hub.errors
         import huggingface_hub.hf_api
