@@ -178,6 +178,18 @@ def test_a_copy_is_the_same(artifact: Artifact, tmp_path: Path) -> None:
     assert manifest.identity != artifact.manifest.identity
 
 
+def test_a_plan_that_has_a_name_stays_what_it_is(artifact: Artifact) -> None:
+    for plan in artifact.plans.values():
+        with pytest.raises(ValueError, match="read-only"):
+            plan.cells[:] = 1
+
+
+def test_a_part_that_is_said_to_be_in_fp32_is_not_named(artifact: Artifact) -> None:
+    assert dict(replace(artifact.plans["dense"], precision={"blocks": "fp32", "condition": "int8"}).precision) == {
+        "condition": "int8"
+    }
+
+
 def test_what_a_plan_falls_back_on_is_in_the_precision_that_is_named(artifact: Artifact) -> None:
     for name, other in (("start-3", "four"), ("start-2", "dense")):
         for precision in ("int8", "int8+blocks", "bf16", "fp32"):

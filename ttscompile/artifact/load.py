@@ -368,4 +368,6 @@ def _plans(directory: Path, manifest: Manifest) -> Mapping[str, Plan]:
             otherwise=None if record.otherwise is None else plans[record.otherwise],
             repair=True,
         )
+    for cells in (plan.cells for plan in plans.values() if plan.cells is not None):
+        cells.setflags(write=False)  # by its name everybody gets this plan
     return MappingProxyType({name: plans[name] for name in (DENSE, *manifest.plans)})

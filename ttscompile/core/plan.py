@@ -15,7 +15,7 @@ from ..errors import IllegalPlanError
 from .correction import Correction
 from .lattice import PlanArray, Source
 from .rules import NotNegative, Positive
-from .spec import ORIGINAL as ORIGINAL
+from .spec import FP32, ORIGINAL as ORIGINAL
 
 DENSE = "dense"
 """The plan that is the original policy: its loop, its weights, every cell computed. Every artifact has it."""
@@ -81,7 +81,8 @@ class Plan:
         for name in ("loop", "weights"):
             if not isinstance(getattr(self, name), str):
                 raise IllegalPlanError(f"a plan's {name}: expected a name; found {getattr(self, name)!r:.80}.")
-        object.__setattr__(self, "precision", MappingProxyType(dict(self.precision)))
+        narrow = {part: one for part, one in self.precision.items() if one != FP32}
+        object.__setattr__(self, "precision", MappingProxyType(narrow))
 
     def __reduce__(self) -> tuple[type[Plan], tuple[object, ...]]:
         """Sent to another process, or copied: another plan with the same fields. A read-only mapping cannot be sent."""
