@@ -74,10 +74,12 @@ def read_lerobot_config(
         entries, f"{directory / CONFIG}: ", "The file was changed, or is of another version of lerobot."
     )
     features = {**_features(settings, "input_features"), **_features(settings, "output_features")}
-    actions = {key: shape for key, (kind, shape) in features.items() if kind == "ACTION"}
+    kind, action = features.get(
+        ACTION, ("", ())
+    )  # a data set may have more, such as action.gripper, which lerobot skips
     cameras = {key: shape for key, (kind, shape) in features.items() if kind == "VISUAL"}
     others = {key: shape for key, (kind, shape) in features.items() if kind == "ENV" and environment}
-    if list(actions) != [ACTION] or len(actions[ACTION]) != 1:
+    if kind != "ACTION" or len(action) != 1:
         raise settings.error(f"output_features are {features!s:.300}; expected one vector, 'action'")
     if not (stateless and STATE not in features) and len(features.get(STATE, ("", ()))[1]) != 1:
         raise settings.error(f"input_features have no vector {STATE!r}, which this policy needs")
