@@ -60,6 +60,10 @@ STATISTICS = {
 _NEUTRAL = {"mean": 0.0, "std": 1.0, **dict.fromkeys(("min", "q01", "q10"), -1.0)}
 """What evo1 pads statistics with; 1 for the others."""
 
+_PADS_STATE = ("pi0", "pi05", "smolvla", "xvla")
+"""Types whose network takes states of several widths. Trained on from a base, a policy keeps the base's width in its
+configuration, and only the statistics say how many numbers the state of its robot has."""
+
 _LEAST_STD = 1e-30
 """Stands for a standard deviation of zero, which gives the mean whatever the network says."""
 
@@ -187,10 +191,13 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
     order = [step["registry_name"] for step in after if step["registry_name"] in later]
     if order != [name for name in later if name in order]:
         raise CheckpointError(f"{directory / POSTPROCESSOR}: found {', '.join(order)}; expected {', '.join(later)}.")
-    padded = any(step["registry_name"] in _PAD for step in before)
+    padded, state = any(step["registry_name"] in _PAD for step in before), "observation.state"
+    normalizers = _statistics(directory, before, NORMALIZE, features, padded, state if kind in _PADS_STATE else None)
+    if state in normalizers:
+        features = {**features, state: ("STATE", tuple(normalizers[state].first.shape))}
     return Processors(
         renamed=renamed_observations(directory, before, features),
-        normalizers=_statistics(directory, before, NORMALIZE, features, padded),
+        normalizers=normalizers,
         action=_statistics(directory, after, _UNNORMALIZE, features, padded).get("action"),
         tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
@@ -293,12 +300,18 @@ def state_of(directory: Path, step: Mapping[str, Any]) -> dict[str, torch.Tensor
 
 
 def _statistics(
-    directory: Path, steps: list[dict[str, Any]], registered: str, features: Features, padded: bool
+    directory: Path,
+    steps: list[dict[str, Any]],
+    registered: str,
+    features: Features,
+    padded: bool,
+    free: str | None = None,
 ) -> dict[str, Statistics]:
     """Statistics of each feature that a normalising step changes; without any lerobot changes nothing.
 
     Args:
         padded: whether vectors may be padded, by zeros that stay zeros.
+        free: a vector that has as many numbers as its statistics.
     """
     step = next((step for step in steps if step["registry_name"] == registered), None)
     if step is None:
@@ -328,6 +341,8 @@ def _statistics(
         missing = [name for name in names if name not in tensors]
         if missing:
             raise CheckpointError(f"{directory}: {registered} needs {', '.join(missing)} for {mode}; there is none.")
+        if key == free and tensors[names[0]].ndim == 1:
+            shape = tuple(tensors[names[0]].shape)
         own_numbers = {name: _unpadded(name, tensors[name], shape) if padded else tensors[name] for name in names}
         first, second = (as_statistic(directory, name, value, kind, shape) for name, value in own_numbers.items())
         if mode == "MEAN_STD" and (second < 0).any():
