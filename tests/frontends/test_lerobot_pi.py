@@ -77,6 +77,11 @@ def test_a_policy_that_was_trained_on_from_a_base(
         told = json.loads(lerobot_files(directory, spec)["config.json"])["input_features"]
         assert told[STATE]["shape"] == [pis.STATE_DIM]
     assert np.abs(eager(directory, 0) - golden[f"{kind}.0"]).max() < 1e-4
+    steps = json.loads((directory / "policy_preprocessor.json").read_text())["steps"]
+    steps[0]["config"]["norm_map"]["STATE"] = "IDENTITY"
+    change_json(directory / "policy_preprocessor.json", steps=steps)
+    spec = load_checkpoint_policy(directory)[1]
+    assert kind == "pi05" or spec.observations[STATE].shape == (1, pis.STATE_DIM)
 
 
 @pytest.mark.slow

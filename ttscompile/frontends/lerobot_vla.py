@@ -76,9 +76,8 @@ def read_vla_processors(config: LeRobotConfig) -> tuple[LeRobotConfig, Processor
             f"{config.directory}: {', '.join(normalised[:4])} is normalised before it is resized; expected images as"
             " they are (VISUAL: IDENTITY), which all vision-language-action models of lerobot have."
         )
-    if STATE in processors.normalizers:
-        width = ("STATE", tuple(processors.normalizers[STATE].first.shape))
-        config = replace(config, features={**config.features, STATE: width})
+    if processors.state_dim is not None:
+        config = replace(config, features={**config.features, STATE: ("STATE", (processors.state_dim,))})
     return config, processors
 
 
