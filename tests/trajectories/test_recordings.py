@@ -132,7 +132,7 @@ def test_data_of_other_files_is_not_read(tmp_path: Path) -> None:
 
 def test_of_a_vector_of_one_number_lerobot_saves_the_number(tmp_path: Path) -> None:
     path = as_lerobot(tmp_path, {"timestamp": {"dtype": "float32", "shape": [1], "names": None}})
-    times = np.float32([[i / 10] for n in (5, 4) for i in range(n)])
+    times = np.array([[i / 10] for n in (5, 4) for i in range(n)], np.float32)
     specs = {"timestamp": ObservationSpec((2, 1)), "state": ObservationSpec((2, 5))}
     episodes = load_trajectories([path], specs, 3)
     require_equal(episodes, "timestamp", windows(times, 3))
