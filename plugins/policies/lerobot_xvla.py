@@ -96,7 +96,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     mode, proprio = _mode(shared), settings.flag("use_proprio", True)
     features = {key: each for key, each in shared.features.items() if proprio or key != STATE}
     shared = replace(shared, features=features | {ACTION: ("ACTION", (mode.kept,))})
-    processors = read_vla_processors(shared)
+    shared, processors = read_vla_processors(shared)
     resize = settings.size("resize_imgs_with_padding", None, MOST_PIXELS)
     size, colours = seen_size(shared, resize), _colours(shared, processors)
     florence = read_florence(part_of(settings, "florence_config"), size, colours)

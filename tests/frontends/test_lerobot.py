@@ -311,6 +311,17 @@ def test_observations(tmp_path: Path) -> None:
     assert spec.source["format"] == "lerobot"
 
 
+def test_other_actions_of_the_data_set_are_left_alone(tmp_path: Path) -> None:
+    """LeRobot lists all features of a data set that begin with action, and its policies give one of them."""
+    directory = save_policy(tmp_path)
+    outputs = {key: {"type": "ACTION", "shape": [size]} for key, size in (("action.gripper", 1), ("action", DA))}
+    change_json(directory / "config.json", output_features=outputs)
+    assert load(directory)[1].chunk.action_dim == DA
+    change_json(directory / "config.json", output_features={"action.gripper": outputs["action.gripper"]})
+    with pytest.raises(CheckpointError, match="expected one vector, 'action'"):
+        load(directory)
+
+
 def test_released_encoders_need_no_files(tmp_path: Path) -> None:
     """OpenAI's models are known by name; the weights of this policy are of another network, which is found out."""
     directory = save_policy(tmp_path)

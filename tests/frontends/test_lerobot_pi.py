@@ -1,5 +1,6 @@
 """Parity with LeRobot 0.6.1's pi0 and pi0.5 at tiny sizes: from raw images, state and tokens to robot actions."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
+from ttscompile.frontends.lerobot_files import lerobot_files
 from ttscompile.ir.program import Program
 
 from ..families.support import record
@@ -60,6 +62,26 @@ def test_a_camera_that_the_robot_lacks(directory: Path, kind: str, golden: Mappi
     found = eager(directory, 0, LoadOptions(without_cameras=[CAMERAS[1]]))
     assert np.abs(found - golden[f"{kind}.missing"]).max() < 1e-4
     assert np.abs(found - golden[f"{kind}.0"]).max() > 0.01
+
+
+@pytest.mark.parametrize("width", [pis.PADDED, 2])
+def test_a_policy_that_was_trained_on_from_a_base(
+    directory: Path, kind: str, golden: Mapping[str, Array], width: int
+) -> None:
+    """Its configuration keeps the width of the base's state; the robot's is that of the statistics."""
+    inputs = json.loads((directory / "config.json").read_text())["input_features"]
+    change_json(directory / "config.json", input_features={**inputs, STATE: {"type": "STATE", "shape": [width]}})
+    spec = load_checkpoint_policy(directory)[1]
+    if kind == "pi0":
+        assert spec.observations[STATE].shape == (1, pis.STATE_DIM)
+        told = json.loads(lerobot_files(directory, spec)["config.json"])["input_features"]
+        assert told[STATE]["shape"] == [pis.STATE_DIM]
+    assert np.abs(eager(directory, 0) - golden[f"{kind}.0"]).max() < 1e-4
+    steps = json.loads((directory / "policy_preprocessor.json").read_text())["steps"]
+    steps[0]["config"]["norm_map"]["STATE"] = "IDENTITY"
+    change_json(directory / "policy_preprocessor.json", steps=steps)
+    spec = load_checkpoint_policy(directory)[1]
+    assert kind == "pi05" or spec.observations[STATE].shape == (1, pis.STATE_DIM)
 
 
 @pytest.mark.slow

@@ -130,6 +130,14 @@ def test_data_of_other_files_is_not_read(tmp_path: Path) -> None:
         load_trajectories([path], LOW, 3, SOURCES)
 
 
+def test_of_a_vector_of_one_number_lerobot_saves_the_number(tmp_path: Path) -> None:
+    path = as_lerobot(tmp_path, {"timestamp": {"dtype": "float32", "shape": [1], "names": None}})
+    times = np.array([[i / 10] for n in (5, 4) for i in range(n)], np.float32)
+    specs = {"timestamp": ObservationSpec((2, 1)), "state": ObservationSpec((2, 5))}
+    episodes = load_trajectories([path], specs, 3)
+    require_equal(episodes, "timestamp", windows(times, 3))
+
+
 @pytest.mark.parametrize(("part", "message"), [("task_name", "is string; expected numbers"), ("nested", "no array")])
 def test_columns_of_text_are_refused(part: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(TrajectoryError, match=message):

@@ -117,6 +117,10 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda root: _info(root, lambda info: info["features"]["top"].update(info={"video.is_depth_map": True})),
         "a video of depths, which is not decoded",
     ),
+    "depth of lerobot 0.6": (
+        lambda root: _info(root, lambda info: info["features"]["top"].update(info={"is_depth_map": True})),
+        "a video of depths, which is not decoded",
+    ),
 }
 
 
@@ -129,6 +133,13 @@ def test_damage_is_one_error(tmp_path: Path, damage: str) -> None:
     with pytest.raises(TrajectoryError, match=message) as caught:
         load_trajectories([root], SPECS, 2)
     assert str(root) in str(caught.value)
+
+
+@pytest.mark.usefixtures("here")
+def test_nothing_may_be_known_of_a_video(tmp_path: Path) -> None:
+    root = as_lerobot_with_videos(tmp_path)
+    _info(root, lambda info: info["features"]["top"].update(info=None))
+    assert [episode.calls for episode in load_trajectories([root], SPECS, 2)] == [3, 2]
 
 
 @pytest.mark.usefixtures("here")

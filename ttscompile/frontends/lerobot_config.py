@@ -70,14 +70,14 @@ def read_lerobot_config(
             its own: vision-language-action models and ``act``.
         stateless: whether this type can do without the robot's state.
     """
-    settings = Settings(
-        entries, f"{directory / CONFIG}: ", "The file was changed, or is of another version of lerobot."
-    )
+    remedy = "If lerobot takes the file, this is not compiled; else it was changed, or is of another of its versions."
+    settings = Settings(entries, f"{directory / CONFIG}: ", remedy)
     features = {**_features(settings, "input_features"), **_features(settings, "output_features")}
-    actions = {key: shape for key, (kind, shape) in features.items() if kind == "ACTION"}
+    # A data set may have more of the type ACTION, such as action.gripper, and lerobot's policies skip those.
+    kind, action = features.get(ACTION, ("", ()))
     cameras = {key: shape for key, (kind, shape) in features.items() if kind == "VISUAL"}
     others = {key: shape for key, (kind, shape) in features.items() if kind == "ENV" and environment}
-    if list(actions) != [ACTION] or len(actions[ACTION]) != 1:
+    if kind != "ACTION" or len(action) != 1:
         raise settings.error(f"output_features are {features!s:.300}; expected one vector, 'action'")
     if not (stateless and STATE not in features) and len(features.get(STATE, ("", ()))[1]) != 1:
         raise settings.error(f"input_features have no vector {STATE!r}, which this policy needs")

@@ -56,7 +56,8 @@ _BY_KIND = re.compile(r"\.(action_encoder\.(first|second|third)|(mlp_head|state_
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     shared = vla.read_vla_config(directory, entries, options)
-    settings, processors = shared.settings, vla.read_vla_processors(shared)
+    shared, processors = vla.read_vla_processors(shared)
+    settings = shared.settings
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     folder = language_model_folder(name, encoder_folders(options.encoders, directory), "internvl")
     model = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")

@@ -39,7 +39,7 @@ _VISION_HEADS = 16
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     shared = vla.read_vla_config(directory, entries, options)
-    processors, adaptive = vla.read_vla_processors(shared), entries["type"] == "pi05"
+    (shared, processors), adaptive = vla.read_vla_processors(shared), entries["type"] == "pi05"
     if adaptive and options.task is not None:
         raise CheckpointError(
             f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"

@@ -60,6 +60,10 @@ STATISTICS = {
 _NEUTRAL = {"mean": 0.0, "std": 1.0, **dict.fromkeys(("min", "q01", "q10"), -1.0)}
 """What evo1 pads statistics with; 1 for the others."""
 
+_STATE, _PADS_STATE = "observation.state", ("pi0", "pi05", "smolvla", "xvla")
+"""Types whose network takes states of several widths. Trained on from a base, a policy keeps the base's width in its
+configuration, and only the statistics say how many numbers the state of its robot has."""
+
 _LEAST_STD = 1e-30
 """Stands for a standard deviation of zero, which gives the mean whatever the network says."""
 
@@ -166,6 +170,7 @@ class Processors:
         relative: for each number of an action, which number of the state it is relative to; None for none. Empty where
             actions are absolute.
         poses: of an action, that are relative to poses of the state.
+        state_dim: numbers of the state in the data, where the configuration may have those of a base.
     """
 
     normalizers: Mapping[str, Statistics]
@@ -177,6 +182,7 @@ class Processors:
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     relative: tuple[int | None, ...] = ()
     poses: tuple[Pose, ...] = ()
+    state_dim: int | None = None
 
 
 def read_processors(directory: Path, features: Features, kind: str = "") -> Processors:
@@ -188,6 +194,10 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
     if order != [name for name in later if name in order]:
         raise CheckpointError(f"{directory / POSTPROCESSOR}: found {', '.join(order)}; expected {', '.join(later)}.")
     padded = any(step["registry_name"] in _PAD for step in before)
+    width: int | None = None
+    if kind in _PADS_STATE and _STATE in features:
+        width = _state_width(directory, before) or features[_STATE][1][0]
+        features = {**features, _STATE: ("STATE", (width,))}
     return Processors(
         renamed=renamed_observations(directory, before, features),
         normalizers=_statistics(directory, before, NORMALIZE, features, padded),
@@ -201,7 +211,16 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
             if step["registry_name"] in (*own, *later)
         },
         relative=relative_entries(directory, before, after, features),
+        state_dim=width,
     )
+
+
+def _state_width(directory: Path, steps: list[dict[str, Any]]) -> int | None:
+    """Numbers of the state in the data, by its statistics, which are saved whether or not it is normalised."""
+    step = next((step for step in steps if step["registry_name"] == NORMALIZE), None)
+    tensors = {} if step is None else state_of(directory, step)
+    found = (tensors.get(f"{_STATE}.{name}") for name, _ in STATISTICS.values())
+    return next((len(value) for value in found if value is not None and value.ndim == 1), None)
 
 
 def relative_entries(
@@ -214,7 +233,7 @@ def relative_entries(
     enabled = [each.flag("enabled", False) for each in own]
     if not any(enabled):
         return ()
-    (count,), state = features["action"][1], features.get("observation.state", ("", (0,)))[1][0]
+    (count,), state = features["action"][1], features.get(_STATE, ("", (0,)))[1][0]
     names, excluded = own[0].values.get("action_names"), own[0].values.get("exclude_joints") or []
     if enabled != [True, True] or any(name in _CHANGES for name in orders[0][: orders[0].index(_RELATIVE)]):
         told = f"expected {_RELATIVE} before the state is changed, and {_ABSOLUTE}, both enabled or none"

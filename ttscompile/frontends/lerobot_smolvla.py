@@ -50,7 +50,8 @@ _UNREAD = (".vlm.lm_head.weight", ".text_model.norm.weight")
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     shared = vla.read_vla_config(directory, entries, options)
-    settings, processors = shared.settings, vla.read_vla_processors(shared)
+    shared, processors = vla.read_vla_processors(shared)
+    settings = shared.settings
     folders = encoder_folders(options.encoders, directory)
     name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))

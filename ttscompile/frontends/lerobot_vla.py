@@ -64,8 +64,11 @@ def read_vla_config(
     return LeRobotConfig(**{**vars(config), "features": features})
 
 
-def read_vla_processors(config: LeRobotConfig) -> Processors:
-    """The processors of a policy, which leave images alone but in steps that its type alone has."""
+def read_vla_processors(config: LeRobotConfig) -> tuple[LeRobotConfig, Processors]:
+    """The processors of a policy, which leave images alone but in steps that its type alone has.
+
+    The configuration comes back with the width that the state of this robot has.
+    """
     processors = read_processors(config.directory, config.features, str(config.settings.values["type"]))
     normalised = sorted(key for key in config.cameras if key in processors.normalizers)
     if normalised:
@@ -73,7 +76,9 @@ def read_vla_processors(config: LeRobotConfig) -> Processors:
             f"{config.directory}: {', '.join(normalised[:4])} is normalised before it is resized; expected images as"
             " they are (VISUAL: IDENTITY), which all vision-language-action models of lerobot have."
         )
-    return processors
+    if processors.state_dim is not None:
+        config = replace(config, features={**config.features, STATE: ("STATE", (processors.state_dim,))})
+    return config, processors
 
 
 def vla_spec(

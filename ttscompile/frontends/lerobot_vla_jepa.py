@@ -56,7 +56,8 @@ _RENAMED = (
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     shared = vla.read_vla_config(directory, {"chunk_size": 7, "n_action_steps": 7, **entries}, options, stateless=True)
-    settings, processors = shared.settings, vla.read_vla_processors(shared)
+    shared, processors = vla.read_vla_processors(shared)
+    settings = shared.settings
     name = settings.text("qwen_model_name", "Qwen/Qwen3-VL-2B-Instruct", _MOST_LETTERS)
     backbone = qwen.find_backbone(name, encoder_folders(options.encoders, directory))
     resize = settings.size("resize_images_to", None, MOST_PIXELS)

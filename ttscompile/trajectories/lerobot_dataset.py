@@ -66,7 +66,10 @@ def lerobot_recording(path: Path, most: int | None = None) -> Recording:
             times = np.concatenate([np.zeros(0, np.float32), *_column(path, tables, TIME, size)])
             rows = len(episodes) if most is None else int(order.max()) + 1
             return rows, video_frames(path, name, info, episodes[:rows], times[:rows], columns)
-        return len(episodes), _column(path, tables, name, size)
+        found = _column(path, tables, name, size)
+        if info["features"].get(name, {}).get("shape") == [1]:  # the tables have the number alone
+            found = (block.reshape(len(block), -1) for block in found)
+        return len(episodes), found
 
     def columns(files: Sequence[Path], name: str) -> Array:
         return np.concatenate(list(_column(path, [parquet.ParquetFile(file) for file in files], name, size)))
@@ -194,7 +197,8 @@ def video_frames(
     fps: Any = info.get("fps")
     if type(fps) not in (int, float) or not 0 < fps < 1e6:
         raise TrajectoryError(f"{path}: fps of meta/info.json is {fps!r:.80}; expected frames a second of {name!r}.")
-    if info["features"][name].get("info", {}).get("video.is_depth_map"):
+    told = info["features"][name].get("info") or {}
+    if told.get("is_depth_map") or told.get("video.is_depth_map"):  # the latter before lerobot 0.6
         raise TrajectoryError(f"{path}: {name!r} is a video of depths, which is not decoded. Leave that camera out.")
     if Path(name).name != name:
         raise TrajectoryError(f"{path}: {name!r:.80} is no name of a camera; expected one without folders.")
