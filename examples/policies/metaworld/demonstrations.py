@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,8 @@ def demonstrate(environment: MetaWorld, seed: int, task: str) -> dict[str, npt.N
         ``pushed [S]``; None if the expert did not succeed.
     """
     rng = np.random.default_rng([seed, 1])
-    expert = ENV_POLICY_MAP[task]()
+    experts: Mapping[str, Any] = ENV_POLICY_MAP  # each of its own class, where Meta-World says the abstract one
+    expert = experts[task]()
     environment.reset(seed, task)
     rows: list[tuple[Any, Any, bool]] = []
     left, after, push = 0, 0, np.zeros(4)
