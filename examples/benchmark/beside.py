@@ -25,7 +25,7 @@ from ttscompile.runtimes.policy import CompiledPolicy
 
 Array = npt.NDArray[np.float32]
 
-POLICIES = ("smolvla", "pi0", "groot", "evo1", "vla_jepa")
+POLICIES = ("smolvla", "pi0", "pi05", "groot", "evo1", "vla_jepa")
 """Of ``large.py``, that another engine runs."""
 
 COMPUTED = 2

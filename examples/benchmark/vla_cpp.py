@@ -1,12 +1,13 @@
 """A policy beside vla.cpp (github.com/VinRobotics/vla.cpp), the same weights and the same call, taking turns.
 
-    python examples/benchmark/large.py --smolvla --output DIR        # or --pi0, --groot, --evo1, --vla-jepa
+    python examples/benchmark/large.py --smolvla --output DIR        # or --pi0, --pi05, --groot, --evo1, --vla-jepa
     python examples/benchmark/vla_cpp.py DIR --library libvla.so --model smolvla.gguf [--threads 1]
 
 ``DIR`` is what ``large.py`` leaves. ``libvla.so`` is vla.cpp's own: build it with its CMakeLists, which takes ggml from
 llama.cpp. A ggml that is built by itself leaves ``GGML_LLAMAFILE`` off, and is slower. ``smolvla.gguf`` is what its
-``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``, and so for pi0 and VLA-JEPA. GR00T's and Evo-1's read the names
-of a release, of which ``released_groot.py`` and ``released_evo1.py`` write the weights.
+``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``, and so for pi0, VLA-JEPA and pi0.5, which wants
+``--dataset-stats DIR/pi05/stats.json``, too. GR00T's and Evo-1's read the names of a release, of which
+``released_groot.py`` and ``released_evo1.py`` write the weights.
 
 vla.cpp is given tokens, and pictures that are resized beforehand. See ``beside.py`` for what is timed.
 """
@@ -77,7 +78,7 @@ class Stats(ctypes.Structure):
     _fields_: ClassVar = [(name, ctypes.c_float) for name in ("total", "vision", "inference", "prefill", "denoise")]
 
 
-_IMAGE_TOKENS = {"groot": IMAGE_TOKEN, "vla_jepa": IMAGE_TOKEN, "evo1": MODEL["image_token_id"]}
+IMAGE_TOKENS = {"groot": IMAGE_TOKEN, "vla_jepa": IMAGE_TOKEN, "evo1": MODEL["image_token_id"]}
 """Of policies whose prompt says where pictures stand."""
 
 
@@ -96,7 +97,7 @@ class Prompt:
 
 def prompt_of(folder: Path, name: str, obs: Mapping[str, Array]) -> Prompt:
     """The prompt of a policy that ``large.py`` saved."""
-    if name not in _IMAGE_TOKENS:
+    if name not in IMAGE_TOKENS:
         (tokens,) = (np.ascontiguousarray(obs[key].reshape(-1), np.int32) for key in obs if key.endswith("tokens"))
         return Prompt(tokens, lambda each: each)
     directory, task = saved(folder, name)
@@ -106,7 +107,7 @@ def prompt_of(folder: Path, name: str, obs: Mapping[str, Array]) -> Prompt:
     between = network.prompt.between
     count = network.config.image_tokens if name == "evo1" else network.pictured.count(True) // len(between)
     for words in between:
-        found += [*words, *[_IMAGE_TOKENS[name]] * count]
+        found += [*words, *[IMAGE_TOKENS[name]] * count]
     tokens = np.array([*found, *encoder.task[0].tolist(), *network.prompt.later], np.int32)
     if name == "evo1":
         return Prompt(tokens, lambda each: each)
@@ -143,7 +144,8 @@ class VlaCpp:
         rows = [self._prompt.seen(obs[key][0, 0]).transpose(1, 2, 0).astype(np.float32, order="C") for key in CAMERAS]
         images = (Image * len(rows))(*(Image(each.ctypes.data, *each.shape[:2], FLOATS) for each in rows))
         numbers, initial = np.zeros(STATES, np.float32), np.ascontiguousarray(noise.initial[0])
-        numbers[: obs[STATE].size] = obs[STATE].reshape(-1)
+        if STATE in obs:
+            numbers[: obs[STATE].size] = obs[STATE].reshape(-1)
         given = Inputs(
             images,
             len(rows),
