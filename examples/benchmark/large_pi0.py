@@ -51,9 +51,8 @@ def save(directory: Path, adaptive: bool = False) -> None:
         **_SIZES,
     }
     if adaptive:
-        numbers = {"mean": 0.0, "std": 1.0, "q01": -1.0, "q99": 1.0}
-        own = {name: [value] * FEATURES[ACTION]["shape"][0] for name, value in numbers.items()}
-        write_json(directory / "stats.json", {STATE: own, ACTION: own})
+        numbers = {"mean": [0.0] * 6, "std": [1.0] * 6, "q01": [-1.0] * 6, "q99": [1.0] * 6}
+        write_json(directory / "stats.json", {STATE: numbers, ACTION: numbers})
     write_json(directory / "config.json", entries | ({"tokenizer_max_length": 200} if adaptive else {}))
     write_processors(directory)
     config = PiConfig(

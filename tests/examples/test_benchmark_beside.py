@@ -79,7 +79,7 @@ def test_one_policy_is_in_the_folder(tmp_path: Path) -> None:
 def test_the_state_is_within_what_vla_cpp_clips(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
     drawn = {STATE: np.array([-3.0, 0.5, 2.0]), "tokens.mask": np.array([True, False])}
-    monkeypatch.setattr(beside, "call", lambda _: (drawn, Noise(np.zeros(1))))
+    monkeypatch.setattr(beside, "call", lambda _: (drawn, Noise(np.zeros(1, np.float32))))
     obs, _ = beside.observed(tmp_path)
     assert obs[STATE].tolist() == [-1.0, 0.5, 1.0] and obs["tokens.mask"].all()
 

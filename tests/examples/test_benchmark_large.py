@@ -31,10 +31,15 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"WORDS": 24, "_SEEN": 2, "_IMAGES": 16, "_MERGED": 64}
     for name, size in sizes.items():
         monkeypatch.setattr(large_qwen3_vl, name, size)
-    both = {"layers": 2, "heads": 2, "channels": 8, "hidden": 24}
+    both: dict[str, Any] = {"layers": 2, "heads": 2, "channels": 8, "hidden": 24}
     monkeypatch.setattr(large_pi0, "GEMMA", replace(large_pi0.GEMMA, width=24, **both))
     monkeypatch.setattr(large_pi0, "EXPERT", replace(large_pi0.EXPERT, width=16, **both))
-    seen = {"hidden_size": 32, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 16}
+    seen: dict[str, Any] = {
+        "hidden_size": 32,
+        "intermediate_size": 24,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 16,
+    }
     monkeypatch.setattr(large_pi0, "VISION", replace(large_pi0.VISION, **seen, image_size=224, patch_size=56))
 
 
