@@ -68,12 +68,12 @@ def save(directory: Path) -> None:
     save_file(weights, directory / "model.safetensors")
 
 
-def write_processors(directory: Path) -> None:
+def write_processors(directory: Path, features: Mapping[str, Any] = FEATURES) -> None:
     """Normalisers that change nothing."""
     numbers = {"mean": 0.0, "std": 1.0}
     statistics = {f"{key}.{n}": torch.full((6,), value) for key in (STATE, ACTION) for n, value in numbers.items()}
     save_file(statistics, directory / "statistics.safetensors")
-    own = {"config": {"eps": 1e-8, "features": FEATURES, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
+    own = {"config": {"eps": 1e-8, "features": features, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
     for name, kind in (("pre", "normalizer_processor"), ("post", "unnormalizer_processor")):
         write_json(directory / f"policy_{name}processor.json", {"steps": [{"registry_name": kind, **own}]})
 

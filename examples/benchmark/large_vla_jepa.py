@@ -34,16 +34,16 @@ def save(directory: Path) -> None:
     """
     directory.mkdir(parents=True, exist_ok=True)
     save_backbone(directory.parent / BACKBONE)
-    pictures = {key: {"type": "VISUAL", "shape": [3, 256, 256]} for key in CAMERAS}
+    features = FEATURES | {key: {"type": "VISUAL", "shape": [3, 256, 256]} for key in CAMERAS}
     entries = {
         "type": "vla_jepa",
-        "input_features": {STATE: FEATURES[STATE], **pictures},
-        "output_features": {ACTION: FEATURES[ACTION]},
+        "input_features": {key: features[key] for key in (STATE, *CAMERAS)},
+        "output_features": {ACTION: features[ACTION]},
         "qwen_model_name": f"Qwen/{BACKBONE}",
         **_SIZES,
     }
     write_json(directory / "config.json", entries)
-    write_processors(directory)
+    write_processors(directory, features)
     shapes = dict(backbone(_BACKBONE, MODEL["text_config"]["num_hidden_layers"], "model.language_model.embed_tokens"))
     shapes |= dict(_head("model.action_model."))
     save_drawn(directory / "model.safetensors", shapes, halved=_BACKBONE)
