@@ -111,9 +111,10 @@ def prompt_of(folder: Path, name: str, obs: Mapping[str, Array]) -> Prompt:
     tokens = np.array([*found, *encoder.task[0].tolist(), *network.prompt.later], np.int32)
     if name == "evo1":
         return Prompt(tokens, lambda each: each)
+    zoom, cameras = prefix.seen, network.prompt.images  # without the network, which takes memory
 
     def seen(each: Array) -> Array:
-        made = prefix.seen([torch.from_numpy(each)[None] * 2 - 1] * network.prompt.images)
+        made = zoom([torch.from_numpy(each)[None] * 2 - 1] * cameras)
         return np.asarray((made[0][0] + 1) / 2)
 
     return Prompt(tokens, seen)
