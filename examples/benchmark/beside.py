@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 from large_calls import lowered, plans_of
-from large_smolvla import call
+from large_smolvla import STATE, call
 from moving import REUSE, arm, backgrounds
 
 from ttscompile import Noise, Plan
@@ -25,7 +25,7 @@ from ttscompile.runtimes.policy import CompiledPolicy
 
 Array = npt.NDArray[np.float32]
 
-POLICIES = ("smolvla", "pi0", "groot")
+POLICIES = ("smolvla", "pi0", "pi05", "groot", "evo1", "vla_jepa")
 """Of ``large.py``, that another engine runs."""
 
 COMPUTED = 2
@@ -55,9 +55,14 @@ def policy_of(folder: Path) -> str:
 
 
 def observed(folder: Path) -> tuple[dict[str, Array], Noise]:
-    """One observation of the policy, all of whose tokens count, and the noise of a call."""
+    """One observation of the policy, all of whose tokens count, and the noise of a call.
+
+    The state is between -1 and 1, since vla.cpp clips some policies' there.
+    """
     obs, noise = call(load_artifact(folder / "compiled").manifest.spec)
-    return {key: np.ones_like(value) if key.endswith("mask") else value for key, value in obs.items()}, noise
+    made = {key: np.ones_like(value) for key, value in obs.items() if key.endswith("mask")}
+    made |= {key: value.clip(-1, 1) for key, value in obs.items() if key == STATE}
+    return obs | made, noise
 
 
 def race(folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, fp32: bool = True) -> None:

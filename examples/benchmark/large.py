@@ -5,9 +5,10 @@
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
     python examples/benchmark/large.py --smolvla --precision int4 --only convert --output DIR     # what it is made of
-    python examples/benchmark/large.py --pi0 --precision int4                   # LeRobot's pi0, whole
+    python examples/benchmark/large.py --pi0 --precision int4                   # LeRobot's pi0, whole; or --pi05
     python examples/benchmark/large.py --groot --precision int4                 # LeRobot's GR00T N1.7, whole
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
+    python examples/benchmark/large.py --vla-jepa                               # LeRobot's vla_jepa, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 STEPS = 4
 
-WHOLE = ("smolvla", "pi0", "groot", "evo1", "xvla", "rdt")
+WHOLE = ("smolvla", "pi0", "pi05", "groot", "evo1", "vla_jepa", "xvla", "rdt")
 """Policies that are compiled from what is saved of them; LeRobot's are whole."""
 
 MOST_FILES = 3
@@ -139,13 +140,16 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     import large_pi0
     import large_rdt
     import large_smolvla
+    import large_vla_jepa
     import large_xvla
 
     directory = folder / name
     if not directory.exists():
-        own = [large_smolvla, large_pi0, large_groot, large_evo1, large_xvla, large_rdt]
-        dict(zip(WHOLE, own, strict=True))[name].save(directory)
-    return directory, large_evo1.TASK if name in ("evo1", "groot") else None
+        pi05 = partial(large_pi0.save, adaptive=True)
+        others = (large_groot, large_evo1, large_vla_jepa, large_xvla, large_rdt)
+        saves = [large_smolvla.save, large_pi0.save, pi05, *(each.save for each in others)]
+        dict(zip(WHOLE, saves, strict=True))[name](directory)
+    return directory, large_evo1.TASK if name in ("evo1", "groot", "vla_jepa") else None
 
 
 def convert_clip(folder: Path) -> None:
@@ -237,8 +241,10 @@ def main() -> None:
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
     parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
     parser.add_argument("--pi0", action="store_true", help="LeRobot's pi0, likewise")
+    parser.add_argument("--pi05", action="store_true", help="LeRobot's pi05, likewise")
     parser.add_argument("--groot", action="store_true", help="LeRobot's groot, GR00T N1.7, likewise")
     parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
+    parser.add_argument("--vla-jepa", action="store_true", help="LeRobot's vla_jepa, likewise")
     parser.add_argument("--xvla", action="store_true", help="LeRobot's xvla, likewise")
     parser.add_argument("--rdt", action="store_true", help="RDT-170M, likewise")
     parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
@@ -270,8 +276,8 @@ def main() -> None:
             folder.mkdir(parents=True, exist_ok=True)
             for part in ("convert", "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
-                own += [f"--{name}" for name in policies if getattr(options, name)] + [f"--rounds={options.rounds}"]
-                own += [f"--precision={options.precision}"]
+                own += [f"--{name.replace('_', '-')}" for name in policies if getattr(options, name)]
+                own += [f"--rounds={options.rounds}", f"--precision={options.precision}"]
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

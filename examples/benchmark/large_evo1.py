@@ -35,7 +35,16 @@ MODEL: dict[str, Any] = {
     },
 }
 """InternVL3-1B; other entries are the defaults."""
-_STEPS = {"chunk_size": 50, "num_inference_timesteps": 32}
+STEPS, PADDED = 32, 24
+"""Of a call; and numbers of a state and of an action."""
+_SIZES = {
+    "chunk_size": 50,
+    "num_inference_timesteps": STEPS,
+    "max_state_dim": PADDED,
+    "max_action_dim": PADDED,
+    "max_views": len(CAMERAS),
+}
+"""Lerobot's own, but for a prompt of as many images as there are cameras."""
 _MARKS = {"<img>": 151665, "</img>": 151666, "<IMG_CONTEXT>": 151667}
 
 
@@ -51,7 +60,7 @@ def save(directory: Path) -> None:
         "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
         "output_features": {ACTION: FEATURES[ACTION]},
         "vlm_model_name": f"OpenGVLab/{model.name}",
-        **_STEPS,
+        **_SIZES,
     }
     write_json(directory / "config.json", entries)
     write_processors(directory)

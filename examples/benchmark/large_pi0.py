@@ -1,4 +1,4 @@
-"""pi0 at its real size with random weights, for ``large.py``: 3.2 billion, in the files that lerobot saves."""
+"""pi0 and pi0.5 at their real size with random weights, for ``large.py``, in the files that lerobot saves."""
 
 from __future__ import annotations
 
@@ -37,23 +37,37 @@ _SIZES = {
 _TEXT = "paligemma_with_expert.paligemma.model.language_model."
 
 
-def save(directory: Path) -> None:
-    """What lerobot's ``save_pretrained`` writes of a pi0 with its default configuration, in float32."""
+def save(directory: Path, adaptive: bool = False) -> None:
+    """What lerobot's ``save_pretrained`` writes of a pi0 with its default configuration, in float32.
+
+    Args:
+        adaptive: of a pi0.5, under the names that its published files have, and with statistics of a data set.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     entries = {
-        "type": "pi0",
+        "type": "pi05" if adaptive else "pi0",
         "input_features": {key: FEATURES[key] for key in (STATE, *CAMERAS)},
         "output_features": {ACTION: FEATURES[ACTION]},
         **_SIZES,
     }
-    write_json(directory / "config.json", entries)
+    if adaptive:
+        numbers = {"mean": [0.0] * 6, "std": [1.0] * 6, "q01": [-1.0] * 6, "q99": [1.0] * 6}
+        write_json(directory / "stats.json", {STATE: numbers, ACTION: numbers})
+    write_json(directory / "config.json", entries | ({"tokenizer_max_length": 200} if adaptive else {}))
     write_processors(directory)
     config = PiConfig(
-        vision=VISION, text=GEMMA, vocabulary=257152, expert=EXPERT, state=_PADDED, actions=_PADDED, periods=_PERIODS
+        vision=VISION,
+        text=GEMMA,
+        vocabulary=257152,
+        expert=EXPERT,
+        state=None if adaptive else _PADDED,
+        actions=_PADDED,
+        periods=_PERIODS,
     )
+    start = "" if adaptive else "model."
     with torch.device("meta"):
-        shapes = {f"model.{_saved(name)}": value.shape for name, value in Pi(config).state_dict().items()}
-    shapes[f"model.{_TEXT}norm.weight"] = torch.Size((GEMMA.width,))  # no action depends on it
+        shapes = {f"{start}{_saved(name)}": value.shape for name, value in Pi(config).state_dict().items()}
+    shapes[f"{start}{_TEXT}norm.weight"] = torch.Size((GEMMA.width,))  # no action depends on it
     save_drawn(directory / "model.safetensors", shapes)
 
 

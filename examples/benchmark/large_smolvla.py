@@ -68,12 +68,12 @@ def save(directory: Path) -> None:
     save_file(weights, directory / "model.safetensors")
 
 
-def write_processors(directory: Path) -> None:
+def write_processors(directory: Path, features: Mapping[str, Any] = FEATURES) -> None:
     """Normalisers that change nothing."""
     numbers = {"mean": 0.0, "std": 1.0}
     statistics = {f"{key}.{n}": torch.full((6,), value) for key in (STATE, ACTION) for n, value in numbers.items()}
     save_file(statistics, directory / "statistics.safetensors")
-    own = {"config": {"eps": 1e-8, "features": FEATURES, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
+    own = {"config": {"eps": 1e-8, "features": features, "norm_map": _MODES}, "state_file": "statistics.safetensors"}
     for name, kind in (("pre", "normalizer_processor"), ("post", "unnormalizer_processor")):
         write_json(directory / f"policy_{name}processor.json", {"steps": [{"registry_name": kind, **own}]})
 
@@ -89,18 +89,24 @@ def random_weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.
     return torch.ones(shape) if name.endswith("weight") else torch.zeros(shape)  # a norm's, whatever it is called
 
 
-def save_drawn(path: Path, shapes: Mapping[str, torch.Size]) -> None:
-    """Write random weights one after the other, so that they need no memory that a machine may not have."""
+def save_drawn(path: Path, shapes: Mapping[str, torch.Size], halved: str | None = None) -> None:
+    """Write random weights one after the other, so that they need no memory that a machine may not have.
+
+    Args:
+        halved: how names begin of those that are in bf16; None for none.
+    """
     header, end = dict[str, Any](), 0
+    half = {name: halved is not None and name.startswith(halved) for name in shapes}
     for name, shape in shapes.items():
-        start, end = end, end + 4 * shape.numel()
-        header[name] = {"dtype": "F32", "shape": list(shape), "data_offsets": [start, end]}
+        start, end = end, end + (2 if half[name] else 4) * shape.numel()
+        header[name] = {"dtype": "BF16" if half[name] else "F32", "shape": list(shape), "data_offsets": [start, end]}
     content, draw = json.dumps(header).encode(), torch.Generator().manual_seed(0)
     content += b" " * (-len(content) % 8)
     with path.open("wb") as file:
         file.write(len(content).to_bytes(8, "little") + content)
         for name, shape in shapes.items():
-            random_weight(name, shape, draw).numpy().tofile(file)
+            value = random_weight(name, shape, draw)
+            (value.bfloat16().view(torch.int16) if half[name] else value).numpy().tofile(file)
 
 
 def write_json(path: Path, content: Any) -> None:

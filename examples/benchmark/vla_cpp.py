@@ -1,12 +1,13 @@
 """A policy beside vla.cpp (github.com/VinRobotics/vla.cpp), the same weights and the same call, taking turns.
 
-    python examples/benchmark/large.py --smolvla --output DIR        # or --pi0, or --groot
+    python examples/benchmark/large.py --smolvla --output DIR        # or --pi0, --pi05, --groot, --evo1, --vla-jepa
     python examples/benchmark/vla_cpp.py DIR --library libvla.so --model smolvla.gguf [--threads 1]
 
 ``DIR`` is what ``large.py`` leaves. ``libvla.so`` is vla.cpp's own: build it with its CMakeLists, which takes ggml from
 llama.cpp. A ggml that is built by itself leaves ``GGML_LLAMAFILE`` off, and is slower. ``smolvla.gguf`` is what its
-``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``, and so for pi0. GR00T's reads the names of NVIDIA's release, of
-which ``released_groot.py`` writes the weights.
+``convert_smolvla_to_gguf.py`` makes of ``DIR/smolvla``, and so for pi0, VLA-JEPA and pi0.5, which wants
+``--dataset-stats DIR/pi05/stats.json``, too. GR00T's and Evo-1's read the names of a release, of which
+``released_groot.py`` and ``released_evo1.py`` write the weights.
 
 vla.cpp is given tokens, and pictures that are resized beforehand. See ``beside.py`` for what is timed.
 """
@@ -26,7 +27,9 @@ import numpy.typing as npt
 import torch
 from beside import Array, observed, policy_of, race
 from large import saved
-from large_groot import EMBODIMENT, IMAGE_TOKEN
+from large_evo1 import MODEL
+from large_groot import EMBODIMENT
+from large_qwen3_vl import IMAGE_TOKEN
 from large_smolvla import CAMERAS, STATE
 
 from ttscompile import Noise
@@ -75,6 +78,10 @@ class Stats(ctypes.Structure):
     _fields_: ClassVar = [(name, ctypes.c_float) for name in ("total", "vision", "inference", "prefill", "denoise")]
 
 
+IMAGE_TOKENS = {"groot": IMAGE_TOKEN, "vla_jepa": IMAGE_TOKEN, "evo1": MODEL["image_token_id"]}
+"""Of policies whose prompt says where pictures stand."""
+
+
 @dataclass(frozen=True)
 class Prompt:
     """What vla.cpp leaves to its caller.
@@ -90,21 +97,27 @@ class Prompt:
 
 def prompt_of(folder: Path, name: str, obs: Mapping[str, Array]) -> Prompt:
     """The prompt of a policy that ``large.py`` saved."""
-    if name != "groot":
+    if name not in IMAGE_TOKENS:
         (tokens,) = (np.ascontiguousarray(obs[key].reshape(-1), np.int32) for key in obs if key.endswith("tokens"))
         return Prompt(tokens, lambda each: each)
     directory, task = saved(folder, name)
     encoder: Any = load_checkpoint_policy(directory, options=LoadOptions(task=task))[0].encoder
-    backbone, zoom, found = encoder.prefix.backbone, encoder.prefix.seen, list[int]()
-    tokens = backbone.pictured.count(True) // len(CAMERAS)
-    for words in backbone.prompt.between:
-        found += [*words, *[IMAGE_TOKEN] * tokens]
+    prefix, found = encoder.prefix, list[int]()
+    network = prefix.embedder if name == "evo1" else prefix.backbone
+    between = network.prompt.between
+    count = network.config.image_tokens if name == "evo1" else network.pictured.count(True) // len(between)
+    for words in between:
+        found += [*words, *[IMAGE_TOKENS[name]] * count]
+    tokens = np.array([*found, *encoder.task[0].tolist(), *network.prompt.later], np.int32)
+    if name == "evo1":
+        return Prompt(tokens, lambda each: each)
+    zoom, cameras = prefix.seen, network.prompt.images  # without the network, which takes memory
 
     def seen(each: Array) -> Array:
-        (made,) = zoom([torch.from_numpy(each)[None] * 2 - 1])
-        return np.asarray((made[0] + 1) / 2)
+        made = zoom([torch.from_numpy(each)[None] * 2 - 1] * cameras)
+        return np.asarray((made[0][0] + 1) / 2)
 
-    return Prompt(np.array([*found, *encoder.task[0].tolist()], np.int32), seen)
+    return Prompt(tokens, seen)
 
 
 class VlaCpp:
@@ -132,7 +145,8 @@ class VlaCpp:
         rows = [self._prompt.seen(obs[key][0, 0]).transpose(1, 2, 0).astype(np.float32, order="C") for key in CAMERAS]
         images = (Image * len(rows))(*(Image(each.ctypes.data, *each.shape[:2], FLOATS) for each in rows))
         numbers, initial = np.zeros(STATES, np.float32), np.ascontiguousarray(noise.initial[0])
-        numbers[: obs[STATE].size] = obs[STATE].reshape(-1)
+        if STATE in obs:
+            numbers[: obs[STATE].size] = obs[STATE].reshape(-1)
         given = Inputs(
             images,
             len(rows),

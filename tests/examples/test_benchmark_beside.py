@@ -4,19 +4,28 @@ import ctypes
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import beside
 import numpy as np
 import pytest
+import released_evo1
 import released_groot
+import torch
 import vla_cpp
 from beside import Array
 from click.testing import CliRunner
+from large_evo1 import STEPS, TASK
 from large_groot import BASE
+from large_smolvla import STATE
+from safetensors.torch import save_file
 
 from tests.families import cameras
+from tests.frontends import evo1s, vla_jepas
 from tests.once import Once
 from ttscompile import Noise, load
+from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.errors import CheckpointError
 
 
 class Late:
@@ -61,10 +70,18 @@ def test_medians_are_of_the_calls_that_count() -> None:
 
 
 def test_one_policy_is_in_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match="expected one folder of smolvla, pi0, groot"):
+    with pytest.raises(SystemExit, match="expected one folder of smolvla, pi0, pi05, groot, evo1, vla_jepa"):
         beside.policy_of(tmp_path)
     (tmp_path / "pi0").mkdir()
     assert beside.policy_of(tmp_path) == "pi0"
+
+
+def test_the_state_is_within_what_vla_cpp_clips(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
+    drawn = {STATE: np.array([-3.0, 0.5, 2.0]), "tokens.mask": np.array([True, False])}
+    monkeypatch.setattr(beside, "call", lambda _: (drawn, Noise(np.zeros(1, np.float32))))
+    obs, _ = beside.observed(tmp_path)
+    assert obs[STATE].tolist() == [-1.0, 0.5, 1.0] and obs["tokens.mask"].all()
 
 
 def test_the_structures_have_the_sizes_of_the_interface() -> None:
@@ -92,3 +109,54 @@ def test_weights_of_a_release_are_the_same_bytes_under_its_names(tmp_path: Path)
     assert [each["data_offsets"][0] for each in found.values()] == [0, 1]
     index = json.loads((tmp_path / BASE / "model.safetensors.index.json").read_text())
     assert set(index["weight_map"]) == set(found)
+
+
+_SEEN = f"<|vision_start|>{'<|image_pad|>' * 8}<|vision_end|>"
+_FRAMES = "".join(f"<|action_{i}|>" * 2 for i in range(3))
+_JEPA = (
+    f"<|im_start|>user\n{_SEEN * 2}Your task is {TASK}. Infer the temporal dynamics from frames {_FRAMES} and produce"
+    f" the corresponding policy actions {'<|embodied_action|>' * 3}"
+)
+_EVO1 = "".join(f"Image-{i}: <img>{'<IMG_CONTEXT>' * 4}</img>\n" for i in (1, 2)) + TASK
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "kind", "model", "text"),
+    [("evo1", evo1s, "pooled", evo1s.LANGUAGE, _EVO1), ("vla_jepa", vla_jepas, "libero", vla_jepas.BACKBONE, _JEPA)],
+)
+def test_a_prompt_says_where_pictures_stand(
+    tmp_path: Path, name: str, written: Any, kind: str, model: str, text: str
+) -> None:
+    (tmp_path / name).symlink_to(written.save(kind, tmp_path))
+    tokenizer = Tokenizer(tmp_path / model, CheckpointError)
+    tokenizer.with_words([*(f"<|action_{i}|>" for i in range(20)), "<|embodied_action|>"])
+    own = json.loads((tmp_path / model / "config.json").read_text())["image_token_id"]
+    tokens = [vla_cpp.IMAGE_TOKENS[name] if each == own else each for each in tokenizer(text)]
+    prompt = vla_cpp.prompt_of(tmp_path, name, {})
+    assert prompt.tokens.tolist() == tokens and prompt.tokens.dtype == np.int32
+
+
+def test_weights_of_evo1_have_the_names_of_its_authors(tmp_path: Path) -> None:
+    start, head = "model.embedder.vision_tower.encoder.layers.0", "model.action_head"
+    rows = torch.arange(1000.0)[None, :, None]
+    weights = {f"{start}.self_attn.{one}_proj.bias": torch.full((2,), i) for i, one in enumerate("kqv")}
+    weights |= {f"{start}.lambda_1": torch.ones(2), f"{head}.times": rows}
+    weights |= {f"{head}.mlp_head.fc2.bias": torch.ones(72), f"{head}.action_encoder.first.bias": torch.zeros(2)}
+    weights["model.embedder.language_model.layers.0.self_attn.q_proj.bias"] = torch.ones(2)
+    (tmp_path / "evo1").mkdir()
+    save_file(weights, tmp_path / "evo1" / "model.safetensors")
+    assert CliRunner().invoke(released_evo1.main, [str(tmp_path)]).exit_code == 0
+    made = torch.load(tmp_path / released_evo1.BASE / "mp_rank_00_model_states.pt")["module"]
+    assert sorted(made) == [
+        "action_head.action_encoder.W1.linear.bias",
+        "action_head.mlp_head.fc2.linear.bias",
+        "action_head.time_pos_enc.pe",
+        "embedder.model.language_model.model.layers.0.self_attn.q_proj.bias",
+        "embedder.model.vision_model.encoder.layers.0.attn.qkv.bias",
+        "embedder.model.vision_model.encoder.layers.0.ls1",
+    ]
+    assert made["embedder.model.vision_model.encoder.layers.0.attn.qkv.bias"].tolist() == [1, 1, 0, 0, 2, 2]
+    read = made["action_head.time_pos_enc.pe"][0, [int(step / STEPS * 1000) for step in range(STEPS)], 0]
+    assert read.tolist() == [int(step / STEPS * 999) for step in range(STEPS)]
+    entries = json.loads((tmp_path / released_evo1.BASE / "config.json").read_text())
+    assert (entries["horizon"], entries["action_dim"], entries["per_action_dim"]) == (3, 72, 24)

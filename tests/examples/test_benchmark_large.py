@@ -1,0 +1,59 @@
+"""Policies of ``large.py``: what is written of one is what lerobot's frontend reads; at small sizes here."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import large
+import large_pi0
+import large_qwen3_vl
+import large_smolvla
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.families import LoadOptions
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Towers and language models of two layers."""
+    text = {"hidden_size": 24, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+    text |= {"num_key_value_heads": 1, "head_dim": 12, "vocab_size": 151936}
+    turns = {"mrope_section": [2, 2, 2], "rope_type": "default", "mrope_interleaved": True}
+    vision = {"depth": 2, "hidden_size": 16, "intermediate_size": 24, "num_heads": 2, "out_hidden_size": 24}
+    model: dict[str, Any] = large_qwen3_vl.MODEL
+    monkeypatch.setitem(model, "text_config", {**model["text_config"], **text, "rope_scaling": turns})
+    stacked = {"deepstack_visual_indexes": [0, 1], "num_position_embeddings": 64}
+    monkeypatch.setitem(model, "vision_config", {**model["vision_config"], **vision, **stacked})
+    sizes = {"WORDS": 24, "_SEEN": 2, "_IMAGES": 16, "_MERGED": 64}
+    for name, size in sizes.items():
+        monkeypatch.setattr(large_qwen3_vl, name, size)
+    both: dict[str, Any] = {"layers": 2, "heads": 2, "channels": 8, "hidden": 24}
+    monkeypatch.setattr(large_pi0, "GEMMA", replace(large_pi0.GEMMA, width=24, **both))
+    monkeypatch.setattr(large_pi0, "EXPERT", replace(large_pi0.EXPERT, width=16, **both))
+    seen: dict[str, Any] = {
+        "hidden_size": 32,
+        "intermediate_size": 24,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 16,
+    }
+    monkeypatch.setattr(large_pi0, "VISION", replace(large_pi0.VISION, **seen, image_size=224, patch_size=56))
+
+
+@pytest.mark.parametrize(("name", "shape"), [("vla_jepa", (1, 7, 6)), ("pi0", (1, 50, 32)), ("pi05", (1, 50, 32))])
+def test_what_is_written_is_read(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
+    directory, task = large.saved(tmp_path, name)
+    module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
+    obs, noise = large_smolvla.call(spec)
+    made = eager_policy(module, spec)({key: torch.from_numpy(value) for key, value in obs.items()}, noise)
+    assert made.shape == shape and made.isfinite().all() and made.std() > 0.1
+    assert large.saved(tmp_path, name) == (directory, task)
+
+
+def test_of_vla_jepa_the_language_model_alone_is_in_bf16(tmp_path: Path) -> None:
+    directory, _ = large.saved(tmp_path, "vla_jepa")
+    halved = {name: value.dtype == torch.bfloat16 for name, value in load_file(directory / "model.safetensors").items()}
+    assert halved == {name: name.startswith("model.qwen.") for name in halved}
