@@ -179,9 +179,9 @@ def test_a_copy_is_the_same(artifact: Artifact, tmp_path: Path) -> None:
 
 
 def test_a_plan_that_has_a_name_stays_what_it_is(artifact: Artifact) -> None:
-    for plan in artifact.plans.values():
+    for cells in (plan.cells for plan in artifact.plans.values() if plan.cells is not None):
         with pytest.raises(ValueError, match="read-only"):
-            plan.cells[:] = 1
+            cells[:] = 1
 
 
 def test_a_part_that_is_said_to_be_in_fp32_is_not_named(artifact: Artifact) -> None:
