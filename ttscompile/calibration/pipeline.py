@@ -237,9 +237,11 @@ def calibrate(
         corrects |= chosen.fits_correction and SCHEDULE in learn
         fewest, limit = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
         settings = {
-            "model": artifact.manifest.model_identity[:16],
+            # Of what replaces no plans, these too: what is learned is learned for one of them.
+            "model": (artifact.manifest.model_identity if anew else artifact.manifest.identity)[:16],
             "trajectories": digest_of(episodes),
             "budget": goal.record(),
+            "threads": goal.threads if chooses else 1,
             "learn": [row.name for row in rows],
             "strategy": strategy,
             "seed": seed,
