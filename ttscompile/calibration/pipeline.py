@@ -275,6 +275,8 @@ def calibrate(
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.leave(frontier.plans, frontier.scores, SCHEDULE)
+            else:
+                kept.judge_changed(artifact.plans)
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         chosen_within = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(

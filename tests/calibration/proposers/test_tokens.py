@@ -14,6 +14,7 @@ import pytest
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.judge import TIMED, WARM_UP, Score, further, judge, timed
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
@@ -105,6 +106,19 @@ def test_a_call_is_timed_after_another_picture(folder: Path, tmp_path: Path, mon
     assert len(counted) == WARM_UP + TIMED
     whole = counted.pop(WARM_UP)
     assert max(counted) < 0.5 < whole, "its first picture is whole, and the second of the window is not"
+
+
+def test_a_plan_that_is_given_what_another_learned_is_judged_anew(folder: Path, tmp_path: Path) -> None:
+    artifact, files = load_artifact(folder), recorded(tmp_path / "calls.npz")
+    fields = {"distance": 9.0, "interval": [9.0, 9.0], "sparsity": 0.0, "flops_sparsity": 0.0}
+    record = {"plans": {"other": fields}}
+    update_plans(folder, {**artifact.plans, "other": replace(artifact.default, repair=True)}, FULL, record)
+    result = calibrate(folder, files, learn=("tokens",), progress=False)
+    after = load_artifact(folder)
+    assert after.plans["other"].tokens is not None
+    found = (after.manifest.calibration or {})["plans"]["other"]
+    assert found["distance"] == result.plans["other"].distance == result.plans[FULL].distance
+    assert found["tokens"] < 0.5 and found["distance"] < 1
 
 
 def test_what_does_not_hold_on_other_episodes_is_told(
