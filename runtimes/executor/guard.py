@@ -65,6 +65,8 @@ class Guard:
     """
 
     def __init__(self, limits: GuardLimits, normalizer: Affine | None, channels: int) -> None:
+        if not isinstance(limits, GuardLimits):
+            raise ExecutorError(f"the guard must be GuardLimits; found {limits!r:.80}.")
         unlimited = np.full(channels, np.inf, np.float32)
         low, high = -unlimited, unlimited
         if normalizer is not None:

@@ -104,6 +104,7 @@ class Shadow:
         self._clock = clock or MonotonicClock()
         self._lock = threading.Lock()
         self._waiting, self._missed = 0, False
+        self._episode, self._failed = 0, -1  # number of resets, and the last episode in which something failed
         self._count: Counter[str] = Counter()
         self._failure, self._worst = "", (0.0, -1)
         self._sum = np.zeros(0)  # of the mean differences, by number of the action
@@ -127,7 +128,7 @@ class Shadow:
         """A new episode of both."""
         given = () if seed is None else (seed,)
         self._original.reset(*given)
-        self._missed = False
+        self._episode, self._missed = self._episode + 1, False
         self._give(partial(self._compiled.reset, *given))
 
     def follow(self, executed: int) -> None:
@@ -172,14 +173,16 @@ class Shadow:
             self._times[0].add(1e3 * took)
             full = self._waiting >= WAITING
             self._missed |= full
-            drop = full or (self._missed and name != "predict_action")  # the others keep frames from call to call
+            keeps = name != "predict_action"  # frames from call to call
+            drop = full or (keeps and (self._missed or self._failed == self._episode))
             self._count["dropped"] += drop
         try:
             if not drop:
                 kept = {key: copy.deepcopy(value) for key, value in obs.items()}
                 call = partial(getattr(self._compiled, name), kept, **copy.deepcopy(given))
-                self._give(partial(self._compare, call, kept, number, _array(answer), self._deadline or took))
+                self._give(partial(self._compare, call, kept, number, _array(answer), self._deadline or took), keeps)
         except Exception as error:
+            self._missed = True
             self._fail(error)
         return answer
 
@@ -187,24 +190,27 @@ class Shadow:
     predict_action_chunk = partialmethod(_both, "predict_action_chunk")
     select_action = partialmethod(_both, "select_action")
 
-    def _give(self, work: Callable[[], object]) -> None:
+    def _give(self, work: Callable[[], object], keeps: bool = False) -> None:
         with self._lock:
             self._waiting += 1
-        self._helper.submit(partial(self._try, work))
+        self._helper.submit(partial(self._try, work, self._episode, keeps))
 
     def _fail(self, error: Exception) -> None:
         with self._lock:
             self._count["failed"] += 1
             self._failure = f"{type(error).__name__}: {error!s:.300}"
 
-    def _try(self, work: Callable[[], object]) -> None:
+    def _try(self, work: Callable[[], object], episode: int, keeps: bool) -> None:
+        drop = keeps and self._failed == episode  # it waited behind a call that failed
         try:
-            work()
+            if not drop:
+                work()
         except Exception as error:
-            self._missed = True
+            self._failed = episode
             self._fail(error)
         with self._lock:
             self._waiting -= 1
+            self._count["dropped"] += drop
 
     def _compare(self, call: Callable[[], Any], obs: Any, number: int, answer: Numbers, within: float) -> None:
         begun = self._clock.now()

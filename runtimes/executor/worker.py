@@ -19,7 +19,7 @@ from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import Clock, measure_latencies
-from .settings import Policy, Resolved, SeeingPolicy
+from .settings import Policy, Resolved, SeeingPolicy, require_number
 from .state import ExecutorState, Job
 from .statistics import Trace
 from .window import Frame
@@ -156,6 +156,8 @@ class Worker:
         elif missing := [name for name in settings.plans if name not in given]:
             raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {settings.plans}.")
         else:
+            for name in settings.plans:
+                require_number(given[name], f"the latency of plan {name!r}", wanted="of seconds", above=-1e-9)
             measured = {name: [given[name]] for name in settings.plans}
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self.feasibility = {name: settings.feasibility(max(measured[name])) for name in settings.tiers}

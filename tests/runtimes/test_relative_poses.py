@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from ttscompile.core.lattice import Source
 from ttscompile.core.poses import Pose, orthonormal
 from ttscompile.core.spec import Affine, Relative
 from ttscompile.core.start import rest_of
-from ttscompile.errors import ArtifactError, ObservationError
+from ttscompile.errors import ArtifactError, CalibrationError, ObservationError
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.verification.record_golden import record_plans
 
@@ -183,6 +184,14 @@ def test_calibration_measures_what_the_network_says(once: Once, tmp_path: Path) 
     assert np.abs(shown[0] - shown[1]).max() > 0.1
     np.testing.assert_allclose(orthonormal(shown[1][..., 1:10]), shown[1][..., 1:10], atol=1e-5)
     assert np.abs(orthonormal(shown[0][..., 1:10]) - shown[0][..., 1:10]).max() > 1e-3
+
+
+def test_a_latency_is_measured_where_the_robot_has_a_pose(made: Path, tmp_path: Path) -> None:
+    """Zeros are no rotation."""
+    path, rows = shutil.copytree(made / "artifact", tmp_path / "own"), [observed(seed, 6)[0]["obs"] for seed in (0, 1)]
+    np.savez(tmp_path / "calls.npz", obs=np.concatenate(rows), episode_ends=[6, 12])
+    with pytest.raises(CalibrationError, match="a call that computes step 0 alone takes"):
+        ttscompile.calibrate(path, [tmp_path / "calls.npz"], latency_ms=1e-4, progress=False)
 
 
 def test_it_is_written_where_there_is_one_and_read_strictly() -> None:

@@ -149,7 +149,7 @@ def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> 
     steps, blocks = manifest.steps, len(manifest.blocks)
     runtime = open_runtime(artifact, "onnxruntime", goal.threads, plan=base)
     policy = CompiledPolicy(artifact, runtime, seed=0, plan=base)
-    obs = {key: np.zeros((1, *one.shape), one.dtype) for key, one in manifest.spec.observations.items()}
+    obs, _ = random_call(manifest.spec, 0, 0)  # zeros may be none: a pose has a rotation
     waited = _pruner_ms(manifest, runtime, base) if pruned else 0.0
     measured: dict[int, float] = {}
 

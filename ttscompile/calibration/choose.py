@@ -57,10 +57,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
             entered[f"{name}, all tokens"] = replace(plan, tokens=None)
     kept.trials.bar.stage("held-out calls", len(entered))
     for number, (name, plan) in enumerate(entered.items(), 1):
-        if kept.judged.get(name) is plan:
-            scores[name] = kept.scores[name]
-        else:
-            scores[name] = judge(kept.trials, plan)
+        scores[name] = kept.scores[name] if kept.judged.get(name) is plan else judge(kept.trials, plan)
         kept.trials.bar.update(number, f"{name}: {scores[name].distance:.3g}", kept.trials.clock.left())
     kept.trials.bar.stage("timing", 1)
     times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))

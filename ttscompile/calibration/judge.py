@@ -115,8 +115,9 @@ def further(score: Score, other: Score) -> tuple[float, float]:
 def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = TIMED) -> list[Times]:
     """What calls of plans take, of one stream, in turn: whatever else the machine does hits all.
 
-    Every call computes all of its frames. Weights that are in memory alone are timed as the original's. All trials are
-    of the same episodes.
+    Every call computes all of its frames. One that reuses tokens computes what changed since the call before, and once
+    all of it, so that the longest is known. Weights that are in memory alone are timed as the original's. All trials
+    are of the same episodes.
     """
     filed = [(trials, _filed(trials, plan)) for trials, plan in entrants]
     opened = [open_runtime(one.artifact, one.runtime, threads, _device(one), plan) for one, plan in filed]
@@ -130,6 +131,8 @@ def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = T
             if plan.otherwise is not None:
                 runtime.predict(obs, noise, plan)  # so that there is a chunk to begin with
             runtime.forget_frames()
+            if plan.tokens is not None and row and number != WARM_UP:
+                runtime.frames.learn(trials.observation([(int(sample.stretches[stretch, 0]), row - 1)]))
             timer.time(i, partial(runtime.predict, obs, noise, plan))
             runtime.reset()
     return timer.times

@@ -81,6 +81,12 @@ class Kept:
             self.refused[name] = f"has nothing to propose: {error}"
         self.told[name] = proposer.told
 
+    def judge_changed(self, before: Mapping[str, Plan]) -> None:
+        """Judge plans anew that were given a field after they were judged, here or by the calibration ``before``."""
+        for name, plan in self.plans.items():
+            if name != DENSE and self.judged.get(name, before.get(name)) is not plan:
+                self.scores[name] = judge(self.trials, plan)
+
     def leave(self, plans: Mapping[str, Plan], scores: Mapping[str, Score], default: str) -> None:
         """Leave these plans alone, and tell of what was given to all plans that none of these has."""
         self.plans, self.scores, self.default = dict(plans), dict(scores), default

@@ -237,9 +237,11 @@ def calibrate(
         corrects |= chosen.fits_correction and SCHEDULE in learn
         fewest, limit = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
         settings = {
-            "model": artifact.manifest.model_identity[:16],
+            # Of what replaces no plans, these too: what is learned is learned for one of them.
+            "model": (artifact.manifest.model_identity if anew else artifact.manifest.identity)[:16],
             "trajectories": digest_of(episodes),
             "budget": goal.record(),
+            "threads": goal.threads if chooses else 1,
             "learn": [row.name for row in rows],
             "strategy": strategy,
             "seed": seed,
@@ -273,6 +275,8 @@ def calibrate(
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.leave(frontier.plans, frontier.scores, SCHEDULE)
+            else:
+                kept.judge_changed(artifact.plans)
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
         chosen_within = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(

@@ -228,6 +228,14 @@ def test_killed_at_random_moments_and_resumed_it_ends_the_same(
     assert {p.name: p.read_bytes() for p in directory.iterdir()} == {p.name: p.read_bytes() for p in own.iterdir()}
 
 
+def test_what_was_timed_with_other_threads_is_not_gone_on_with(directory: Path, recording: Path, timed: None) -> None:
+    how: dict[str, Any] = {"learn": ("loops",), "max_distance": 0.4, "progress": False}
+    with killed():
+        calibrate(directory, [recording], **how)
+    with pytest.raises(CalibrationError, match="other settings: threads was 1, now 2"):
+        calibrate(directory, [recording], threads=2, resume=True, **how)
+
+
 def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> None:
     with pytest.raises(CalibrationError, match="a schedule or loops; found both"):
         calibrate(directory, [recording], learn=("schedule", "loops"), progress=False)

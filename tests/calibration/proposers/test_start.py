@@ -107,10 +107,9 @@ def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatc
         found = first(Start(request(margin=margin)), trials, plan)
         assert described(found) == expected
         assert (found.name, found.margin, found.notes["steps"]) == (NAME, margin, expected[0])
-    assert [described(one) for one in proposed(Start(request(margin=1.25)), trials, plan)] == [
-        (3, [0, 1]),
-        (3, [0, 1, 2]),
-    ]
+    refused = Start(request(margin=1.25))
+    assert [described(one) for one in proposed(refused, trials, plan)] == [(3, [0, 1]), (3, [0, 1, 2])]
+    assert refused.told == "", "no call begins so"
     with pytest.raises(CalibrationFailedError, match="the last 3 steps are 1 further off at worst, and 0.9 is allowed"):
         proposed(Start(request(margin=0.9)), trials, plan)
 

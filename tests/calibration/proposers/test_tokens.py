@@ -14,7 +14,8 @@ import pytest
 from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.judge import Score, further, judge
+from ttscompile.artifact.write import update_plans
+from ttscompile.calibration.judge import TIMED, WARM_UP, Score, further, judge, timed
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
@@ -24,6 +25,7 @@ from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.plan import DENSE, FULL, Plan, TokenReuse
 from ttscompile.errors import CalibrationFailedError
 from ttscompile.measure.timer import Times
+from ttscompile.runtimes.runtime import Runtime
 from ttscompile.verification import verify
 
 from .trying import proposed, request, trials_of
@@ -87,6 +89,36 @@ def test_tokens_that_no_chosen_plan_reuses_are_said_to_be_of_no_use(
         result = calibrate(own, files, learn=("loops", "tokens"), progress=False, max_minutes=1, max_distance=0.9)
         assert result.told["tokens"].endswith(ends)
         assert any(plan.tokens for plan in load_artifact(own).plans.values()) is (slower == 5.0)
+
+
+def test_a_call_is_timed_after_another_picture(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is timed with all tokens, since a robot may wait for such a call."""
+    (trials, found), predict, counted = tried(folder, recorded(tmp_path / "calls.npz")), Runtime.predict, list[float]()
+
+    def told(self: Runtime, obs: Any, noise: Any, plan: Plan) -> Any:
+        made = predict(self, obs, noise, plan)
+        if plan.tokens is not None:
+            counted.append(made[1].frames.tokens / made[1].frames.of)
+        return made
+
+    monkeypatch.setattr(Runtime, "predict", told)
+    timed([(trials, found.plan), (trials, replace(found.plan, tokens=None))], 1)
+    assert len(counted) == WARM_UP + TIMED
+    whole = counted.pop(WARM_UP)
+    assert max(counted) < 0.5 < whole, "its first picture is whole, and the second of the window is not"
+
+
+def test_a_plan_that_is_given_what_another_learned_is_judged_anew(folder: Path, tmp_path: Path) -> None:
+    artifact, files = load_artifact(folder), recorded(tmp_path / "calls.npz")
+    fields = {"distance": 9.0, "interval": [9.0, 9.0], "sparsity": 0.0, "flops_sparsity": 0.0}
+    record = {"plans": {"other": fields}}
+    update_plans(folder, {**artifact.plans, "other": replace(artifact.default, repair=True)}, FULL, record)
+    result = calibrate(folder, files, learn=("tokens",), progress=False)
+    after = load_artifact(folder)
+    assert after.plans["other"].tokens is not None
+    found = (after.manifest.calibration or {})["plans"]["other"]
+    assert found["distance"] == result.plans["other"].distance == result.plans[FULL].distance
+    assert found["tokens"] < 0.5 and found["distance"] < 1
 
 
 def test_what_does_not_hold_on_other_episodes_is_told(

@@ -22,6 +22,7 @@ from ttscompile.artifact.files import describe
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import MANIFEST
 from ttscompile.artifact.view import View, view_of
+from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.calibration.proposers import weights as student
@@ -239,6 +240,10 @@ def test_what_was_interrupted_is_not_taken_for_something_else(copied: Path, reco
         train(copied, recording)
     with pytest.raises(CalibrationError, match="that was interrupted had other settings: rank was 4, now 2"):
         train(copied, recording, rank=2, resume=True)
+    artifact = load_artifact(copied)
+    update_plans(copied, artifact.plans, "uniform")
+    with pytest.raises(CalibrationError, match="that was interrupted had other settings: model was"):
+        train(copied, recording, resume=True)  # for another plan than it was begun for
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, WorkerDeadError
+from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, ExecutorError, WorkerDeadError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
 from .simulation import REAL_LIMIT, FakeClock, ScriptedPolicy, World, workers
@@ -289,3 +289,14 @@ def test_an_executor_in_a_forked_process_says_so_even_if_its_lock_is_held_for_ev
     """
     done = program(body, toy_compiled)
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, ["True"] * 6 + ["7"], "")
+
+
+@pytest.mark.parametrize("latency", ["x", None, -0.1, float("nan")])
+def test_a_latency_that_is_none_is_refused(latency: Any) -> None:
+    with pytest.raises(ExecutorError, match="the latency of plan 'dense' must be a number, of seconds; found"):
+        AsyncExecutor(ScriptedPolicy(FakeClock()), 10, latencies={"dense": latency})
+
+
+def test_no_guard_is_none() -> None:
+    with pytest.raises(ExecutorError, match="the guard must be GuardLimits; found None"):
+        AsyncExecutor(ScriptedPolicy(FakeClock()), 10, ExecutorSettings(guard=None), latencies=LATENCIES)  # type: ignore[arg-type]

@@ -179,6 +179,26 @@ def test_a_compiled_policy_that_hangs_delays_nobody_and_frames_it_missed_end_its
     assert (original.resets, compiled.resets) == (1, 1)
 
 
+def test_what_fails_ends_its_own_episode_and_no_other(toys: tuple[Toy, Toy]) -> None:
+    """Calls that wait behind the one that fails have missed its frame; those of the next episode have not."""
+    original, compiled = toys
+    gate = threading.Event()
+    compiled.faults = {0: gate, 1: ZeroDivisionError("scripted")}
+    with closing(Shadow(original, compiled)) as shadow:
+        for number in range(3):
+            shadow.select_action(seen(number))
+        shadow.reset()
+        shadow.select_action(seen(3))
+        gate.set()
+        drained(shadow).select_action(seen(4))
+        shadow.reset()
+        shadow.select_action({**seen(5), "lock": threading.Lock()})  # no copy of it can be made
+        shadow.select_action(seen(6))
+    found = shadow.report()
+    assert compiled.calls == [0, 1, 3, 4]
+    assert (found.calls, found.compared, found.failed, found.dropped) == (7, 3, 2, 2)
+
+
 def test_the_observation_is_copied_and_what_belongs_to_the_plans_stays_with_the_original(toys: tuple[Toy, Toy]) -> None:
     original, compiled = toys
     original.info = compiled.info = SimpleNamespace()  # type: ignore[attr-defined]

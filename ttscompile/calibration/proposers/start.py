@@ -56,9 +56,9 @@ class Start(Proposer):
             off, limits[steps] = further(judge(holding(trials, one), one.plan, LEARNED), score)
             trials.bar.update(number + 1, f"{steps} steps: {off:.3g} further", clock.left())
             if limits[steps] <= self.margin:
-                self.told = f"calls but an episode's first begin with the chunk before, in the last {steps} steps"
                 kept = yield replace(one, notes={"steps": steps, "further": off}, margin=self.margin)
                 if kept:
+                    self.told = f"calls but an episode's first begin with the chunk before, in the last {steps} steps"
                     return
         if min(limits.values()) > self.margin:
             least = min(limits, key=limits.__getitem__)
