@@ -213,6 +213,20 @@ def test_weights_that_are_there_once(build: Callable[..., tuple[Any, Any]], two_
         assert all(torch.equal(found[key], expected[key]) for key in expected)
 
 
+def test_keys_of_any_name(build: Callable[..., tuple[Any, Any]], two_cameras: Payload) -> None:
+    """An observation may have a name with dashes, slashes and blanks, as the original's dictionaries may."""
+    names = {"wrist": "images/wrist cam", "pos": "arm-pos", "front": "cam-front"}
+    meta = copy.deepcopy(two_cameras["cfg"]["policy"]["shape_meta"])
+    meta["obs"] = {names[key]: each for key, each in meta["obs"].items()}
+    weights = two_cameras["state_dicts"]["ema_model"]
+    parts = {key: [names.get(part, part) for part in key.split(".")] for key in weights}
+    renamed = {".".join(parts[key]): value for key, value in weights.items()}
+    found, spec = build(renamed, without=".", shape_meta=meta)
+    expected = build()[0].state_dict()
+    assert list(spec.observations) == list(names.values())
+    assert all(torch.equal(value, expected[key]) for key, value in found.state_dict().items())
+
+
 def test_the_grid_of_half_precision_is_exact(build: Callable[..., tuple[Any, Any]], two_cameras: Payload) -> None:
     """The grid of the spatial softmax was rounded with the weights, and is known without them."""
     meta, grid = copy.deepcopy(two_cameras["cfg"]["policy"]["shape_meta"]), SpatialSoftmax(4, 4)

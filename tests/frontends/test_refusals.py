@@ -82,6 +82,8 @@ NAMES = [
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
     ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
+    ("MyDiffusionUnetImagePolicy", r".*one of these renamed\. .* the name of that class at the end of cfg\.policy\._t"),
+    ("RobotPolicy", r".*kind\. If its class adds nothing .* cfg\.policy\._target_\. Otherwise: if it denoises: Build"),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
 ]
 

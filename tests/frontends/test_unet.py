@@ -169,6 +169,20 @@ def test_the_centre_is_looked_at(build: Build) -> None:
     assert found == {(4, 8, 36, 35)}
 
 
+def test_sizes_of_each_camera(build: Build) -> None:
+    """They may stand by key, as the original takes them."""
+    sizes = {
+        "crop_shape": {"wrist": [36, 35], "front": [20, 30]},
+        "resize_shape": {"wrist": [45, 50], "front": [44, 50]},
+    }
+    module, _ = build("images", encoder=sizes)
+    front, wrist = module.encoder.cameras
+    assert (front.geometry.size, wrist.geometry.size) == ((20, 30), (36, 35))
+    assert (front.geometry.top, wrist.geometry.top) == (12, 4)
+    with pytest.raises(CheckpointError, match=r"obs_encoder\.crop_shape\.front is None; expected \[height, width\]"):
+        build("images", encoder={"crop_shape": {"wrist": [36, 35]}})
+
+
 _GET_RESNET = {"_target_": "a.get_resnet", "name": "resnet50"}
 
 

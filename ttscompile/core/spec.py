@@ -5,6 +5,7 @@ Nothing here imports torch; the same records are written to the artifact and rea
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -32,6 +33,8 @@ COMMITTED = "committed"
 
 WITHOUT = "without"
 """In ``PolicySpec.source``: the cameras of the checkpoint that were left out, with commas between."""
+
+_KEY = re.compile(r"\w+([./ -]\w+)*")
 
 
 @dataclass(frozen=True)
@@ -178,10 +181,10 @@ class PolicySpec:
         taken = {self.sample_argument, self.timestep_argument, *[COMMITTED] * bool(self.trained_prefix)}
         for key in self.observations:
             argument = self.arguments[key]
-            if argument in taken or not all(part.isidentifier() for part in key.split(".")):
+            if argument in taken or not _KEY.fullmatch(key):
                 raise SpecError(
-                    f"observation key {key!r} must be an identifier, or several with dots between them, and its"
-                    f" argument {argument!r} none of {sorted(taken)}."
+                    f"observation key {key!r} must be letters, digits and _, with single . / - or blanks between them,"
+                    f" and its argument {argument!r} none of {sorted(taken)}."
                 )
             taken.add(argument)
         horizon, channels = self.sample

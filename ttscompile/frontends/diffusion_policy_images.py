@@ -164,7 +164,7 @@ def _view(
         raise settings.error(
             f"shape_meta.obs.{key}.shape is {list(shape)}; expected {COLOURS} channels of an RGB image"
         )
-    resize, crop = (settings.size(name, None, MOST_PIXELS) for name in ("resize_shape", "crop_shape"))
+    resize, crop = (_size(settings, name, key) for name in ("resize_shape", "crop_shape"))
     whole = resize or (height, width)
     if whole[0] < height or whole[1] < width:
         warnings.warn(
@@ -183,3 +183,10 @@ def _view(
     scales = tuple(scale / each for each in deviation)
     offsets = tuple((offset - middle) / each for middle, each in zip(mean, deviation, strict=True))
     return View(height, width, resize, crop, scales, offsets)
+
+
+def _size(settings: Settings, name: str, key: str) -> tuple[int, int] | None:
+    """One for all cameras, or of each by its key."""
+    if not isinstance(settings.values.get(name), dict):
+        return settings.size(name, None, MOST_PIXELS)
+    return settings.part(name).size(key, [], MOST_PIXELS)

@@ -23,7 +23,7 @@ from .saved_weights import as_float32, require_weights
 from .settings import Settings, is_shape
 
 _OTHER_KEY = re.compile(
-    r"(model\.)?_dummy_variable|mask_generator\..*|normalizer\.params_dict\.\w+\.(scale|offset|input_stats\.\w+)"
+    r"(model\.)?_dummy_variable|mask_generator\..*|normalizer\.params_dict\.[^.]+\.(scale|offset|input_stats\.\w+)"
 )
 _MASKS = frozenset({"model.mask", "model.memory_mask"})
 _COUNTERS = ".num_batches_tracked"  # of batch norm, whole numbers, used by training only

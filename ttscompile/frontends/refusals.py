@@ -18,6 +18,10 @@ from .settings import read_json
 
 _BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
 _HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
+_RENAMED = (
+    "If its class adds nothing to the original's that changes actions, save it again with the name of that class at the"
+    " end of cfg.policy._target_. Otherwise:"
+)
 _DITA = "Give the .pth file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
@@ -66,10 +70,10 @@ POLICIES = (
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
     Refusal(
         r"transformer|unet",
-        "a diffusion policy with another observation encoder than those that are read",
-        f"{_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",
+        "a diffusion policy with another observation encoder than those that are read, or one of these renamed",
+        f"{_RENAMED} {_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",
     ),
-    Refusal(r"", "a policy of its own kind", f"If it denoises: {_BUILD}."),
+    Refusal(r"", "a policy of its own kind", f"{_RENAMED} if it denoises: {_BUILD}."),
 )
 """By the class name of a configuration's ``policy``, in lower case."""
 

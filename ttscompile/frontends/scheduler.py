@@ -87,7 +87,7 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
             f"{where} is {own or 'of no class'}; expected one of {', '.join(_NAMES)}. To run on"
             f" its betas with another sampler, ask for sampler={' or '.join(map(repr, DIFFUSION_SAMPLERS))}."
         )
-    given = {key: value for key, value in settings.items() if key != "_target_"}
+    given = {key: value for key, value in settings.items() if not key.startswith("_")}  # as diffusers does
     old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
     if old is not None:
         predicts = "epsilon" if old else "sample"
@@ -165,7 +165,10 @@ def _step_arguments(
             raise CheckpointError(f"cfg.policy.predict_epsilon contradicts {found}.")
     unknown = sorted(set(kept) - {"eta", "use_clipped_model_output"})
     if unknown:
-        raise CheckpointError(f"cfg.policy has settings that are not known: {', '.join(unknown)}.")
+        raise CheckpointError(
+            f"cfg.policy has settings that are not known: {', '.join(unknown)}. Where only the training reads them,"
+            " remove them and save the checkpoint again; otherwise use ttscompile.compile_denoiser(module, spec)."
+        )
     Settings(kept, "cfg.policy.").flag("use_clipped_model_output", False)
     if "eta" in kept and not isinstance(kept["eta"], (int, float)):
         raise CheckpointError(f"cfg.policy.eta is {kept['eta']!r}; expected a number.")
