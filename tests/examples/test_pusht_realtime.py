@@ -100,7 +100,8 @@ def test_the_world_goes_on_without_an_action() -> None:
 @pytest.mark.slow
 def test_the_script_writes_statistics_traces_and_a_picture(compiled_pusht: Path, tmp_path: Path) -> None:
     """Of the policy before it is calibrated, which is too slow for this: exit status 1."""
-    result = CliRunner().invoke(main, [str(compiled_pusht), "--hz", "50", "--minutes", "0.05", "-o", str(tmp_path)])
+    args = [str(compiled_pusht), "--hz", "500", "--minutes", "0.05", "-o", str(tmp_path)]  # whatever the machine is
+    result = CliRunner().invoke(main, args)
     assert result.exit_code == 1, result.output
     (run,) = json.loads((tmp_path / "realtime.json").read_text())["runs"]
     assert run["label"] == COMPILED
