@@ -231,7 +231,7 @@ class AsyncExecutor:
 
     @property
     def trouble(self) -> str:
-        """Why no action comes, for whoever watches; empty where some may: also where frames make no window."""
+        """Why no action comes: the policy failed, this was closed, or frames make no window. Else empty."""
         failure = self._worker.failure
         if failure is not None:
             return f"the thread that owns the policy has ended: a call raised {type(failure).__name__}: {failure}"

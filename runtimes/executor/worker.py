@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from functools import partial
+from math import inf, nextafter
 from typing import cast
 
 import numpy as np
@@ -157,7 +158,7 @@ class Worker:
             raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {settings.plans}.")
         else:
             for name in settings.plans:
-                require_number(given[name], f"the latency of plan {name!r}", wanted="of seconds", above=-1e-9)
+                require_number(given[name], f"the latency of plan {name!r}", inf, "of seconds", nextafter(0, -1))
             measured = {name: [given[name]] for name in settings.plans}
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self.feasibility = {name: settings.feasibility(max(measured[name])) for name in settings.tiers}

@@ -301,7 +301,7 @@ def _scored(
 
 
 def _resampled(gaps: Numbers, apart: float) -> Numbers:
-    """The distance with episodes drawn anew, of the mean h of each, or calls of one; the same draws for as many."""
+    """The distance with episodes, or the calls of a single one, drawn anew; the same draws for equally many."""
     drawn = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLED, len(gaps)))
     share = gaps[drawn].mean(1) / max(apart, 1e-12)
     return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .lerobot_processors import Features
+from .lerobot_processors import STATE as STATE, Features
 from .settings import Settings, is_shape
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
+ENVIRONMENT, ACTION = "observation.environment_state", "action"
 
 MOST_PIXELS, MOST_STEPS, MOST = 4096, 4096, 2**16
 _MOST_CAMERAS = 64

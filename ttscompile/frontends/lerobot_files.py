@@ -46,7 +46,7 @@ def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
     }
     features = {renamed.get(key, key): dict(feature) for key, feature in entries["input_features"].items()}
     for key in [key for key in features if features[key]["type"] == "STATE" and key in spec.observations]:
-        features[key]["shape"] = list(spec.observations[key].shape[1:])  # of a policy trained on, not its base's
+        features[key]["shape"] = list(spec.observations[key].shape[1:])  # the robot's, where config.json has a base's
     config = {
         "type": "ttscompile",
         "n_obs_steps": max(one.frames or 1 for one in spec.observations.values()),

@@ -60,9 +60,11 @@ STATISTICS = {
 _NEUTRAL = {"mean": 0.0, "std": 1.0, **dict.fromkeys(("min", "q01", "q10"), -1.0)}
 """What evo1 pads statistics with; 1 for the others."""
 
-_STATE, _PADS_STATE = "observation.state", ("pi0", "pi05", "smolvla", "xvla")
-"""Types whose network takes states of several widths. Trained on from a base, a policy keeps the base's width in its
-configuration, and only the statistics say how many numbers the state of its robot has."""
+STATE = "observation.state"
+
+_PADS_STATE = ("pi0", "pi05", "smolvla", "xvla")
+"""Types whose network takes states of several widths. A policy that was fine-tuned from a base keeps the base's width
+in its configuration, and only the statistics say how many numbers the state of its robot has."""
 
 _LEAST_STD = 1e-30
 """Stands for a standard deviation of zero, which gives the mean whatever the network says."""
@@ -195,9 +197,9 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
         raise CheckpointError(f"{directory / POSTPROCESSOR}: found {', '.join(order)}; expected {', '.join(later)}.")
     padded = any(step["registry_name"] in _PAD for step in before)
     width: int | None = None
-    if kind in _PADS_STATE and _STATE in features:
-        width = _state_width(directory, before) or features[_STATE][1][0]
-        features = {**features, _STATE: ("STATE", (width,))}
+    if kind in _PADS_STATE and STATE in features:
+        width = _state_width(directory, before) or features[STATE][1][0]
+        features = {**features, STATE: ("STATE", (width,))}
     return Processors(
         renamed=renamed_observations(directory, before, features),
         normalizers=_statistics(directory, before, NORMALIZE, features, padded),
@@ -219,7 +221,7 @@ def _state_width(directory: Path, steps: list[dict[str, Any]]) -> int | None:
     """Numbers of the state in the data, by its statistics, which are saved whether or not it is normalised."""
     step = next((step for step in steps if step["registry_name"] == NORMALIZE), None)
     tensors = {} if step is None else state_of(directory, step)
-    found = (tensors.get(f"{_STATE}.{name}") for name, _ in STATISTICS.values())
+    found = (tensors.get(f"{STATE}.{name}") for name, _ in STATISTICS.values())
     return next((len(value) for value in found if value is not None and value.ndim == 1), None)
 
 
@@ -233,7 +235,7 @@ def relative_entries(
     enabled = [each.flag("enabled", False) for each in own]
     if not any(enabled):
         return ()
-    (count,), state = features["action"][1], features.get(_STATE, ("", (0,)))[1][0]
+    (count,), state = features["action"][1], features.get(STATE, ("", (0,)))[1][0]
     names, excluded = own[0].values.get("action_names"), own[0].values.get("exclude_joints") or []
     if enabled != [True, True] or any(name in _CHANGES for name in orders[0][: orders[0].index(_RELATIVE)]):
         told = f"expected {_RELATIVE} before the state is changed, and {_ABSOLUTE}, both enabled or none"
