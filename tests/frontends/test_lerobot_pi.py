@@ -65,7 +65,7 @@ def test_a_camera_that_the_robot_lacks(directory: Path, kind: str, golden: Mappi
 
 
 @pytest.mark.parametrize("width", [pis.PADDED, 2])
-def test_a_policy_that_was_trained_on_from_a_base(
+def test_a_policy_that_was_fine_tuned_from_a_base(
     directory: Path, kind: str, golden: Mapping[str, Array], width: int
 ) -> None:
     """Its configuration keeps the width of the base's state; the robot's is that of the statistics."""
