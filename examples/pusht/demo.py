@@ -6,7 +6,7 @@ The policy pushes a T-shaped block onto its goal; LeRobot's own code trained it,
 action models are. The demo records 16 episodes, has ``ttscompile build`` find the fastest plan, drives 2,400
 paired episodes with it and with the original, and times it beside PyTorch. It ends with a verdict: equivalent to the
 original within a margin, or not. If 2,400 episodes do not show that it is, the demo drives as many again, and if those
-do not, ``safe`` as well. That takes 10 to 20 minutes on 2 cores; everything it makes is in ``build/pusht/POLICY``.
+do not, ``safe`` as well. That takes 7 to 20 minutes on 2 cores; everything it makes is in ``build/pusht/POLICY``.
 """
 
 from __future__ import annotations
