@@ -54,18 +54,27 @@ def policy_of(folder: Path) -> str:
     return found[0]
 
 
-def observed(folder: Path) -> tuple[dict[str, Array], Noise]:
-    """One observation of the policy, all of whose tokens count, and the noise of a call.
+def observed(folder: Path, words: int | None = None) -> tuple[dict[str, Array], Noise]:
+    """One observation of the policy, and the noise of a call.
 
     The state is between -1 and 1, since vla.cpp clips some policies' there.
+
+    Args:
+        folder: with the artifact.
+        words: how many tokens of the instruction count; None for all.
     """
     obs, noise = call(load_artifact(folder / "compiled").manifest.spec)
     made = {key: np.ones_like(value) for key, value in obs.items() if key.endswith("mask")}
+    if words is not None:
+        for mask in made.values():
+            mask[..., words:] = False
     made |= {key: value.clip(-1, 1) for key, value in obs.items() if key == STATE}
     return obs | made, noise
 
 
-def race(folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, fp32: bool = True) -> None:
+def race(
+    folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, fp32: bool = True, words: int | None = None
+) -> None:
     """Time calls of everybody, in turn, and print medians; and how far actions are from ours in fp32.
 
     Args:
@@ -74,9 +83,10 @@ def race(folder: Path, rivals: Mapping[str, Rival], threads: int, rounds: int, f
         threads: of ours.
         rounds: that are counted.
         fp32: whether ours in fp32 runs, too, which takes memory; actions are then compared.
+        words: see ``observed``.
     """
     artifact = load_artifact(folder / "compiled")
-    (obs, noise), rng, bits = observed(folder), np.random.default_rng(1), lowered(artifact)
+    (obs, noise), rng, bits = observed(folder, words), np.random.default_rng(1), lowered(artifact)
     plans = {name: plans_of(artifact, name, COMPUTED) for name in (("fp32", bits) if fp32 else (bits,))}
     policies = {name: open_policy(artifact, threads=threads, plan=own["dense"]) for name, own in plans.items()}
     few, reused = list(plans_of(artifact, bits, COMPUTED, REUSE).items())[-1]

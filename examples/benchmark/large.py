@@ -11,6 +11,7 @@
     python examples/benchmark/large.py --vla-jepa                               # LeRobot's vla_jepa, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
+    python examples/benchmark/large.py --octo                                   # Octo-small 1.5, whole
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 STEPS = 4
 
-WHOLE = ("smolvla", "pi0", "pi05", "groot", "evo1", "vla_jepa", "xvla", "rdt")
+WHOLE = ("smolvla", "pi0", "pi05", "groot", "evo1", "vla_jepa", "xvla", "rdt", "octo")
 """Policies that are compiled from what is saved of them; LeRobot's are whole."""
 
 MOST_FILES = 3
@@ -137,6 +138,7 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     """Where a whole policy is saved, which is written unless it is there; and the instruction that is compiled in."""
     import large_evo1
     import large_groot
+    import large_octo
     import large_pi0
     import large_rdt
     import large_smolvla
@@ -146,7 +148,7 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     directory = folder / name
     if not directory.exists():
         pi05 = partial(large_pi0.save, adaptive=True)
-        others = (large_groot, large_evo1, large_vla_jepa, large_xvla, large_rdt)
+        others = (large_groot, large_evo1, large_vla_jepa, large_xvla, large_rdt, large_octo)
         saves = [large_smolvla.save, large_pi0.save, pi05, *(each.save for each in others)]
         dict(zip(WHOLE, saves, strict=True))[name](directory)
     return directory, large_evo1.TASK if name in ("evo1", "groot", "vla_jepa") else None
@@ -167,7 +169,7 @@ def convert_clip(folder: Path) -> None:
 
 
 def run_whole(folder: Path, rounds: int, name: str) -> None:
-    """See ``large_calls``; two steps are computed. No tokens can be reused of xvla's encoder, nor of RDT's, outside."""
+    """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of xvla, Octo and RDT."""
     import large_calls
     import large_smolvla
 
@@ -177,14 +179,15 @@ def run_whole(folder: Path, rounds: int, name: str) -> None:
     directory, task = saved(folder, name)
     module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
     original = large_smolvla.eager(module, _vision(module), spec)
-    large_calls.compare(folder, "vision, prefix, loop", original, spec, 2, rounds)
-    if name not in ("xvla", "rdt"):
+    first = "words" if name == "octo" else "vision"
+    large_calls.compare(folder, f"{first}, prefix, loop", original, spec, 2, rounds)
+    if name not in ("xvla", "rdt", "octo"):
         large_calls.reusing(folder, spec, 2, rounds + 2)
 
 
 def _vision(module: nn.Module) -> nn.Module:
-    """The image encoder of a vision-language-action model; of RDT the adaptor of its tokens."""
-    names = ("vision_model", "vision_tower", "visual", "encoder.image")
+    """The image encoder of a vision-language-action model; of RDT the adaptor of its tokens, and of Octo its T5."""
+    names = ("vision_model", "vision_tower", "visual", "encoder.image", "hf_model")
     return next(one for name, one in module.named_modules() if name.endswith(names))
 
 
@@ -247,6 +250,7 @@ def main() -> None:
     parser.add_argument("--vla-jepa", action="store_true", help="LeRobot's vla_jepa, likewise")
     parser.add_argument("--xvla", action="store_true", help="LeRobot's xvla, likewise")
     parser.add_argument("--rdt", action="store_true", help="RDT-170M, likewise")
+    parser.add_argument("--octo", action="store_true", help="Octo-small 1.5, likewise")
     parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")

@@ -20,6 +20,7 @@ from ttscompile.frontends.lerobot_smolvla import RELEASED, read_config
 from ttscompile.frontends.lerobot_vla import read_vla_config
 from ttscompile.frontends.settings import Settings
 from ttscompile.frontends.smolvla import SmolVLA
+from ttscompile.runtimes.random_calls import random_calls
 
 MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 STATE, CAMERAS, ACTION = "observation.state", ("observation.images.front", "observation.images.wrist"), "action"
@@ -116,9 +117,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def call(spec: PolicySpec) -> tuple[dict[str, np.ndarray], Noise]:
     """One observation, and the noise of a call."""
-    rng = np.random.default_rng(0)
-    noise = Noise(spec.draw_initial(rng, (1, *spec.sample)))
-    return {key: each.draw(rng) for key, each in spec.observations.items()}, noise
+    return random_calls(spec, 1, seed=0)[0]
 
 
 def eager(module: nn.Module, vision: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:

@@ -1,4 +1,4 @@
-"""Policies beside other engines: what is timed and told, and what vla.cpp is given."""
+"""Policies beside other engines: what is timed and told, and what they are given."""
 
 import ctypes
 import json
@@ -8,16 +8,19 @@ from typing import Any
 
 import beside
 import numpy as np
+import onnx
 import pytest
 import released_evo1
 import released_groot
+import tether_beside
 import torch
 import vla_cpp
 from beside import Array
 from click.testing import CliRunner
 from large_evo1 import STEPS, TASK
 from large_groot import BASE
-from large_smolvla import STATE
+from large_smolvla import CAMERAS, STATE
+from onnx import TensorProto, helper
 from safetensors.torch import save_file
 
 from tests.families import cameras
@@ -82,6 +85,53 @@ def test_the_state_is_within_what_vla_cpp_clips(once: Once, tmp_path: Path, monk
     monkeypatch.setattr(beside, "call", lambda _: (drawn, Noise(np.zeros(1, np.float32))))
     obs, _ = beside.observed(tmp_path)
     assert obs[STATE].tolist() == [-1.0, 0.5, 1.0] and obs["tokens.mask"].all()
+
+
+def test_as_many_words_count_as_another_engine_reads(
+    once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
+    drawn = {"tokens.mask": np.array([[True, False, True, True]])}
+    monkeypatch.setattr(beside, "call", lambda _: (drawn, Noise(np.zeros(1, np.float32))))
+    assert beside.observed(tmp_path, 2)[0]["tokens.mask"].tolist() == [[True, True, False, False]]
+
+
+def exported(path: Path) -> Path:
+    """As Tether writes a model, in small: noise, plus the number of cameras that are there, plus the first word."""
+    shapes: dict[str, tuple[int, list[int]]] = {
+        **{f"img_cam{i}": (TensorProto.FLOAT, [1, 3, 4, 4]) for i in (1, 2, 3)},
+        **{f"mask_cam{i}": (TensorProto.BOOL, [1]) for i in (1, 2, 3)},
+        "lang_tokens": (TensorProto.INT64, [1, 2]),
+        "lang_masks": (TensorProto.BOOL, [1, 2]),
+        "state": (TensorProto.FLOAT, [1, 8]),
+        "noise": (TensorProto.FLOAT, [1, 5, 8]),
+    }
+    summed = [*(f"mask_cam{i}" for i in (1, 2, 3)), "lang_tokens", "lang_masks", *(f"img_cam{i}" for i in (1, 2, 3))]
+    nodes = []
+    for name in summed:
+        nodes.append(helper.make_node("Cast", [name], [f"{name}.float"], to=TensorProto.FLOAT))
+        nodes.append(helper.make_node("ReduceSum", [f"{name}.float"], [f"{name}.sum"], keepdims=0))
+    nodes.append(helper.make_node("Sum", ["noise", "state.row", *(f"{name}.sum" for name in summed)], ["actions"]))
+    nodes.insert(0, helper.make_node("Unsqueeze", ["state", "axes"], ["state.row"]))
+    values = [helper.make_tensor_value_info(name, kind, shape) for name, (kind, shape) in shapes.items()]
+    made = helper.make_tensor_value_info("actions", TensorProto.FLOAT, [1, 5, 8])
+    axes = helper.make_tensor("axes", TensorProto.INT64, [1], [1])
+    graph = helper.make_graph(nodes, "call", values, [made], [axes])
+    path.parent.mkdir()
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 19)], ir_version=9), path)
+    return path
+
+
+def test_tether_is_given_two_cameras_of_three_and_as_many_words_as_it_reads(tmp_path: Path) -> None:
+    rival = tether_beside.Tether(exported(tmp_path / tether_beside.MODEL), threads=1)
+    assert rival.words == 2
+    pictures = {key: np.full((1, 1, 3, 4, 4), 0.25, np.float32) for key in CAMERAS}
+    obs = {**pictures, STATE: np.full((1, 6), 2.0, np.float32), "language.tokens": np.array([[10, 20, 40]])}
+    noise = np.arange(40, dtype=np.float32).reshape(1, 5, 8)
+    actions, seconds = rival.predict(obs, Noise(noise))
+    told = 2 + 30 + 2 + 2 * 48 * -0.5 - 48  # cameras, words, all of which count, and the pixels: the third is black
+    state = np.array([2.0] * 6 + [0.0] * 2)
+    assert np.allclose(actions, noise[0] + state + told) and len(seconds) == 1
 
 
 def test_the_structures_have_the_sizes_of_the_interface() -> None:

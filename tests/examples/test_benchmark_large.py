@@ -1,10 +1,11 @@
-"""Policies of ``large.py``: what is written of one is what lerobot's frontend reads; at small sizes here."""
+"""Policies of ``large.py``: what is written of one is what its frontend reads; at small sizes here."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import large
+import large_octo
 import large_pi0
 import large_qwen3_vl
 import large_smolvla
@@ -15,6 +16,7 @@ from safetensors.torch import load_file
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
+from ttscompile.policies.t5 import Words
 
 
 @pytest.fixture(autouse=True)
@@ -41,9 +43,16 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "num_attention_heads": 16,
     }
     monkeypatch.setattr(large_pi0, "VISION", replace(large_pi0.VISION, **seen, image_size=224, patch_size=56))
+    octo = large_octo.config()
+    stems = {name: replace(stem, features=(32,) * 4, out=24) for name, stem in octo.stems.items()}
+    words, head = Words("language", 16, 24, 16, 24, 2, 2, 16, 32), replace(octo.head, width=16)
+    octo = replace(octo, width=32, hidden=48, layers=2, heads=4, words=words, head=head, stems=stems)
+    monkeypatch.setattr(large_octo, "config", lambda: octo)
 
 
-@pytest.mark.parametrize(("name", "shape"), [("vla_jepa", (1, 7, 6)), ("pi0", (1, 50, 32)), ("pi05", (1, 50, 32))])
+@pytest.mark.parametrize(
+    ("name", "shape"), [("vla_jepa", (1, 7, 6)), ("pi0", (1, 50, 32)), ("pi05", (1, 50, 32)), ("octo", (1, 4, 7))]
+)
 def test_what_is_written_is_read(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
     directory, task = large.saved(tmp_path, name)
     module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
