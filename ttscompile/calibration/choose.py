@@ -6,7 +6,7 @@ from typing import Any
 
 from ..core.plan import DENSE, FULL, Plan
 from ..errors import CalibrationFailedError
-from ..measure.points import ALIKE, Point, best_plan, efficient
+from ..measure.points import ALIKE, Point, best_plan, efficient, fastest
 from ..measure.timer import Times
 from .judge import Score, judge, timed
 from .kept import Kept
@@ -40,8 +40,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
 
     The default is ``best_plan`` of those within ``Request.farthest``, where those within ``Request.bound`` are near
     enough; there is a warning if it is not one of them. ``schedule`` is the name of the default, ``safe`` that of the
-    fastest plan that is near enough and a good deal nearer, and ``fast`` that of the next faster one that is not too
-    far.
+    fastest plan that is near enough and a good deal nearer, and ``fast`` that of the fastest of all that are kept, where
+    it saves more than what counts as equally fast.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
@@ -74,9 +74,9 @@ def choose(kept: Kept, request: Request) -> Frontier:
     wanted = SAFER * scores[chosen].distance
     if nearer := [name for name in others if name in allowed and scores[name].distance <= wanted]:
         named[min(nearer, key=lambda name: times[name].median)] = SAFE
-    faster = [name for name in others if ALIKE * times[name].median < times[chosen].median]
-    if within := [name for name in faster if scores[name].distance <= request.farthest]:
-        named[max(within, key=lambda name: times[name].median)] = FAST
+    faster = {name: times[name].median for name in allowed if ALIKE * times[name].median < times[chosen].median}
+    if faster:
+        named[fastest(faster, {name: scores[name].distance for name in faster})] = FAST
     plans = {named[name]: entered[name] for name in named}
     plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
     tried = [

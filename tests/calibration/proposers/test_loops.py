@@ -286,10 +286,10 @@ def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, record
         "e": (0.05, 0.60, 5.0),
         "f": (0.16, 0.20, 3.5),  # slower than c and further
     }
-    assert chosen(monkeypatch, trials, figures, bound=0.25) == {"schedule": "b", "fast": "a", "safe": "d"}
+    assert chosen(monkeypatch, trials, figures, bound=0.25) == {"schedule": "b", "safe": "d"}
     # Where a fifth of the time makes it nearer, it is nearer; what is safe has to be near enough itself, as e is not.
     closer = figures | {"g": (0.10, 0.20, 2.3)}
-    assert chosen(monkeypatch, trials, closer, bound=0.25) == {"schedule": "g", "fast": "a"}
+    assert chosen(monkeypatch, trials, closer, bound=0.25) == {"schedule": "g"}
     assert chosen(monkeypatch, trials, closer | {"g": (0.1, 0.2, 2.5)}, bound=0.25)["schedule"] == "b"
     # By a deadline the nearest that keeps it; the nearest of all, e, is not surely near enough.
     assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=3.2)["schedule"] == "c"
@@ -306,10 +306,14 @@ def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(
     trials = trials_of(directory, [recording])
     figures = {"a": (0.20, 0.25, 1.0), "b": (0.12, 0.20, 2.0), "c": (0.08, 0.12, 4.0), "d": (0.01, 0.02, 9.0)}
     bounds = {"bound": 0.1, "farthest": 0.25}
-    assert chosen(monkeypatch, trials, figures, **bounds) == {"schedule": "c", "fast": "b", "safe": "d"}
+    assert chosen(monkeypatch, trials, figures, **bounds) == {"schedule": "c", "fast": "a", "safe": "d"}
+    # What is fast is surely near enough for that, and of those that are as fast it is the nearest.
+    surely = figures | {"a": (0.20, 0.60, 1.0)}
+    assert chosen(monkeypatch, trials, surely, **bounds)["fast"] == "b"
+    assert chosen(monkeypatch, trials, figures | {"e": (0.15, 0.2, 1.1)}, **bounds)["fast"] == "e"
     # One that may be a half further than the bound is as far as some that have lost successes.
     doubtful = figures | {"c": (0.08, 0.15, 4.0)}
-    assert chosen(monkeypatch, trials, doubtful, **bounds) == {"schedule": "d", "fast": "c"}
+    assert chosen(monkeypatch, trials, doubtful, **bounds) == {"schedule": "d", "fast": "a"}
     # Without it, and where it does not keep the deadline, the nearest is taken, and said to be far (``chosen``).
     far = {name: figures[name] for name in "ab"}
     assert chosen(monkeypatch, trials, far, **bounds) == {"schedule": "b", "fast": "a"}
