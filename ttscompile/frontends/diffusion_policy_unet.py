@@ -116,7 +116,7 @@ def behind_encoder(
         known: settings of ``cfg.policy`` that were read for encoder and network.
     """
     as_global = saved.settings.flag("obs_as_global_cond", True)
-    (n_obs_steps,) = saved.sizes("n_obs_steps")
+    n_obs_steps = saved.settings.number("n_obs_steps")
     config = UNetConfig(
         input_dim=action_dim + (0 if as_global else width),
         global_cond_dim=width * n_obs_steps if as_global else None,
