@@ -248,11 +248,9 @@ class ConditionEncoder(lerobot.Measured):
         """Observations ``[B, ...]`` by name -> ``[B, C]``."""
         measured = self.measured(observations)
         images = [measured[key] for key in self.cameras]
-        tokens, mask = (
-            (self.task_tokens, self.task_mask)
-            if self.has_task
-            else (observations[name.replace(".", "_")] for name in (lerobot.TOKENS, lerobot.MASK))
-        )
+        tokens, mask = (observations.get(name.replace(".", "_")) for name in (lerobot.TOKENS, lerobot.MASK))
+        if self.has_task:
+            tokens, mask = self.task_tokens, self.task_mask
         return self.observation_encoder(measured[STATE], images, tokens, mask)  # type: ignore[no-any-return]
 
 
