@@ -55,18 +55,15 @@ def _network(config: TransformerConfig, weights: Weights) -> TransformerForDiffu
     """The network of a configuration, if the checkpoint has weights for one of its size."""
     width, tokens = config.n_emb, config.trunk_tokens
     channels = max(config.input_dim, config.output_dim, config.cond_dim)
-    parts.require_room(
-        {
-            "n_emb": width * width,
-            "input_dim, output_dim or cond_dim": width * channels,
-            "horizon": max(width * tokens, tokens * tokens if config.causal_attn else 0),
-            "n_obs_steps": max(
-                width * config.memory_tokens, tokens * config.memory_tokens if config.causal_attn else 0
-            ),
-            "n_layer or n_cond_layers": max(config.n_layer, config.n_cond_layers) * width,
-        },
-        weights,
-    )
+    row = max(width, tokens if config.causal_attn else 0)  # of a position, or of a causal mask
+    needed = {
+        "n_emb": width * width,
+        "input_dim, output_dim or cond_dim": width * channels,
+        "horizon": row * tokens,
+        "n_obs_steps": row * config.memory_tokens,
+        "n_layer or n_cond_layers": max(config.n_layer, config.n_cond_layers) * width,
+    }
+    parts.require_room(needed, weights)
     return TransformerForDiffusion(config)
 
 

@@ -103,11 +103,8 @@ def _require_whole(backbone: qwen.Backbone, side: int) -> None:
 
 def read_config(base: Settings, model: Settings, processors: GrootProcessors) -> GrootConfig:
     """Sizes and variant, of the entries of the base model and of its backbone."""
-    images, dit = (
-        [(processors.geometry.target,) * 2] * len(processors.cameras),
-        vla.part_of(base, "diffusion_model_cfg"),
-    )
-    language = qwen.read_language(model, base.number("select_layer", 16), images)
+    dit, side = vla.part_of(base, "diffusion_model_cfg"), processors.geometry.target
+    language = qwen.read_language(model, base.number("select_layer", 16), [(side, side)] * len(processors.cameras))
     layers, width = _tower(dit), language.text.width
     mixing = vla.part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
     mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None

@@ -61,7 +61,7 @@ def read_vla_config(
         )
         raise CheckpointError(f"{directory}: {told}. A policy needs a camera that it was trained with.")
     features = {key: each for key, each in config.features.items() if key in kept or key not in config.cameras}
-    return LeRobotConfig(**{**vars(config), "features": features})
+    return replace(config, features=features)
 
 
 def read_vla_processors(config: LeRobotConfig) -> tuple[LeRobotConfig, Processors]:

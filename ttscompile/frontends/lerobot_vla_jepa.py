@@ -157,20 +157,14 @@ def _prompt(
 
 def _template(settings: Settings) -> list[str]:
     """What is before an instruction, after it, and, if actions are asked for, after these."""
-    template, fields = (
-        settings.text("prompt_template", _TEMPLATE, _MOST_LETTERS),
-        ["instruction", "actions", "e_actions"],
-    )
+    fields = ["instruction", "actions", "e_actions"]
     try:
-        parts = list(Formatter().parse(template))
+        parts = list(Formatter().parse(settings.text("prompt_template", _TEMPLATE, _MOST_LETTERS)))
     except ValueError:
         parts = []
     texts, found = [text for text, *_ in parts], [field for _, field, *_ in parts if field is not None]
-    if (
-        any(spec or kind for *_, spec, kind in parts)
-        or found not in (fields, fields[::2])
-        or "\n" in "".join(texts[1:])
-    ):
+    formatted, lines = any(spec or kind for *_, spec, kind in parts), "".join(texts[1:]).split("\n")
+    if formatted or found not in (fields, fields[::2]) or len(lines) > 1:
         expected = "text with {instruction}, {actions} (or not) and {e_actions}, in this order, in a line from there on"
         raise settings.refusal("prompt_template", expected, _TEMPLATE)
     return texts[: len(found)]
