@@ -21,7 +21,8 @@ from .settings import Settings
 COLOURS = 3
 """Channels of an image, which torchvision's ResNets have."""
 
-Size, Colours = tuple[int, int], tuple[float, ...]
+Size = tuple[int, int]
+Colours = tuple[float, ...]
 
 
 class Camera(nn.Module):
