@@ -216,7 +216,7 @@ def _images_encoder(config: dict[str, Any]) -> MultiImageEncoder:
 def _images_weights(encoder: MultiImageEncoder, config: dict[str, Any], seed: int) -> dict[str, torch.Tensor]:
     """Under the names of the original."""
     named = {}
-    for key, network in zip(encoder.views, encoder.networks, strict=False):
+    for key, network in zip(encoder.keys, encoder.networks, strict=False):
         owner = "rgb" if config.get("share_rgb_model") else key
         for name, value in network.state_dict().items():
             named[f"obs_encoder.key_model_map.{owner}.{name}"] = value
