@@ -55,8 +55,7 @@ def build(
     other plans take at most a fifth longer than the fastest, the nearest of them is chosen.
 
     Args:
-        checkpoint: see ``convert``.
-        directory: where the artifact goes; see ``convert``.
+        checkpoint, directory, explain: see ``convert``.
         trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on,
             of a data set on the hub (``frontends.data_set``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
@@ -69,10 +68,7 @@ def build(
         max_minutes: for all but the conversion.
         seed: of everything random.
         resume: go on where the same build was interrupted.
-        observation: see ``calibrate``.
-        progress: see ``calibrate``.
-        ray: see ``calibrate``.
-        explain: see ``convert``.
+        observation, progress, ray: see ``calibrate``.
         of_checkpoint: ``format``, ``task``, ``encoders``, ``without_cameras`` and ``base`` of ``convert``.
 
     Returns:

@@ -39,7 +39,7 @@ from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.frontends.clip import TextConfig, VisionConfig
-from ttscompile.frontends.diffusion_policy_images import MultiImageEncoder, View
+from ttscompile.frontends.diffusion_policy_images import Camera, MultiImageEncoder
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from ttscompile.frontends.resnet import group_norm
@@ -77,9 +77,9 @@ class ResNets(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        view = View(240, 320, None, (216, 288), (2.0,) * 3, (-1.0,) * 3)
-        views = dict.fromkeys(CAMERAS, view)
-        self.encoder = MultiImageEncoder(views, {"state": STATE}, "resnet18", group_norm, False)
+        camera = Camera(240, 320, None, (216, 288), (2.0,) * 3, (-1.0,) * 3)
+        cameras = dict.fromkeys(CAMERAS, camera)
+        self.encoder = MultiImageEncoder(cameras, {"state": STATE}, "resnet18", group_norm, False)
         self.width = TO * self.encoder.width
 
     def forward(self, obs: Mapping[str, Tensor]) -> Tensor:

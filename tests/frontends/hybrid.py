@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile.frontends.diffusion_policy_hybrid import FEATURES, Camera, ObservationEncoder
+from ttscompile.frontends.diffusion_policy_hybrid import FEATURES, CameraEncoder, ObservationEncoder
+from ttscompile.frontends.resnet import group_norm
 from ttscompile.frontends.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 Array = npt.NDArray[np.float32]
@@ -130,11 +131,12 @@ def build_encoder(config: Mapping[str, Any]) -> ObservationEncoder:
     """robomimic's encoder of ``cfg.policy``."""
     obs = config["shape_meta"]["obs"]
     crop = None if config["crop_shape"] is None else tuple(config["crop_shape"])
+    norm = group_norm if config.get("obs_encoder_group_norm", False) else torch.nn.BatchNorm2d
     inputs = {
-        key: Camera(tuple(each["shape"]), crop) if each.get("type") == "rgb" else math.prod(each["shape"])
+        key: CameraEncoder(tuple(each["shape"]), crop, norm) if each.get("type") == "rgb" else math.prod(each["shape"])
         for key, each in obs.items()
     }
-    return ObservationEncoder(inputs, config.get("obs_encoder_group_norm", False))
+    return ObservationEncoder(inputs)
 
 
 def fill(shapes: Mapping[str, torch.Tensor], seed: int) -> dict[str, torch.Tensor]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
-from ttscompile.frontends.diffusion_policy_images import MultiImageEncoder, View
+from ttscompile.frontends.diffusion_policy_images import Camera, MultiImageEncoder
 from ttscompile.frontends.resnet import group_norm
 from ttscompile.policies.dp3 import PointCloudEncoder, PointNet
 
@@ -205,18 +205,18 @@ def _points_encoder(policy: dict[str, Any]) -> PointCloudEncoder:
 def _images_encoder(config: dict[str, Any]) -> MultiImageEncoder:
     """With networks of the right sizes; how images reach them does not matter to the weights."""
     obs = config["shape_meta"]["obs"]
-    view = View(8, 8, None, None, (1.0,) * 3, (0.0,) * 3)
-    views = {key: view for key, each in sorted(obs.items()) if each.get("type") == "rgb"}
+    camera = Camera(8, 8, None, None, (1.0,) * 3, (0.0,) * 3)
+    cameras = {key: camera for key, each in sorted(obs.items()) if each.get("type") == "rgb"}
     low_dim = {key: each["shape"][0] for key, each in sorted(obs.items()) if each.get("type") != "rgb"}
     shared = config.get("share_rgb_model", False)
     norm = group_norm if config.get("use_group_norm") and not shared else torch.nn.BatchNorm2d
-    return MultiImageEncoder(views, low_dim, config["rgb_model"]["name"], norm, shared)
+    return MultiImageEncoder(cameras, low_dim, config["rgb_model"]["name"], norm, shared)
 
 
 def _images_weights(encoder: MultiImageEncoder, config: dict[str, Any], seed: int) -> dict[str, torch.Tensor]:
     """Under the names of the original."""
     named = {}
-    for key, network in zip(encoder.views, encoder.networks, strict=False):
+    for key, network in zip(encoder.keys, encoder.networks, strict=False):
         owner = "rgb" if config.get("share_rgb_model") else key
         for name, value in network.state_dict().items():
             named[f"obs_encoder.key_model_map.{owner}.{name}"] = value

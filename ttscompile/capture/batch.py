@@ -12,7 +12,7 @@ import torch
 
 from ..errors import CaptureError
 from ..ir.evaluate import Evaluator, resolve_op
-from ..ir.graph import GETITEM, Argument, Batch, Graph, Node, Size, TensorType
+from ..ir.graph import GETITEM, Argument, Batch, Graph, Size, TensorType
 
 BATCHES = (107, 109)
 """Batch sizes to capture with, the second if the first does not do: few numbers of networks are a multiple of one."""
@@ -26,31 +26,18 @@ def with_batch(graph: Graph, batch: int) -> Graph:
     Raises:
         CaptureError: a size is no multiple of it, or a multiple of it may be something else; names the first such node.
     """
-    inputs = {name: _type(type_, batch) for name, type_ in graph.inputs.items()}
-    found = replace(graph, inputs=inputs, nodes=tuple(_node(node, batch) for node in graph.nodes))
+
+    def size(number: Size) -> Size:
+        assert isinstance(number, int)
+        return Batch(number // batch) if number and not number % batch else number  # negative: from the end
+
+    def argument(leaf: Argument) -> Argument:
+        return size(leaf) if type(leaf) is int else leaf
+
+    found = graph.mapped(argument, lambda type_: replace(type_, shape=tuple(map(size, type_.shape))))
+    found = replace(found, constants=graph.constants)
     _require_sizes(found, graph, batch)
     return found
-
-
-def _node(node: Node, batch: int) -> Node:
-    args = tuple(_argument(each, batch) for each in node.args)
-    named = tuple((name, _argument(each, batch)) for name, each in node.kwargs)
-    return replace(node, args=args, kwargs=named, types=tuple(_type(each, batch) for each in node.types))
-
-
-def _argument(argument: Argument, batch: int) -> Argument:
-    if isinstance(argument, tuple):
-        return tuple(_argument(each, batch) for each in argument)
-    return _size(argument, batch) if type(argument) is int else argument
-
-
-def _type(type_: TensorType, batch: int) -> TensorType:
-    return replace(type_, shape=tuple(_size(size, batch) for size in type_.shape))
-
-
-def _size(size: Size, batch: int) -> Size:
-    assert isinstance(size, int)
-    return Batch(size // batch) if size and not size % batch else size  # negative: from the end
 
 
 def _require_sizes(graph: Graph, captured: Graph, batch: int) -> None:

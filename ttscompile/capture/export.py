@@ -78,10 +78,7 @@ def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, we
 
     It is run with two streams, and with the second alone.
     """
-    run = evaluator(graph, weights)
-    rng, both, made = np.random.default_rng(0), _examples(spec, 2), list[torch.Tensor]()
-    for key, one in spec.inputs.items():
-        both[key] = torch.from_numpy(one.draw_normalized(rng, 2))
+    run, both, made = evaluator(graph, weights), _examples(spec, 2), list[torch.Tensor]()
     for streams in (1, 2):
         inputs = {name: value[2 - streams :] for name, value in both.items()}
         try:
@@ -164,14 +161,11 @@ def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[
 
 
 def _examples(spec: PolicySpec, streams: int) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    sample = torch.randn(streams, *spec.sample, generator=generator)
-    timestep = torch.from_numpy(spec.sampler.timesteps)[:1].repeat(streams)
-    examples = {spec.sample_argument: sample, spec.timestep_argument: timestep}
-    for key, observation in spec.inputs.items():
-        value = torch.randn(streams, *observation.shape, generator=generator)
-        examples[key] = value.to(getattr(torch, observation.dtype))
-    return examples
+    """Sample, timestep and observations, drawn at random, by the names of the graph's inputs."""
+    sample = torch.randn(streams, *spec.sample, generator=torch.Generator().manual_seed(0))
+    timestep, rng = torch.from_numpy(spec.sampler.timesteps)[:1].repeat(streams), np.random.default_rng(0)
+    drawn = {key: torch.from_numpy(one.draw_normalized(rng, streams)) for key, one in spec.inputs.items()}
+    return {spec.sample_argument: sample, spec.timestep_argument: timestep, **drawn}
 
 
 class _Converter:

@@ -100,8 +100,7 @@ def read_checkpoint(path: str | os.PathLike[str], mapped: bool = False) -> dict[
     except Exception as error:  # a damaged directory or pickle; of whatever kind
         raise _unreadable(path, error) from error
     if not isinstance(payload, dict):
-        found = type(payload).__name__
-        raise CheckpointError(f"{path}: holds a {found}; expected a dictionary.")
+        raise CheckpointError(f"{path}: holds a {type(payload).__name__}; expected a dictionary.")
     _require_own_data(path, payload)
     return payload
 

@@ -99,11 +99,6 @@ class VisionConfig(ImageTowerConfig):
             expected = "3 channels, and patches that are no larger than the image"
             raise CheckpointError(f"CLIP's num_channels is {found}; expected {expected}.")
 
-    @property
-    def patches(self) -> int:
-        """Tokens of an image, without the class token."""
-        return self.side**2
-
 
 @dataclass(frozen=True)
 class TextConfig(TowerConfig):
@@ -279,7 +274,7 @@ class _VisionEmbeddings(nn.Module):
         width, patch = config.hidden_size, config.patch_size
         self.class_embedding = nn.Parameter(torch.zeros(width))
         self.patch_embedding = nn.Conv2d(config.num_channels, width, patch, stride=patch, bias=False)
-        self.position_embedding = nn.Embedding(config.patches + 1, width)
+        self.position_embedding = nn.Embedding(config.side**2 + 1, width)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         patches = self.patch_embedding(pixels).flatten(2).transpose(1, 2)

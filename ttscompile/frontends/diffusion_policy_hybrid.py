@@ -13,7 +13,6 @@ import math
 import warnings
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -53,30 +52,27 @@ class SpatialSoftmax(nn.Module):
         return torch.flatten(attention @ positions, 1)
 
 
-@dataclass(frozen=True)
-class Camera:
-    """How the images of one observation key are taken in.
+class CameraEncoder(nn.Module):
+    """Images of one camera to features: normalise, crop the centre, ResNet-18, spatial softmax, linear, ReLU.
 
-    Attributes:
-        shape: ``(C, H, W)`` as they come.
+    Args:
+        shape: ``(C, H, W)`` of an image as it comes.
         crop: ``(height, width)`` of the centre that is looked at; None for the whole image.
         scale: of the image's normaliser, one number for all of it.
     """
 
-    shape: tuple[int, int, int]
-    crop: tuple[int, int] | None
-    scale: float = 1.0
-    offset: float = 0.0
-
-
-class CameraEncoder(nn.Module):
-    """Images of one camera to features: normalise, crop the centre, ResNet-18, spatial softmax, linear, ReLU."""
-
-    def __init__(self, camera: Camera, norm: Norm) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, int, int],
+        crop: tuple[int, int] | None,
+        norm: Norm,
+        scale: float = 1.0,
+        offset: float = 0.0,
+    ) -> None:
         super().__init__()
-        self.camera = camera
-        channels, height, width = camera.shape
-        self.crop = ResizeCrop(height, width, crop=camera.crop)
+        self.scale, self.offset = scale, offset
+        channels, height, width = shape
+        self.crop = ResizeCrop(height, width, crop=crop)
         height, width = self.crop.size
         numbered = nn.Sequential(*resnet(channels, norm))
         self.backbone = nn.Sequential(OrderedDict(nets=numbered))  # as the checkpoint names them
@@ -86,22 +82,21 @@ class CameraEncoder(nn.Module):
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """``[N, C, H, W]`` -> ``[N, 64]``."""
         x = self.crop(images)
-        if (self.camera.scale, self.camera.offset) != (1.0, 0.0):
-            x = x * self.camera.scale + self.camera.offset
+        if (self.scale, self.offset) != (1.0, 0.0):
+            x = x * self.scale + self.offset
         return torch.relu(self.linear(self.pool(self.backbone(x))))
 
 
 class ObservationEncoder(nn.Module):
     """All keys of the observation to one vector for each observed step."""
 
-    def __init__(self, inputs: Mapping[str, Camera | int], group_norm_in_place_of_batch_norm: bool) -> None:
+    def __init__(self, inputs: Mapping[str, CameraEncoder | int]) -> None:
         super().__init__()
-        cameras = {key: each for key, each in inputs.items() if isinstance(each, Camera)}
+        cameras = {key: each for key, each in inputs.items() if isinstance(each, CameraEncoder)}
         self.order = tuple(inputs)
-        self.width = sum(FEATURES if isinstance(each, Camera) else each for each in inputs.values())
-        norm = group_norm if group_norm_in_place_of_batch_norm else nn.BatchNorm2d
+        self.width = sum(FEATURES if isinstance(each, CameraEncoder) else each for each in inputs.values())
         # A list, because a key may be any text and the name of a submodule may not.
-        self.cameras = nn.ModuleList(CameraEncoder(each, norm) for each in cameras.values())
+        self.cameras = nn.ModuleList(cameras.values())
         self.position = {key: i for i, key in enumerate(cameras)}
 
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -126,9 +121,9 @@ _ROUNDING = 2**-8  # of numbers up to 1 that were saved as bfloat16; the grid it
 
 def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> ObservationEncoder:
     """The observation encoder with its weights; normalisers of images are part of it."""
-    group_norm, fixed = (settings.flag(name, False) for name in ("obs_encoder_group_norm", "eval_fixed_crop"))
-    crop = settings.size("crop_shape", [76, 76])
-    inputs: dict[str, Camera | int] = {}
+    grouped, fixed = (settings.flag(name, False) for name in ("obs_encoder_group_norm", "eval_fixed_crop"))
+    norm: Norm = group_norm if grouped else nn.BatchNorm2d
+    crop, inputs = settings.size("crop_shape", [76, 76]), dict[str, CameraEncoder | int]()
     for key, (kind, shape) in observed.items():
         if kind == "low_dim":
             inputs[key] = math.prod(shape)
@@ -137,8 +132,8 @@ def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> O
         if crop is not None and (crop[0] >= height or crop[1] >= width):
             found = f"crop_shape is {list(crop)}, and the images of {key!r} are {height} x {width}"
             raise settings.error(f"{found}; expected a crop that is smaller; the original refuses this, too")
-        inputs[key] = Camera((channels, height, width), crop, *image_normalizer(weights, key))
-    encoder = ObservationEncoder(inputs, group_norm)
+        inputs[key] = CameraEncoder((channels, height, width), crop, norm, *image_normalizer(weights, key))
+    encoder = ObservationEncoder(inputs)
     if crop is not None and not fixed and encoder.position:
         warnings.warn(
             "eval_fixed_crop is false: the original crops its images at random even in evaluation. The compiled policy"

@@ -7,7 +7,6 @@ Source: ``MultiImageObsEncoder`` and ``get_resnet`` of real-stanford/diffusion_p
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -22,34 +21,29 @@ from .settings import Settings
 COLOURS = 3
 """Channels of an image, which torchvision's ResNets have."""
 
+Size = tuple[int, int]
+Colours = tuple[float, ...]
 
-@dataclass(frozen=True)
-class View:
-    """How the images of one observation key are taken in.
 
-    Attributes:
-        resize: ``(height, width)`` that it is brought to; None for none.
+class Camera(nn.Module):
+    """The images of one observation key, as a network sees them.
+
+    Args:
+        resize: ``(height, width)`` that they are brought to; None for none.
         crop: of the centre that is looked at; None for the whole image.
         scale: of each colour, after that.
     """
 
-    height: int
-    width: int
-    resize: tuple[int, int] | None
-    crop: tuple[int, int] | None
-    scale: tuple[float, ...]
-    offset: tuple[float, ...]
-
-
-class _Camera(nn.Module):
     scale: torch.Tensor
     offset: torch.Tensor
 
-    def __init__(self, view: View) -> None:
+    def __init__(
+        self, height: int, width: int, resize: Size | None, crop: Size | None, scale: Colours, offset: Colours
+    ) -> None:
         super().__init__()
         # As torchvision 0.13 resizes tensors, which the original's environment has.
-        self.geometry = ResizeCrop(view.height, view.width, view.resize, view.crop, antialias=False)
-        for name, values in (("scale", view.scale), ("offset", view.offset)):
+        self.geometry = ResizeCrop(height, width, resize, crop, antialias=False)
+        for name, values in (("scale", scale), ("offset", offset)):
             self.register_buffer(name, torch.tensor(values).reshape(-1, 1, 1), persistent=False)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -61,20 +55,20 @@ class MultiImageEncoder(nn.Module):
     """All keys of the observation to one vector for each observed step: the images' features, then the others."""
 
     def __init__(
-        self, views: Mapping[str, View], low_dim: Mapping[str, int], network: str, norm: Norm, shared: bool
+        self, cameras: Mapping[str, Camera], low_dim: Mapping[str, int], network: str, norm: Norm, shared: bool
     ) -> None:
         super().__init__()
-        self.views, self.low_dim = tuple(views), tuple(low_dim)
-        self.width = CHANNELS * len(views) + sum(low_dim.values())
+        self.keys, self.low_dim = tuple(cameras), tuple(low_dim)
+        self.width = CHANNELS * len(cameras) + sum(low_dim.values())
         # Lists, because a key may be any text and the name of a submodule may not.
-        self.cameras = nn.ModuleList(_Camera(view) for view in views.values())
-        count = min(len(views), 1) if shared else len(views)
+        self.cameras = nn.ModuleList(cameras.values())
+        count = min(len(cameras), 1) if shared else len(cameras)
         self.networks = nn.ModuleList(resnet(COLOURS, norm, network) for _ in range(count))
 
     def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """By key ``[B, To, ...]``, low-dimensional ones normalised -> ``[B, To, width]``."""
         features = []
-        for i, (key, camera) in enumerate(zip(self.views, self.cameras, strict=True)):
+        for i, (key, camera) in enumerate(zip(self.keys, self.cameras, strict=True)):
             images = observations[key]
             maps = self.networks[min(i, len(self.networks) - 1)](camera(images.flatten(0, 1)))
             features.append(maps.mean((2, 3)).reshape(images.shape[0], images.shape[1], CHANNELS))
@@ -109,11 +103,10 @@ def encoder_settings(settings: Settings) -> Settings:
 def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> MultiImageEncoder:
     """The observation encoder with its weights; normalisers of images are part of it."""
     flags = {name: settings.flag(name, False) for name in ("use_group_norm", "share_rgb_model", "imagenet_norm")}
-    views: dict[str, View] = {}
-    low_dim: dict[str, int] = {}
+    cameras, low_dim = dict[str, Camera](), dict[str, int]()
     for key, (kind, shape) in sorted(observed.items()):  # the original sorts them, too
         if kind == "rgb":
-            views[key] = _view(settings, key, shape, image_normalizer(weights, key), flags["imagenet_norm"])
+            cameras[key] = _camera(settings, key, shape, image_normalizer(weights, key), flags["imagenet_norm"])
         elif len(shape) == 1:
             low_dim[key] = shape[0]
         else:
@@ -121,8 +114,8 @@ def build_encoder(settings: Settings, observed: Observed, weights: Weights) -> M
     shared = flags["share_rgb_model"]
     # The original puts group norm into the networks of single cameras, and leaves the shared one as it is.
     norm: Norm = group_norm if flags["use_group_norm"] and not shared else nn.BatchNorm2d
-    arguments = (views, low_dim, _network(settings) if views else next(iter(DEPTHS)), norm, shared)
-    owners = ["rgb"] if shared else list(views)
+    arguments = (cameras, low_dim, _network(settings) if cameras else next(iter(DEPTHS)), norm, shared)
+    owners = ["rgb"] if shared else list(cameras)
 
     def saved_name(name: str) -> str:
         _, index, rest = name.split(".", 2)
@@ -156,9 +149,9 @@ def _network(settings: Settings) -> str:
     return str(model.values["name"])
 
 
-def _view(
+def _camera(
     settings: Settings, key: str, shape: tuple[int, ...], normalizer: tuple[float, float], imagenet: bool
-) -> View:
+) -> Camera:
     channels, height, width = shape
     if channels != COLOURS:
         raise settings.error(
@@ -182,10 +175,10 @@ def _view(
     mean, deviation = (_MEAN, _DEVIATION) if imagenet else ((0.0,) * COLOURS, (1.0,) * COLOURS)
     scales = tuple(scale / each for each in deviation)
     offsets = tuple((offset - middle) / each for middle, each in zip(mean, deviation, strict=True))
-    return View(height, width, resize, crop, scales, offsets)
+    return Camera(height, width, resize, crop, scales, offsets)
 
 
-def _size(settings: Settings, name: str, key: str) -> tuple[int, int] | None:
+def _size(settings: Settings, name: str, key: str) -> Size | None:
     """One for all cameras, or of each by its key."""
     if not isinstance(settings.values.get(name), dict):
         return settings.size(name, None, MOST_PIXELS)

@@ -13,22 +13,8 @@ from torch import nn
 
 from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
-from . import diffusion_policy_hybrid as hybrid
-from .diffusion_policy_parts import (
-    InpaintingDenoiser,
-    Rebuilt,
-    Saved,
-    TokensDenoiser,
-    Weights,
-    affine,
-    load_network,
-    network_settings,
-    network_weights,
-    observation_specs,
-    read_shape_meta,
-    require_room,
-    require_sizes,
-)
+from . import diffusion_policy_hybrid as hybrid, diffusion_policy_parts as parts
+from .diffusion_policy_parts import Rebuilt, Saved, Weights
 from .encoded import EncodedDenoiser
 from .interpolation import Config
 from .transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
@@ -46,63 +32,59 @@ def low_dim(saved: Saved) -> Rebuilt:
     network = _network(_network_config(saved.config), saved.weights)
     as_cond = saved.settings.flag("obs_as_cond", False)
     obs_dim, action_dim, n_obs_steps = saved.sizes("obs_dim", "action_dim", "n_obs_steps")
-    horizon, start, variant = _check(saved, network.config, as_cond, obs_dim, action_dim)
-    load_network(network, saved.weights)
-    module = _conditioned(network, as_cond, horizon, action_dim, n_obs_steps)
-    observations = {"obs": ObservationSpec((n_obs_steps, obs_dim), affine(saved.weights, "obs", obs_dim))}
-    sample = (horizon, network.config.input_dim)
+    module, sample, start, variant = _denoiser(saved, network, saved.weights, as_cond, obs_dim, action_dim)
+    observations = {"obs": ObservationSpec((n_obs_steps, obs_dim), parts.affine(saved.weights, "obs", obs_dim))}
     known = _SWITCHES | {"obs_dim", "action_dim", "model"}
     return Rebuilt(module, observations, sample, action_dim, start, variant, known)
 
 
 def on_images(saved: Saved) -> Rebuilt:
     """``DiffusionTransformerHybridImagePolicy``."""
-    action_dim, observed = read_shape_meta(saved.settings, "low_dim", "rgb")
+    action_dim, observed = parts.read_shape_meta(saved.settings, "low_dim", "rgb")
     encoder = hybrid.build_encoder(saved.settings, observed, saved.weights)
     as_cond = saved.settings.flag("obs_as_cond", True)
     network = _network(_hybrid_config(saved, as_cond, action_dim, encoder.width), saved.weights)
-    horizon, start, variant = _check(saved, network.config, as_cond, encoder.width, action_dim)
-    load_network(network, network_weights(saved.weights))
-    (n_obs_steps,) = saved.sizes("n_obs_steps")
-    module = EncodedDenoiser(encoder, _conditioned(network, as_cond, horizon, action_dim, n_obs_steps))
-    observations = observation_specs(observed, n_obs_steps, saved.weights)
-    sample = (horizon, network.config.input_dim)
+    weights = parts.network_weights(saved.weights)
+    module, sample, start, variant = _denoiser(saved, network, weights, as_cond, encoder.width, action_dim)
+    observations = parts.observation_specs(observed, saved.settings.number("n_obs_steps"), saved.weights)
     known = _SWITCHES | hybrid.ENCODER_KEYS | _NETWORK_KEYS
-    return Rebuilt(module, observations, sample, action_dim, start, variant, known)
+    return Rebuilt(EncodedDenoiser(encoder, module), observations, sample, action_dim, start, variant, known)
 
 
 def _network(config: TransformerConfig, weights: Weights) -> TransformerForDiffusion:
     """The network of a configuration, if the checkpoint has weights for one of its size."""
     width, tokens = config.n_emb, config.trunk_tokens
     channels = max(config.input_dim, config.output_dim, config.cond_dim)
-    require_room(
-        {
-            "n_emb": width * width,
-            "input_dim, output_dim or cond_dim": width * channels,
-            "horizon": max(width * tokens, tokens * tokens if config.causal_attn else 0),
-            "n_obs_steps": max(
-                width * config.memory_tokens, tokens * config.memory_tokens if config.causal_attn else 0
-            ),
-            "n_layer or n_cond_layers": max(config.n_layer, config.n_cond_layers) * width,
-        },
-        weights,
-    )
+    row = max(width, tokens if config.causal_attn else 0)  # of a position, or of a causal mask
+    needed = {
+        "n_emb": width * width,
+        "input_dim, output_dim or cond_dim": width * channels,
+        "horizon": row * tokens,
+        "n_obs_steps": row * config.memory_tokens,
+        "n_layer or n_cond_layers": max(config.n_layer, config.n_cond_layers) * width,
+    }
+    parts.require_room(needed, weights)
     return TransformerForDiffusion(config)
 
 
-def _conditioned(
-    network: TransformerForDiffusion, as_cond: bool, horizon: int, action_dim: int, n_obs_steps: int
-) -> nn.Module:
+def _denoiser(
+    saved: Saved, network: TransformerForDiffusion, weights: Weights, as_cond: bool, obs_dim: int, action_dim: int
+) -> tuple[nn.Module, tuple[int, int], int, str]:
+    """The network with its weights, as it is given the observation; ``(T, D)``, first executed step and variant."""
+    horizon, start, variant = _check(saved, network.config, as_cond, obs_dim, action_dim)
+    parts.load_network(network, weights)
+    sample = (horizon, network.config.input_dim)
     if as_cond:
-        return TokensDenoiser(network)
-    return InpaintingDenoiser(network, (horizon, network.config.input_dim), action_dim, n_obs_steps)
+        return parts.TokensDenoiser(network), sample, start, variant
+    n_obs_steps = saved.settings.number("n_obs_steps")
+    return parts.InpaintingDenoiser(network, sample, action_dim, n_obs_steps), sample, start, variant
 
 
 def _network_config(config: Config) -> TransformerConfig:
     """``cfg.policy.model`` as a record; what is absent has the original's default."""
     names = [field.name for field in fields(TransformerConfig)]
     # obs_as_cond is taken from cond_dim by the original; dropout does nothing at inference.
-    values = network_settings(config, _NETWORK, {*names, "obs_as_cond", "p_drop_emb", "p_drop_attn"})
+    values = parts.network_settings(config, _NETWORK, {*names, "obs_as_cond", "p_drop_emb", "p_drop_attn"})
     if values.get("n_obs_steps") is None:
         values["n_obs_steps"] = values.get("horizon")
     for name in ("input_dim", "output_dim", "horizon"):
@@ -134,7 +116,7 @@ def _check(
     channels = action_dim + (0 if as_cond else obs_dim)
     expected = {"input_dim": channels, "output_dim": channels, "cond_dim": obs_dim if as_cond else 0}
     found = f"obs_as_cond = {as_cond}, action_dim = {action_dim} and obs_dim = {obs_dim}"
-    require_sizes(network, expected, found)
+    parts.require_sizes(network, expected, found)
     exact = network.causal_attn
     limits = {"horizon": (network.horizon, horizon)}
     if as_cond:

@@ -11,26 +11,11 @@ from torch import nn
 
 from ..core.spec import ObservationSpec
 from ..errors import CheckpointError
+from . import diffusion_policy_parts as parts
 from .conditional_unet1d import ConditionalUnet1D, UNetConfig
 from .diffusion_policy_hybrid import ENCODER_KEYS, build_encoder as build_robomimic_encoder
 from .diffusion_policy_images import build_encoder as build_image_encoder, encoder_settings
-from .diffusion_policy_parts import (
-    GlobalDenoiser,
-    InpaintingDenoiser,
-    LocalDenoiser,
-    Observed,
-    Rebuilt,
-    Saved,
-    Weights,
-    affine,
-    load_network,
-    network_settings,
-    network_weights,
-    observation_specs,
-    read_shape_meta,
-    require_room,
-    require_sizes,
-)
+from .diffusion_policy_parts import Observed, Rebuilt, Saved, Weights
 from .encoded import EncodedDenoiser
 
 _NETWORK = "ConditionalUnet1D"
@@ -61,20 +46,23 @@ def low_dim(saved: Saved) -> Rebuilt:
         raise settings.error("pred_action_steps_only needs obs_as_global_cond; the original refuses this, too")
     given: Given = "global condition" if as_global else "local condition" if as_local else "inpainting"
     obs_dim, action_dim, n_obs_steps = saved.sizes("obs_dim", "action_dim", "n_obs_steps")
-    config = network_config(network_settings(saved.config, _NETWORK, _SETTINGS), "cfg.policy.model.")
+    network = parts.network_settings(saved.config, _NETWORK, _SETTINGS)
+    if network.get("input_dim") is None:
+        raise CheckpointError("cfg.policy.model.input_dim is missing; it is needed to rebuild the network.")
+    config = UNetConfig(**{name: value for name, value in network.items() if name in _SETTINGS})
     expected = {
         "input_dim": action_dim + (obs_dim if given == "inpainting" else 0),
         "global_cond_dim": obs_dim * n_obs_steps if as_global else None,
         "local_cond_dim": obs_dim if as_local else None,
     }
     sizes = f"action_dim = {action_dim}, obs_dim = {obs_dim} and n_obs_steps = {n_obs_steps}"
-    require_sizes(config, expected, f"the observation as {given}, {sizes}")
+    parts.require_sizes(config, expected, f"the observation as {given}, {sizes}")
     steps = "n_action_steps" if only_steps else "horizon"
     start = 0 if only_steps else n_obs_steps - from_last
     module, sample = denoiser(saved, saved.weights, config, given, action_dim, steps, start)
     return Rebuilt(
         module,
-        {"obs": ObservationSpec((n_obs_steps, obs_dim), affine(saved.weights, "obs", obs_dim))},
+        {"obs": ObservationSpec((n_obs_steps, obs_dim), parts.affine(saved.weights, "obs", obs_dim))},
         sample,
         action_dim,
         start,
@@ -85,16 +73,16 @@ def low_dim(saved: Saved) -> Rebuilt:
 
 def hybrid(saved: Saved) -> Rebuilt:
     """``DiffusionUnetHybridImagePolicy``."""
-    action_dim, observed = read_shape_meta(saved.settings, "low_dim", "rgb")
+    action_dim, observed = parts.read_shape_meta(saved.settings, "low_dim", "rgb")
     encoder = build_robomimic_encoder(saved.settings, observed, saved.weights)
     return _on_images(saved, encoder, encoder.width, observed, action_dim, ENCODER_KEYS)
 
 
 def images(saved: Saved) -> Rebuilt:
     """``DiffusionUnetImagePolicy``."""
-    action_dim, _ = read_shape_meta(saved.settings, "low_dim", "rgb")
+    action_dim, _ = parts.read_shape_meta(saved.settings, "low_dim", "rgb")
     settings = encoder_settings(saved.settings)
-    _, observed = read_shape_meta(settings, "low_dim", "rgb")
+    _, observed = parts.read_shape_meta(settings, "low_dim", "rgb")
     encoder = build_image_encoder(settings, observed, saved.weights)
     return _on_images(saved, encoder, encoder.width, observed, action_dim, {"shape_meta", "obs_encoder"})
 
@@ -128,7 +116,7 @@ def behind_encoder(
         known: settings of ``cfg.policy`` that were read for encoder and network.
     """
     as_global = saved.settings.flag("obs_as_global_cond", True)
-    (n_obs_steps,) = saved.sizes("n_obs_steps")
+    n_obs_steps = saved.settings.number("n_obs_steps")
     config = UNetConfig(
         input_dim=action_dim + (0 if as_global else width),
         global_cond_dim=width * n_obs_steps if as_global else None,
@@ -136,23 +124,16 @@ def behind_encoder(
     )
     given: Given = "global condition" if as_global else "inpainting"
     start = n_obs_steps - 1
-    module, sample = denoiser(saved, network_weights(saved.weights), config, given, action_dim, "horizon", start)
+    module, sample = denoiser(saved, parts.network_weights(saved.weights), config, given, action_dim, "horizon", start)
     return Rebuilt(
         EncodedDenoiser(encoder, module),
-        observation_specs(observed, n_obs_steps, saved.weights),
+        parts.observation_specs(observed, n_obs_steps, saved.weights),
         sample,
         action_dim,
         start,
         given,
         frozenset({"obs_as_global_cond", *known}),
     )
-
-
-def network_config(values: dict[str, Any], where: str) -> UNetConfig:
-    """A U-Net's settings, which stand at ``where``, as a record."""
-    if values.get("input_dim") is None:
-        raise CheckpointError(f"{where}input_dim is missing; it is needed to rebuild the network.")
-    return UNetConfig(**{name: value for name, value in values.items() if name in _SETTINGS})
 
 
 def denoiser(
@@ -179,10 +160,10 @@ def denoiser(
         "diffusion_step_embed_dim": width * max(width, *dims),
         "down_dims or kernel_size": config.kernel_size * sum(n * n for n in dims),
     }
-    require_room(needed, weights)
+    parts.require_room(needed, weights)
     network = ConditionalUnet1D(config)
-    load_network(network, weights)
+    parts.load_network(network, weights)
     sample = (horizon, config.input_dim)
     if given == "inpainting":
-        return InpaintingDenoiser(network, sample, action_dim, n_obs_steps), sample
-    return (GlobalDenoiser if given == "global condition" else LocalDenoiser)(network), sample
+        return parts.InpaintingDenoiser(network, sample, action_dim, n_obs_steps), sample
+    return (parts.GlobalDenoiser if given == "global condition" else parts.LocalDenoiser)(network), sample

@@ -4,6 +4,8 @@ The compiler changes no module that it was given, and holds no weight more often
 """
 
 import copy
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -49,18 +51,13 @@ def sharing_copy(module: nn.Module) -> nn.Module:
     # Of other classes, as those that have no shape yet, a plain copy is made.
     plain = (each for each in module.parameters() if type(each) is nn.Parameter)
     shared = {id(each): nn.Parameter(each.detach(), each.requires_grad) for each in plain}
-    return _copied(module, shared).cpu().float().eval()
+    return own_copy(module, shared).cpu().float().eval()
 
 
-def own_copy(module: nn.Module) -> nn.Module:
-    """A copy that shares nothing with a module whose owner may go on to train it."""
-    return _copied(module, {})
-
-
-def _copied(module: nn.Module, known: dict[int, nn.Parameter]) -> nn.Module:
-    """``known`` says what takes the place of the objects of these ids."""
+def own_copy(module: nn.Module, shared: Mapping[int, nn.Parameter] = MappingProxyType({})) -> nn.Module:
+    """A copy that shares nothing with a module whose owner may go on to train it, but what ``shared`` has by id."""
     try:
-        return copy.deepcopy(module, dict[int, object](known))
+        return copy.deepcopy(module, dict[int, object](shared))
     except RuntimeError as error:
         raise CaptureError(
             f"{type(module).__name__} cannot be copied: {error} Of a weight that is computed from others, call"

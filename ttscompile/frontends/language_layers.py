@@ -77,8 +77,7 @@ class Attention(nn.Module):
         self.k_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.v_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.o_proj = nn.Linear(queries, config.width, bias=False)
-        norms = [Norm(config, config.channels) if config.normed else nn.Identity() for _ in range(2)]
-        self.q_norm, self.k_norm = norms
+        self.q_norm, self.k_norm = (Norm(config, config.channels) if config.normed else nn.Identity() for _ in range(2))
 
     def split(self, x: Tensor) -> Tensor:
         """``[B, T, heads * channels]`` -> ``[B, heads, T, channels]``."""

@@ -12,7 +12,7 @@ CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ENVIRONMENT, ACTION = "observation.environment_state", "action"
 
 MOST_PIXELS, MOST_STEPS, MOST = 4096, 4096, 2**16
-_MOST_CAMERAS = 64
+MOST_LAYERS, MOST_VOCABULARY, MOST_LETTERS, _MOST_CAMERAS = 512, 2**20, 400, 64
 """Sizes above these are no policy's. Whether the weights are there for them is asked later."""
 
 

@@ -22,13 +22,13 @@ from .evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from .families import LoadOptions
 from .instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from .internvl import InternVitConfig, InternVLConfig, Prompt
-from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
+from .lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, read_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
-_MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS, _MOST_VIEWS, _MOST_KINDS = 512, 2**20, 400, 64, 4096
+_MOST_VIEWS, _MOST_KINDS = 64, 4096
 _IMAGE = "Image-{}: <img><IMG_CONTEXT></img>"
 """The line of one image in the prompt; of its tokens one stands for all, since none is joined to a word beside it."""
 _RENAMED = (
@@ -58,13 +58,13 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     shared = vla.read_vla_config(directory, entries, options)
     shared, processors = vla.read_vla_processors(shared)
     settings = shared.settings
-    name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
+    name = settings.text("vlm_model_name", _MODEL, MOST_LETTERS)
     folder = language_model_folder(name, encoder_folders(options.encoders, directory), "internvl")
     model = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")
     config = read_config(shared, model)
     vocabulary, views = config.language.vocabulary, _views(settings)
     told = Instruction(TOKENS, MASK, False, tuple(_IMAGE.format(i + 1) for i in range(views)))
-    image = model.number("image_token_id", 151667, _MOST_VOCABULARY)
+    image = model.number("image_token_id", 151667, MOST_VOCABULARY)
     between, told = told_after(told, name, folder, vocabulary, image, views)
     images = told.skipped + views * (config.language.image_tokens - 1)
     length = settings.number("max_text_length", 1024, MOST) - images
@@ -77,7 +77,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
     network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
     encoder = vla.Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
-    side, table = config.language.vision.image_size, partial(vla.in_buckets, settings, 32, TIMES - 1)
+    side, table = config.language.vision.image_size, partial(vla.in_buckets, settings, 32, TIMES - 1, False)
     spec = vla.vla_spec(shared, processors, (side, side), "stretch", sizes, options, table, told)
     spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform")
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
@@ -108,7 +108,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
         hidden_dim=settings.number("hidden_dim", 1024, MOST),
         state_hidden_dim=settings.number("state_hidden_dim", 1024, MOST),
         num_heads=heads,
-        num_layers=settings.number("num_layers", 8, _MOST_LAYERS),
+        num_layers=settings.number("num_layers", 8, MOST_LAYERS),
         return_cls_only=settings.flag("return_cls_only", False),
     )
 
@@ -126,7 +126,7 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     scale = max(int(1 / ratio), 1)
     if abs(scale * ratio - 1) > 1e-6 or vision.side % scale:
         raise model.refusal("downsample_ratio", f"one of so many of the {vision.side} patches along a side", 0.5)
-    there, wanted = text.number("num_hidden_layers", 32, _MOST_LAYERS), settings.values.get("vlm_num_layers", 14)
+    there, wanted = text.number("num_hidden_layers", 32, MOST_LAYERS), settings.values.get("vlm_num_layers", 14)
     if wanted is not None and type(wanted) is not int:
         raise settings.refusal("vlm_num_layers", "a whole number, or null for all", 14)
     heads = text.number("num_attention_heads", 32, MOST)
@@ -135,7 +135,7 @@ def _read_language(settings: Settings, model: Settings) -> InternVLConfig:
     config = InternVLConfig(
         vision=vision,
         text=language,
-        vocabulary=text.number("vocab_size", 151936, _MOST_VOCABULARY),
+        vocabulary=text.number("vocab_size", 151936, MOST_VOCABULARY),
         scale=scale,
         activation=model.choice("projector_hidden_act", "gelu", *ACTIVATIONS),
         base=_rotary_base(text, settings.number("max_text_length", 1024, MOST)),

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..core.spec import Instruction, PolicySpec, SamplerTable
+from ..core.spec import Instruction, PolicySpec
 from ..errors import CheckpointError
 from . import lerobot_qwen3_vl as qwen, lerobot_vla as vla
 from .clip import TowerConfig
@@ -23,14 +23,13 @@ from .families import LoadOptions
 from .groot import Denoiser, Groot, GrootConfig, Prefix
 from .instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from .internvl import Prompt
-from .lerobot_config import ACTION, CONFIG, MOST, STATE, LeRobotConfig
+from .lerobot_config import ACTION, CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
 from .lerobot_policy import MASK, TOKENS, read_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
 _BASE, _BACKBONE = "nvidia/GR00T-N1.7-3B", "nvidia/Cosmos-Reason2-2B"
-_MOST_LETTERS = 400
 _LENGTH = 64
 """Tokens of an instruction with what is after it, of a policy that none is compiled into; lerobot has no limit."""
 _EMPTY = "Perform the task."
@@ -56,10 +55,10 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     settings, processors = shared.settings, read_groot_processors(directory, shared.features)
     _require_version(settings)
     folders = encoder_folders(options.encoders, directory)
-    name = settings.text("base_model_path", _BASE, _MOST_LETTERS)
+    name = settings.text("base_model_path", _BASE, MOST_LETTERS)
     folder = language_model_folder(name, folders, "Gr00tN1d7", "base model")
     base = Settings(_DEFAULTS | read_json(folder / CONFIG), f"{folder / CONFIG}: ")
-    name = base.text("model_name", _BACKBONE, _MOST_LETTERS)
+    name = base.text("model_name", _BACKBONE, MOST_LETTERS)
     backbone = qwen.find_backbone(name, folders)
     _require_whole(backbone, processors.geometry.target)
     config = read_config(base, backbone.model, processors)
@@ -72,8 +71,10 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     weights = _weights(shared, options, config, processors.embodiment)
     network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
     encoder = vla.Gathered(shared, processors, Prefix(network, Seen(processors.geometry)), config.state, task)
-    edge, own = processors.geometry.edge, {name: each for name, each in entries.items() if each is not None}
-    table = partial(_sampler, Settings({**base.values, **own}, settings.where), processors.bounded)
+    edge, given = processors.geometry.edge, {name: each for name, each in entries.items() if each is not None}
+    own = Settings({**base.values, **given}, settings.where)
+    last = own.number("num_timestep_buckets", 1000, 2**20)
+    table = partial(vla.in_buckets, own, 4, last, processors.bounded)
     spec = vla.vla_spec(shared, processors, (edge, edge), "stretch", sizes, options, table, told)
     spec = replace(spec, source={**spec.source, "embodiment": processors.kind})
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
@@ -102,11 +103,8 @@ def _require_whole(backbone: qwen.Backbone, side: int) -> None:
 
 def read_config(base: Settings, model: Settings, processors: GrootProcessors) -> GrootConfig:
     """Sizes and variant, of the entries of the base model and of its backbone."""
-    images, dit = (
-        [(processors.geometry.target,) * 2] * len(processors.cameras),
-        vla.part_of(base, "diffusion_model_cfg"),
-    )
-    language = qwen.read_language(model, base.number("select_layer", 16), images)
+    dit, side = vla.part_of(base, "diffusion_model_cfg"), processors.geometry.target
+    language = qwen.read_language(model, base.number("select_layer", 16), [(side, side)] * len(processors.cameras))
     layers, width = _tower(dit), language.text.width
     mixing = vla.part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
     mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None
@@ -119,7 +117,7 @@ def read_config(base: Settings, model: Settings, processors: GrootProcessors) ->
     every = 2 * base.number("attend_text_every_n_blocks", 2, MOST) if apart else 1
     if apart and not itself:
         raise dit.refusal("interleave_self_attention", "true, with use_alternate_vl_dit")
-    looks = ("itself" if itself and i % 2 else "images" if i % every else "words" for i in range(qwen.MOST_LAYERS))
+    looks = ("itself" if itself and i % 2 else "images" if i % every else "words" for i in range(MOST_LAYERS))
     horizon = base.number("action_horizon", 40, MOST)
     places = base.number("max_seq_len", 1024, MOST) if base.flag("add_pos_embed", True) else None
     if places is not None and places < horizon:
@@ -149,7 +147,7 @@ def _tower(own: Settings) -> TowerConfig:
     return TowerConfig(
         hidden_size=width,
         intermediate_size=4 * width,
-        num_hidden_layers=own.number("num_layers", 12, qwen.MOST_LAYERS),
+        num_hidden_layers=own.number("num_layers", 12, MOST_LAYERS),
         num_attention_heads=heads,
         hidden_act="gelu_pytorch_tanh",
         layer_norm_eps=vla.positive_number(own, "norm_eps", 1e-5),
@@ -175,12 +173,6 @@ def _prompt(
     told = Instruction(TOKENS, MASK, True, (qwen.TURN,), around=around, plain=processors.plain, otherwise=_EMPTY)
     between, told = told_after(told, name, backbone.folder, vocabulary, backbone.image, shown)
     return Prompt(between, len(processors.cameras)), told
-
-
-def _sampler(settings: Settings, bounded: bool, options: LoadOptions) -> SamplerTable:
-    """From noise to actions, which may be clipped at the end."""
-    table = vla.in_buckets(settings, 4, settings.number("num_timestep_buckets", 1000, 2**20), options)
-    return vla.clipped_at_the_end(table) if bounded else table
 
 
 def _weights(shared: LeRobotConfig, options: LoadOptions, config: GrootConfig, kind: int) -> Mapping[str, Tensor]:

@@ -18,13 +18,13 @@ from ..core.tokenizer import TASK
 from ..errors import CheckpointError
 from . import lerobot_processors as lerobot
 from .image_geometry import ResizeCrop
-from .lerobot_config import ACTION, MOST_PIXELS, STATE
+from .lerobot_config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 from .settings import Settings
 
 (_PACK, _UNPACK, _DECODE), _ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
-_MOST_FRAMES, _MOST_LETTERS, _EPSILON = 64, 400, 1e-8
+_MOST_FRAMES, _EPSILON = 64, 1e-8
 _CAMERA = "observation.images."
 _POSES = ("xyz_rot6d", "xyz+rot6d")
 """Both names of the one format of poses that lerobot decodes."""
@@ -116,7 +116,7 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         normalizers={} if state is None else {STATE: state},
         action=actions.statistics,
         renamed=lerobot.renamed_observations(directory, before, features),
-        tokenizer={"tokenizer_name": encoding.text("model_name", "nvidia/Cosmos-Reason2-2B", _MOST_LETTERS)},
+        tokenizer={"tokenizer_name": encoding.text("model_name", "nvidia/Cosmos-Reason2-2B", MOST_LETTERS)},
         cameras=_cameras(packing, features),
         frames=1 if packing.values.get("video_horizon") is None else packing.number("video_horizon", most=_MOST_FRAMES),
         embodiment=number,

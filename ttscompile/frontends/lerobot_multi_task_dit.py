@@ -163,8 +163,7 @@ def with_inputs(
                 f"images reach the vision encoder as {geometry.size}, and it takes {vision.image_size} pixels square."
                 " Check image_resize_shape and image_crop_shape, and that the encoder found is the policy's own."
             )
-    tokens = lerobot.TOKENS.replace(".", "_"), lerobot.MASK.replace(".", "_")
-    condition = ConditionEncoder(config, processors, geometry, network.observation_encoder, tokens, task)
+    condition = ConditionEncoder(config, processors, geometry, network.observation_encoder, task)
     return EncodedDenoiser(condition, network.noise_predictor)
 
 
@@ -224,7 +223,6 @@ class ConditionEncoder(lerobot.Measured):
     """Raw observations to the condition vector: normalised, cropped and encoded.
 
     Args:
-        tokens: the names of the instruction's tokens and of their mask.
         task: tokens int64 ``[1, L]`` and mask bool ``[1, L]`` of the one instruction that is compiled in; None where it
             is an input.
     """
@@ -238,11 +236,10 @@ class ConditionEncoder(lerobot.Measured):
         processors: Processors,
         geometry: ResizeCrop | None,
         observation_encoder: ObservationEncoder,
-        tokens: tuple[str, str],
         task: tuple[torch.Tensor, torch.Tensor] | None = None,
     ) -> None:
         super().__init__(config, processors, geometry)
-        self.observation_encoder, self.tokens, self.has_task = observation_encoder, tokens, task is not None
+        self.observation_encoder, self.has_task = observation_encoder, task is not None
         if task is not None:
             self.register_buffer("task_tokens", task[0], persistent=False)
             self.register_buffer("task_mask", task[1], persistent=False)
@@ -251,8 +248,9 @@ class ConditionEncoder(lerobot.Measured):
         """Observations ``[B, ...]`` by name -> ``[B, C]``."""
         measured = self.measured(observations)
         images = [measured[key] for key in self.cameras]
-        given = (self.task_tokens, self.task_mask) if self.has_task else (observations[name] for name in self.tokens)
-        tokens, mask = given
+        tokens, mask = (observations.get(name.replace(".", "_")) for name in (lerobot.TOKENS, lerobot.MASK))
+        if self.has_task:
+            tokens, mask = self.task_tokens, self.task_mask
         return self.observation_encoder(measured[STATE], images, tokens, mask)  # type: ignore[no-any-return]
 
 

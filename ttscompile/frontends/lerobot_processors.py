@@ -106,10 +106,9 @@ class Statistics:
 
     def unnormalized(self, x: torch.Tensor, channel: int) -> torch.Tensor:
         """Numbers of one channel of a vector in their own units, as lerobot computes them."""
-        first = self.first[channel]
-        return (
-            x * self.second[channel] + first if self.mode == "MEAN_STD" else (x + 1) / 2 * self.width[channel] + first
-        )
+        if self.mode == "MEAN_STD":
+            return x * self.second[channel] + self.first[channel]
+        return (x + 1) / 2 * self.width[channel] + self.first[channel]
 
     def inverse(self, steps: int = 1) -> Affine:
         """The inverse as an ``Affine``, for vectors; of a chunk's steps, where statistics have rows, the last repeated.

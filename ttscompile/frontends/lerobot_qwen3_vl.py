@@ -12,11 +12,10 @@ from ..errors import CheckpointError
 from . import lerobot_vla as vla
 from .clip import ACTIVATIONS
 from .instruction import language_model_folder
-from .lerobot_config import CONFIG, MOST
+from .lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_VOCABULARY
 from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
 from .settings import Settings, read_json
 
-MOST_LAYERS, MOST_VOCABULARY = 512, 2**20
 _MOST_PATCHES = 2**22
 TURN, IMAGE, END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""

@@ -16,7 +16,7 @@ from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .instruction import encoder_folders, language_model_folder, task_tokens
-from .lerobot_config import CONFIG, MOST, MOST_PIXELS, LeRobotConfig
+from .lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
 from .lerobot_policy import read_weights
 from .saved_weights import filled
 from .settings import Settings, read_json
@@ -42,7 +42,6 @@ RELEASED: Mapping[str, Mapping[str, Any]] = {
 }
 """Configurations of the released models: with these names nothing but the policy's own weights is needed."""
 
-_MOST_LAYERS, _MOST_VOCABULARY, _MOST_LETTERS = 512, 2**20, 400
 _UNREAD = (".vlm.lm_head.weight", ".text_model.norm.weight")
 """Weights of what the policy does not compute: the language model's answer."""
 
@@ -53,7 +52,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     shared, processors = vla.read_vla_processors(shared)
     settings = shared.settings
     folders = encoder_folders(options.encoders, directory)
-    name = settings.text("vlm_model_name", _MODEL, _MOST_LETTERS)
+    name = settings.text("vlm_model_name", _MODEL, MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))
     length = settings.number("tokenizer_max_length", 48, MOST)
     sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
@@ -77,7 +76,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     vision_entries, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
     names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
     vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
-    layers = _layers(settings, text.number("num_hidden_layers", None, _MOST_LAYERS))
+    layers = _layers(settings, text.number("num_hidden_layers", None, MOST_LAYERS))
     heads, width = text.number("num_attention_heads", None, MOST), text.number("hidden_size", None, MOST)
     own = Settings({"num_key_value_heads": heads} | dict(text.values), text.where)
     language = vla.read_language(own, layers, width // heads)
@@ -88,7 +87,7 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     return SmolVLAConfig(
         vision=vision,
         text=language,
-        vocabulary=text.number("vocab_size", None, _MOST_VOCABULARY),
+        vocabulary=text.number("vocab_size", None, MOST_VOCABULARY),
         scale=scale,
         image=_image(shared, vision.patch_size * scale),
         expert=expert,

@@ -61,7 +61,7 @@ def read_vla_config(
         )
         raise CheckpointError(f"{directory}: {told}. A policy needs a camera that it was trained with.")
     features = {key: each for key, each in config.features.items() if key in kept or key not in config.cameras}
-    return LeRobotConfig(**{**vars(config), "features": features})
+    return replace(config, features=features)
 
 
 def read_vla_processors(config: LeRobotConfig) -> tuple[LeRobotConfig, Processors]:
@@ -124,20 +124,21 @@ def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     return flow_matching(integration_steps(settings, options, name, 10), options, start=1.0, end=0.0)
 
 
-def in_buckets(settings: Settings, steps: int, last: int, options: LoadOptions) -> SamplerTable:
+def in_buckets(settings: Settings, steps: int, last: int, clipped: bool, options: LoadOptions) -> SamplerTable:
     """From noise at time 0 to actions at 1, each time as a whole number up to ``last``, rounded down as lerobot does.
 
     Args:
         steps: where neither the configuration nor the options say how many.
+        clipped: whether actions are clipped to -1..1 after the last step.
     """
     count = integration_steps(settings, options, "num_inference_timesteps", steps)
     table = flow_matching(count, options, start=0.0, end=1.0)
     times = np.rint(table.timesteps.astype(np.float64) * 2 * count) / (2 * count)  # as they were before float32
-    return replace(table, timesteps=(times * last).astype(np.int64))
+    table = replace(table, timesteps=(times * last).astype(np.int64))
+    return _clipped_at_the_end(table) if clipped else table
 
 
-def clipped_at_the_end(table: SamplerTable) -> SamplerTable:
-    """The same loop, whose actions are clipped to -1..1 after the last step."""
+def _clipped_at_the_end(table: SamplerTable) -> SamplerTable:
     if table.name != "euler":
         raise SpecError(f"sampler {table.name}: the actions of this policy are clipped at the end; expected euler.")
     last = np.arange(table.steps) == table.steps - 1

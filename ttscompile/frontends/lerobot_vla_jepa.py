@@ -6,6 +6,7 @@ lerobot nor transformers is needed. Source: ``VLAJEPAPolicy.predict_action_chunk
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..core.spec import LARGEST, Instruction, PolicySpec, SamplerTable, Switch
+from ..core.spec import LARGEST, Instruction, PolicySpec, Switch
 from ..core.tokenizer import Tokenizer
 from ..errors import CheckpointError
 from . import lerobot_qwen3_vl as qwen, lerobot_vla as vla
@@ -25,14 +26,14 @@ from .groot import Denoiser, Groot, GrootConfig, Prefix
 from .image_geometry import ResizeCrop
 from .instruction import encoder_folders, task_tokens, told_after
 from .internvl import Prompt
-from .lerobot_config import MOST, MOST_PIXELS, STATE, LeRobotConfig
+from .lerobot_config import MOST, MOST_LAYERS, MOST_PIXELS, STATE, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, read_weights
 from .lerobot_processors import BINARIZE, CLIP, PREPARE, SNAP, Processors
 from .qwen3_vl import Qwen3VLConfig
 from .saved_weights import filled, renamed
 from .settings import Settings
 
-_MOST_LETTERS, _MOST_TOKENS, _MOST_LAYERS = 4000, 4096, qwen.MOST_LAYERS
+_MOST_LETTERS, _MOST_TOKENS = 4000, 4096
 _LENGTH = 64
 """Tokens of an instruction, of a policy that none is compiled into; lerobot has no limit."""
 _TEMPLATE = (
@@ -65,7 +66,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     prepared.require(resize_to=resize and list(resize))
     sizes = [resize or (shape[1], shape[2]) for shape in shared.cameras.values()]
     seen = [qwen.read_resizing(backbone)(*each) for each in sizes]
-    weights, language = read_weights(shared, options, *_UNREAD), qwen.read_language(backbone.model, _MOST_LAYERS, seen)
+    weights, language = read_weights(shared, options, *_UNREAD), qwen.read_language(backbone.model, MOST_LAYERS, seen)
     prompt, told, numbers = _prompt(shared, weights, name, backbone, language.vocabulary)
     config, task = read_config(shared, replace(language, vocabulary=numbers["vocabulary"])), None
     if options.task is not None:
@@ -74,11 +75,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     own = _weights(weights, config)
     network = filled(lambda: Groot(config, prompt), own, "config.json, or the backbone's,", directory)
     encoder = vla.Gathered(shared, processors, Prefix(network, _Seen(sizes, seen)), config.state or None, task)
-
-    def table(each: LoadOptions) -> SamplerTable:
-        made = vla.in_buckets(settings, 4, settings.number("action_num_timestep_buckets", 1000, 2**20), each)
-        return vla.clipped_at_the_end(made) if CLIP in processors.own else made
-
+    last = settings.number("action_num_timestep_buckets", 1000, 2**20)
+    table = partial(vla.in_buckets, settings, 4, last, CLIP in processors.own)
     spec = vla.vla_spec(shared, processors, resize, "average", numbers, options, table, told)
     spec = replace(spec, chunk=replace(spec.chunk, switches=_switches(shared, processors)))
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
@@ -159,20 +157,14 @@ def _prompt(
 
 def _template(settings: Settings) -> list[str]:
     """What is before an instruction, after it, and, if actions are asked for, after these."""
-    template, fields = (
-        settings.text("prompt_template", _TEMPLATE, _MOST_LETTERS),
-        ["instruction", "actions", "e_actions"],
-    )
+    fields = ["instruction", "actions", "e_actions"]
     try:
-        parts = list(Formatter().parse(template))
+        parts = list(Formatter().parse(settings.text("prompt_template", _TEMPLATE, _MOST_LETTERS)))
     except ValueError:
         parts = []
     texts, found = [text for text, *_ in parts], [field for _, field, *_ in parts if field is not None]
-    if (
-        any(spec or kind for *_, spec, kind in parts)
-        or found not in (fields, fields[::2])
-        or "\n" in "".join(texts[1:])
-    ):
+    formatted, lines = any(spec or kind for *_, spec, kind in parts), "".join(texts[1:]).split("\n")
+    if formatted or found not in (fields, fields[::2]) or len(lines) > 1:
         expected = "text with {instruction}, {actions} (or not) and {e_actions}, in this order, in a line from there on"
         raise settings.refusal("prompt_template", expected, _TEMPLATE)
     return texts[: len(found)]
@@ -202,7 +194,7 @@ def read_config(shared: LeRobotConfig, language: Qwen3VLConfig) -> GrootConfig:
     settings = shared.settings
     preset = zip(_HEADS, _PRESETS[settings.choice("action_model_type", *_PRESETS)], strict=True)
     heads, channels = (settings.number(name, None, MOST) if settings.values.get(name) else own for name, own in preset)
-    layers, count = settings.number("action_num_layers", 16, _MOST_LAYERS), _answers(settings)
+    layers, count = settings.number("action_num_layers", 16, MOST_LAYERS), _answers(settings)
     return GrootConfig(
         language=language,
         mixing=None,

@@ -1,6 +1,7 @@
 """Binding times: the earliest moment at which each value of a graph is known."""
 
 from collections.abc import Mapping
+from functools import reduce
 
 from ..core.spec import PolicySpec
 from .graph import Batch, Graph
@@ -38,11 +39,8 @@ def bindings(graph: Graph, inputs: Mapping[str, Binding]) -> dict[str, Binding]:
             shaped.add(node.name)
             found[node.name] = Binding.TABLE
             continue
-        binding = Binding.CONSTANT
-        for name in read:
-            if name not in shaped:  # the batch size comes with the inputs
-                binding = join(binding, found[name])
-        found[node.name] = binding
+        # The batch size comes with the inputs.
+        found[node.name] = reduce(join, (found[name] for name in read if name not in shaped), Binding.CONSTANT)
     return found
 
 

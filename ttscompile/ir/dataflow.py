@@ -37,22 +37,15 @@ def dominators(graph: Graph, sources: Iterable[str], sinks: Iterable[str]) -> li
 
     In a topological order a value is such a point exactly if no edge on a live path jumps over it.
     """
-    source_list, sink_list = list(sources), list(sinks)
-    live = reachable_from(graph, source_list) & reaching(graph, sink_list)
-    order = [s for s in source_list if s in live] + [n.name for n in graph.nodes if n.name in live]
-    position = {name: i for i, name in enumerate(order)}
-    last_use = dict.fromkeys(order, -1)
-    for node in graph.nodes:
-        if node.name in live:
-            for name in node.refs():
-                if name in live:
-                    last_use[name] = position[node.name]
-    for sink in sink_list:
-        last_use[sink] = len(order)  # an edge to a sink behind all of them
+    sources, sinks = list(sources), list(sinks)
+    live = reachable_from(graph, sources) & reaching(graph, sinks)
+    starts, inner = [name for name in sources if name in live], [node for node in graph.nodes if node.name in live]
+    position = {name: i for i, name in enumerate([*starts, *(node.name for node in inner)])}
+    last_use = {name: position[node.name] for node in inner for name in node.refs()}
+    last_use |= dict.fromkeys(sinks, len(position))  # an edge to a sink behind all of them
     points, horizon = [], -1
-    first_inner = len(order) - len([n for n in graph.nodes if n.name in live])
-    for i, name in enumerate(order):
-        if horizon <= i and (i >= first_inner or first_inner == 1):
+    for name, i in position.items():
+        if horizon <= i and (i >= len(starts) or len(starts) == 1):
             points.append(name)
-        horizon = max(horizon, last_use[name])
+        horizon = max(horizon, last_use.get(name, -1))
     return points

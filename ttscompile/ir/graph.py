@@ -112,14 +112,15 @@ class Node:
 
     def renamed(self, rename: Callable[[str], str]) -> Node:
         """The same operation on other values; its own name is kept."""
-        return self._mapped(lambda leaf: Ref(rename(leaf.name)) if isinstance(leaf, Ref) else leaf)
+        return self.mapped(lambda leaf: Ref(rename(leaf.name)) if isinstance(leaf, Ref) else leaf)
 
     def resized(self, size: Callable[[Batch], Size]) -> Node:
         """The same operation with others in the place of the symbolic sizes."""
-        node = self._mapped(lambda leaf: size(leaf) if isinstance(leaf, Batch) else leaf)
+        node = self.mapped(lambda leaf: size(leaf) if isinstance(leaf, Batch) else leaf)
         return replace(node, types=tuple(type_.resized(size) for type_ in self.types))
 
-    def _mapped(self, function: Callable[[Argument], Argument]) -> Node:
+    def mapped(self, function: Callable[[Argument], Argument]) -> Node:
+        """The same operation on what the function makes of each of its ``leaves``."""
         args = tuple(_map(a, function) for a in self.args)
         return replace(self, args=args, kwargs=tuple((k, _map(a, function)) for k, a in self.kwargs))
 
@@ -170,6 +171,12 @@ class Graph:
         inputs, constants = ({called(n): t for n, t in types.items()} for types in (self.inputs, self.constants))
         nodes = tuple(replace(node.renamed(called), name=called(node.name)) for node in self.nodes)
         return Graph(inputs, constants, nodes, tuple(map(called, self.outputs)))
+
+    def mapped(self, leaf: Callable[[Argument], Argument], kind: Callable[[TensorType], TensorType]) -> Graph:
+        """The same values, with what ``leaf`` makes of the arguments of nodes, and ``kind`` of all types."""
+        inputs, constants = ({n: kind(t) for n, t in types.items()} for types in (self.inputs, self.constants))
+        nodes = (replace(node.mapped(leaf), types=tuple(map(kind, node.types))) for node in self.nodes)
+        return Graph(inputs, constants, tuple(nodes), self.outputs)
 
     def __str__(self) -> str:
         lines = ["inputs    " + ", ".join(f"%{n} : {t}" for n, t in self.inputs.items())]

@@ -26,7 +26,7 @@ import numpy.typing as npt
 import torch
 
 from .evaluate import evaluate
-from .graph import Argument, Batch, Graph, Node, Ref, TensorType
+from .graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice
 from .operations import Linear, operation
 from .program import Pieces
 
@@ -174,11 +174,8 @@ def _split_at_norm(tail: Graph, stream: str) -> tuple[Node, Graph]:
     users = tail.users()[stream]
     if len(users) != 1 or users[0].op != _NORM or users[0].args[0] != Ref(stream):
         raise _Declined(f"the tail does not begin with a LayerNorm of its input, but with {users[0]}")
-    norm = users[0]
-    rest = tuple(node for node in tail.nodes if node is not norm)
-    read = {ref for node in rest for ref in node.refs()}
-    constants = {name: type_ for name, type_ in tail.constants.items() if name in read}
-    return norm, replace(tail, inputs={norm.name: norm.type}, constants=constants, nodes=rest)
+    (norm,) = users
+    return norm, backward_slice(tail, tail.outputs, {norm.name: norm.type})
 
 
 def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wide, float]:
@@ -201,6 +198,4 @@ def _wide(graph: Graph) -> Graph:
     def wide(type_: TensorType) -> TensorType:
         return replace(type_, dtype="float64") if type_.dtype == "float32" else type_
 
-    inputs, constants = ({n: wide(t) for n, t in types.items()} for types in (graph.inputs, graph.constants))
-    nodes = tuple(replace(node, types=tuple(map(wide, node.types))) for node in graph.nodes)
-    return replace(graph, inputs=inputs, constants=constants, nodes=nodes)
+    return graph.mapped(lambda leaf: leaf, wide)

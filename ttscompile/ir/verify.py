@@ -66,8 +66,7 @@ def _verify_constants(graph: Graph, what: str, program: Phase) -> None:
         if weight is None:
             raise PassError(f"{what}: constant %{name} has no value in the program's weights.")
         if weight.shape != type_.shape or str(weight.dtype) != type_.dtype:
-            found = f"{weight.dtype}{list(weight.shape)}"
-            raise PassError(f"{what}: constant %{name} is {found}; its type says {type_}.")
+            raise PassError(f"{what}: constant %{name} is {weight.dtype}{list(weight.shape)}; its type says {type_}.")
 
 
 def _verify_loop(loop: Loop, blocks: tuple[Block, ...], spec: PolicySpec) -> None:

@@ -6,8 +6,6 @@ The pieces are small; run one by one they cost more in calls than in arithmetic.
 counts: samples are ``[D, B, T]``, so that the update is one product (``core.update``) and nothing is turned.
 What is carried from a step to the next comes in pairs ``NAME`` and ``NAME_next``; ``memory`` only where there is one.
 Steps without a computed block need a model of the sum that they add alone (``ir.idle_form``).
-
-Push-T, 1 thread: 41 us with samples ``[B, T, D]``, a product for each coefficient and one for the correction; 31 us so.
 """
 
 from dataclasses import replace

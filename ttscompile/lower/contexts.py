@@ -21,6 +21,7 @@ class Contexts:
         streams: value of B, int64 ``[1]``.
         steps: K.
 
+    Attributes:
         rows: tables ``[K, ...]`` by name.
         by_step: step values ``[K * B, ...]`` by name, step-major, whatever their axis of streams is.
     """

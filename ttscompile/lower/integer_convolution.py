@@ -13,6 +13,7 @@ import numpy.typing as npt
 from onnx import ModelProto, NodeProto, shape_inference
 
 from .graph_writer import GraphWriter
+from .onnx_model import replaced
 
 Array = npt.NDArray[Any]
 
@@ -27,15 +28,12 @@ _STREAMS = re.compile(r"([1-9][0-9]*\*)?B")
 """A size that depends on the number of streams, as ``onnx_model.value_info`` writes it."""
 
 LEAST = 2048
-"""Channels in times channels out from which integers are faster: gathering a tap costs as much for any. How many times
-as fast as in fp32 with onnxruntime 1.31, AVX-512 VNNI, one thread: 0.4 for 3 x 64, 1.9 for 3 x 768, 2.0 for 64 x 64,
-3.2 for 512 x 512."""
+"""Channels in times channels out from which integers are faster: gathering a tap costs as much for any."""
 
 
 def shapes_of(model: ModelProto, size: int = 1) -> dict[str, tuple[int, ...]]:
     """Shapes of values where B is ``size``; zero for a size that is not known."""
-    alone = ModelProto()
-    alone.CopyFrom(model)
+    alone = replaced(model)
     for value in alone.graph.input:
         for axis in value.type.tensor_type.shape.dim:
             if _STREAMS.fullmatch(axis.dim_param):

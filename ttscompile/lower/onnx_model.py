@@ -82,18 +82,23 @@ def own_model(graph: GraphProto, opset_import: Iterable[onnx.OperatorSetIdProto]
 
 def only(model: ModelProto, inputs: Sequence[ValueInfoProto], outputs: Sequence[ValueInfoProto]) -> ModelProto:
     """The part of a model that computes ``outputs`` from ``inputs``; both are the model's own."""
-    part = ModelProto()
-    part.CopyFrom(model)
     nodes = live_nodes(list(model.graph.node), {value.name for value in outputs})
     own = {value.name for value in inputs}
     foreign = {value.name for value in model.graph.input} - own
     for node in nodes:
         if crossed := foreign.intersection(node.input):
             raise LoweringError(f"{node.op_type} {node.name!r} reads {sorted(crossed)}, the input of another piece.")
-    for field, kept in (("node", nodes), ("input", inputs), ("output", outputs)):
-        part.graph.ClearField(field)
-        getattr(part.graph, field).extend(kept)
-    return part
+    return replaced(model, node=nodes, input=inputs, output=outputs)
+
+
+def replaced(model: ModelProto, **fields: Sequence[NodeProto | TensorProto | ValueInfoProto]) -> ModelProto:
+    """A copy of a model whose graph has these nodes, initializers, inputs or outputs in place of its own."""
+    copy = ModelProto()
+    copy.CopyFrom(model)
+    for field, values in fields.items():
+        copy.graph.ClearField(field)
+        getattr(copy.graph, field).extend(values)
+    return copy
 
 
 def live_nodes(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]:

@@ -27,7 +27,7 @@ from ..ir.pieces import BLOCKS, CONDITION, INDEX, OF_ALL_BLOCKS, PIXELS, STEP, f
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
 from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, integer_convolution, shapes_of
-from .onnx_model import live_nodes
+from .onnx_model import live_nodes, replaced
 
 if TYPE_CHECKING:
     from ..ir.program import Program
@@ -201,17 +201,13 @@ def quantize_model(
         ):
             w.nodes.append(node)
     nodes = live_nodes(w.nodes, {value.name for value in model.graph.output})
-    quantized = ModelProto()
-    quantized.CopyFrom(model)
     if not constants:
-        return quantized, {}
+        return replaced(model), {}
     read = {name for node in nodes for name in node.input} | {value.name for value in model.graph.output}
     kept = [tensor for tensor in model.graph.initializer if tensor.name in read]
     types = {name: helper.np_dtype_to_tensor_dtype(value.dtype) for name, value in constants.items()}
     added = [TensorProto(name=n, dims=value.shape, data_type=types[n]) for n, value in constants.items()]
-    for field, values in (("node", nodes), ("initializer", [*added, *kept, *w.initializers])):
-        quantized.graph.ClearField(field)
-        getattr(quantized.graph, field).extend(values)
+    quantized = replaced(model, node=nodes, initializer=[*added, *kept, *w.initializers])
     quantized.opset_import.append(helper.make_opsetid(DOMAIN, _DOMAIN_VERSION))
     return quantized, constants
 
