@@ -27,7 +27,7 @@ from .report import GIVEN, CallReport
 from .runtime import Runtime
 from .tokens import Seen
 
-NO_PREFIX = "its plan begins with the chunk of the call before, and so keeps to it already"
+NO_PREFIX = "its plan begins with the chunk of the call before, and so keeps to it already."
 
 
 class CompiledPolicy:

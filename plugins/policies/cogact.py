@@ -19,6 +19,7 @@ from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.refusals import refuse_payload
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import configured_loops
 
@@ -122,7 +123,13 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
 
 def _weights(path: Path) -> dict[str, Tensor]:
     """Copies of those of the action model; the rest, some 30 GB, stays on the disk."""
-    payload: Any = read_checkpoint(path, mapped=True).get("model")
+    whole = read_checkpoint(path, mapped=True)
+    if any(str(name).startswith("qwen_vl_interface.") for name in whole):  # whose action head has the same name
+        try:
+            refuse_payload(whole)
+        except CheckpointError as error:
+            raise CheckpointError(f"{path}: {error}") from error
+    payload: Any = whole.get("model")
     found = payload.get("action_model") if isinstance(payload, dict) else None
     if not isinstance(found, dict):
         what = f"found {sorted(map(str, payload))[:8]}" if isinstance(payload, dict) else "found no entry model"

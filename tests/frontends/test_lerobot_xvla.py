@@ -136,6 +136,18 @@ def test_the_robot_is_the_preprocessors(directory: Path, golden: Mapping[str, Ar
     assert np.abs(eager(directory, "ee6d", 0) - golden["ee6d.0"]).max() > 0.01
 
 
+def test_weights_as_its_authors_save_them(tmp_path: Path) -> None:
+    """Beside LeRobot's JSON files: without the level ``model``, and as Microsoft's code names Florence's layers."""
+    directory, options = xvlas.save("auto", tmp_path), LoadOptions(task=xvlas.TASKS[0])
+    before, path = load_checkpoint_policy(directory, options=options)[0].state_dict(), directory / "model.safetensors"
+    weights = load_file(path)
+    assert any(name.startswith("model.vlm.language_model.model.encoder.") for name in weights)
+    path.unlink()
+    save_file({name.removeprefix("model."): value for name, value in weights.items()}, path)
+    found = load_checkpoint_policy(directory, options=options)[0].state_dict()
+    assert all(torch.equal(found[name], before[name]) for name in before | found)
+
+
 def test_a_policy_without_state(tmp_path: Path, golden: Mapping[str, Array]) -> None:
     directory = xvlas.save("agibot_ee6d", tmp_path)
     entries = json.loads((directory / "config.json").read_text())

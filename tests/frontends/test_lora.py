@@ -23,7 +23,7 @@ from ttscompile.hub import fetch_checkpoint
 
 from ..hub.conftest import hub as hub
 from ..hub.served import Hub
-from . import lerobot_unets
+from . import lerobot_unets, vla_jepas
 from .lerobot_tiny import TEXT, change_json, dit_config, save_policy, write_json
 
 Tensors = dict[str, torch.Tensor]
@@ -182,6 +182,30 @@ def test_whole_modules_biases_and_the_length_of_rows(base: Path) -> None:
     before = network(base)
     before.pop(name)
     assert_same(found, expected, before, 4)
+
+
+def test_all_biases_of_a_module_that_is_saved_whole(base: Path) -> None:
+    """PEFT 0.21 saves them three times with ``bias="all"``: as the module's, and with a level of its own between."""
+    output = f"{START}noise_predictor.output_proj"
+    own = {f"{output}.weight": drawn(3, 16), f"{output}.bias": drawn(3), **pair(QKV, 48, 16)}
+    copies = {f"{output}.modules_to_save.bias": drawn(3), f"{output}.original_module.bias": drawn(3, seed=9)}
+    settings: dict[str, Any] = {"modules_to_save": ["output_proj"], "bias": "all"}
+    expected = network(save_adapter(base, own, **settings))
+    shutil.rmtree(base.parent / "adapter")
+    assert_same(network(save_adapter(base, own | copies, **settings)), expected, network(base), 3)
+
+
+def test_a_whole_module_that_the_policy_does_not_compute(tmp_path: Path) -> None:
+    """A predictor of videos is for training alone: its weights are there, and are not read."""
+    base = vla_jepas.save(vla_jepas.KINDS[0], tmp_path)
+    weights = load_file(base / "model.safetensors")
+    predictor = [name for name in weights if ".video_predictor." in name]
+    changed = next(name for name in weights if name.endswith("language_model.layers.0.mlp.up_proj.weight"))
+    tensors = {f"{START}{name}": weights[name] for name in predictor}
+    tensors |= pair(changed.removesuffix(".weight"), *weights[changed].shape)
+    adapter = save_adapter(base, tensors, modules_to_save=["video_predictor"])
+    assert predictor
+    assert sum(not torch.equal(value, network(base)[name]) for name, value in network(adapter).items()) == 1
 
 
 def test_convolutions(tmp_path: Path) -> None:

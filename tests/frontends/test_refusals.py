@@ -37,6 +37,11 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
         "CogACT",
         "ends with .pt",
     ),
+    (
+        {"qwen_vl_interface.model.a": W, "action_model.model.proj_out_1.weight": W, "vj_predictor.a": W},
+        "a VLA-JEPA or another of starVLA",
+        rf"No tool makes LeRobot's vla_jepa of it: .*{OWN_MODULE}",
+    ),
     ({"gating_network._layers.0.weight": W, "joint_cmps._gpt.a": W}, "a policy of VDD", "There is no denoising loop"),
     (
         {"itr": 9, "model": {"actor_ft.mlp_mean.layers.0.l1.weight": W, "actor.a": W}},
@@ -63,6 +68,15 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     ({"blocks.0.weight": W, "head.bias": W}, "a plain dictionary of weights", "do not say how they are connected"),
     ({}, "a plain dictionary of weights", r"its entries \(none\)"),
 ]
+
+
+def test_a_vla_jepa_is_told_from_a_cogact(tmp_path: Path) -> None:
+    """Both have an ``action_model``, and both are files of a folder ``checkpoints``."""
+    path = tmp_path / "VLA-JEPA-LIBERO.pt"
+    torch.save({"qwen_vl_interface.model.a": W, "action_model.model.proj_out_1.weight": W}, path)
+    with pytest.raises(CheckpointError, match="this is a VLA-JEPA or another of starVLA") as caught:
+        load_checkpoint_policy(path)
+    assert str(caught.value).startswith(f"{path}: ")
 
 
 @pytest.mark.parametrize(("payload", "what", "remedy"), PAYLOADS)
@@ -112,6 +126,15 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["config.json=model_type=Gr00tN1d7", "model-00001.safetensors"], r"N1\.7 as NVIDIA saves it.*save_pretrained"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
     (["config.json=policy_head_type=unet_diffusion_policy", "model.safetensors"], "DexVLA.*whose head is a U-Net"),
+    (
+        ["config.json=model_type=xvla", "model.safetensors"],
+        "an X-VLA .*beside the JSON files .* a LeRobot policy xvla,",
+    ),
+    (["config.json=paligemma_variant=gemma_2b", "model.safetensors"], "openpi .*beside .* LeRobot policy pi0 or pi05,"),
+    (["30000/model.safetensors", "30000/metadata.pt"], r"openpi .told by 30000/metadata\.pt"),
+    (["config.json=vlm_name=InternVL3", "mp_rank_00_model_states.pt"], "an Evo-1 .*No tool makes LeRobot's evo1"),
+    (["checkpoint-1000/config.json", "checkpoint-1000/model.safetensors"], "around checkpoints .*Give one of those in"),
+    (["step_final/config.json", "step_final/checkpoint.pt"], "around checkpoints .*Give one of those in it"),
     (["pytorch_model.bin"], "a directory of weights"),
     (["README.md"], r"found README\.md; expected the config\.json and model\.safetensors"),
     ([], "found nothing"),

@@ -196,3 +196,13 @@ def test_what_a_plan_falls_back_on_is_in_the_precision_that_is_named(artifact: A
             plan, first = artifact.plan(f"{name}@{precision}"), artifact.plan(f"{other}@{precision}")
             assert plan.otherwise is first and artifact.told(first) == f"{other}@{precision}"
             assert dict(plan.precision) == dict(first.precision)
+
+
+def test_what_an_exact_plan_falls_back_on_is_exact(artifact: Artifact) -> None:
+    """Where the plan itself is in fp32 already, too; what is exact stays what it is."""
+    narrow = replace(artifact.plans["four"], precision={"blocks": "int8"})
+    plan = replace(artifact.plan("start-3"), precision={}, tokens=None, otherwise=narrow)
+    exact = plan.exact
+    assert exact.otherwise is not None and not exact.otherwise.precision
+    assert exact.exact is exact and artifact.plans["dense"].exact is artifact.plans["dense"]
+    open_runtime(artifact, "reference", plan=exact)

@@ -116,7 +116,7 @@ class Plan:
     @property
     def exact(self) -> Plan:
         """The same with all parts in fp32 and all tokens computed, which every runtime can do; itself if it is so."""
-        if not self.precision and self.tokens is None:
-            return self
         otherwise = None if self.otherwise is None else self.otherwise.exact
+        if not self.precision and self.tokens is None and otherwise is self.otherwise:
+            return self
         return replace(self, precision={}, tokens=None, otherwise=otherwise)

@@ -24,6 +24,7 @@ _KNOWN = set(
     " exclude_modules layers_to_transform layers_pattern eva_config megatron_core qalora_group_size".split()
 )  # entries that are read, or that change nothing once there are weights; any other one has to be empty
 _LAYER = re.compile(r"base_model\.model\.(.+)\.(lora_[AB]\.weight|lora_magnitude_vector)")
+_COPY = re.compile(r"\.(modules_to_save|original_module)\..*bias$")  # of what is saved whole, where all biases are, too
 _PATTERN = re.compile(r"(?:[\w.|^$-]|\\[.d]|\.\*(?!.*\*.*\*))+")  # what cannot take for ever to match
 _LEVELS = re.compile(r"\b(?:model|vision_model|text_model)\.")  # other versions of transformers have them elsewhere
 
@@ -63,11 +64,11 @@ def find_base(settings: Settings, given: str | os.PathLike[str] | None) -> Path:
 
 def merged(directory: Path, settings: Settings, base: Tensors, without: tuple[str, ...]) -> Tensors:
     """The base, float32 by name, with the weights in their place that PEFT's ``merge_and_unload`` makes."""
-    where, changes = Settings({}, f"{directory / CHANGES}: ", MERGE), dict[str, Tensors]()
-    kept = dict.fromkeys(settings.values.get("modules_to_save") or (), False)
+    where, changes, done = Settings({}, f"{directory / CHANGES}: ", MERGE), dict[str, Tensors](), set[str]()
+    kept = {each: any(each in one for one in without) for each in settings.values.get("modules_to_save") or ()}
     biases = settings.choice("bias", "none", "all", "lora_only") != "none"
     saved = {key: value for key, value in read_tensors(directory / CHANGES).items() if not left_out(key, without)}
-    for key, value in as_float32(saved, where.where).items():
+    for key, value in as_float32({key: saved[key] for key in saved if not _COPY.search(key)}, where.where).items():
         part = _LAYER.fullmatch(key)
         name = f"{part[1]}.weight" if part else key.removeprefix("base_model.model.").replace(".base_layer.", ".")
         modules = [each for each in kept if f"{each}." in name and not part]
@@ -77,7 +78,6 @@ def merged(directory: Path, settings: Settings, base: Tensors, without: tuple[st
         changes.setdefault(name, {})[part[2] if part else ""] = value
     if not changes or not all(kept.values()):
         raise where.error(f"found {len(changes)} changes and of modules_to_save {kept}; expected weights of each")
-    done = set[str]()
     for name, parts in changes.items():
         if not left_out(name, without):  # which the policy does not compute
             own = [name] if name in base else [each for each in base if _LEVELS.sub("", each) == _LEVELS.sub("", name)]

@@ -28,7 +28,8 @@ _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other mo
 _DPPO = f"{_BUILD}. Of one that is fine-tuned, the module takes actor_ft in the last steps, and actor before them."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
 _INNER = "Give its folder pretrained_model."
-_JAX_FILES = r"(^|/)(_METADATA|_CHECKPOINT_METADATA|manifest\.ocdbt)$|\.msgpack$"
+_PUT = "Put model.safetensors beside the JSON files and statistics of a LeRobot policy {}, and convert that folder."
+_TRAIN = f"No tool makes LeRobot's {{}} of it: train one with LeRobot. Or: {_HEAD}"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
 _HYBRID_VLA = "Give the .pt file of its folder checkpoints, as its training saved it."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
@@ -37,7 +38,6 @@ _NO_LOOP = (
     "There is no denoising loop to compile. Export its network with torch.onnx.export and run it with onnxruntime, or"
     " use torch.compile."
 )
-_LLAMA = "There is no denoising loop to compile. llama.cpp runs such files."
 MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _BY_NAME = (
     (r"\.onnx$", "an ONNX model", "It has no denoising loop. Convert the checkpoint that it was exported from."),
@@ -80,11 +80,15 @@ POLICIES = (
 DIRECTORIES = (
     Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
     Refusal(r"^adapter_config\.json$", "a PEFT adapter without the config.json of its policy", MERGE),
-    Refusal(_JAX_FILES, "a JAX checkpoint (Orbax or msgpack)", _JAX),
+    Refusal(r"(^|/)(_(CHECKPOINT_)?METADATA|manifest\.ocdbt)$|\.msgpack$", "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
+    Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT.format("xvla")),
+    Refusal(r"^config\.json: paligemma_|(^|/)metadata\.pt$", "a pi0 or pi0.5 of openpi", _PUT.format("pi0 or pi05")),
+    Refusal(r"^config\.json: vlm_name=", "an Evo-1 as its authors save it", _TRAIN.format("evo1")),
     Refusal(r"^config\.json: policy_head_type=unet", "a DexVLA or DiVLA whose head is a U-Net", _HEAD),
+    Refusal(r"^(checkpoint-|step_)\w+/config\.json$", "a directory around checkpoints", "Give one of those in it."),
     Refusal(r"\.ckpt$|^checkpoints/[^/]+\.pt$", "a directory of checkpoints", "Give one of the files in it."),
     Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
 )
@@ -105,17 +109,14 @@ LEROBOT = (
         f"{_BUILD}: one step of the model over a cached prefix is the module.",
     ),
     Refusal(r"^molmoact2$", "a policy whose backbone, Molmo, is not rebuilt here", _HEAD),
-    Refusal(
-        r"^(fastwam|lingbot_va)$",
-        "a world model that denoises video beside actions, Wan2.2, which is not rebuilt here",
-        "No module of it was compiled yet.",
-    ),
+    Refusal(r"^(fastwam|lingbot_va)$", "a world model of video, Wan2.2, not rebuilt here", "It was not compiled yet."),
     Refusal(r"", "not known", f"Expected {LEROBOT_TYPES}. If it denoises: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
 
 STATES = (
     Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
+    Refusal(r"^qwen_vl_interface\.", "a VLA-JEPA or another of starVLA as it is saved", _TRAIN.format("vla_jepa")),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
     Refusal(
@@ -184,7 +185,7 @@ def refuse_file(path: Path) -> None:
     if head.startswith(b"\x89HDF\r\n"):
         raise _refused(path, "an HDF5 file, data or Keras weights", "its first bytes", _WEIGHTS)
     if head.startswith(b"GGUF"):
-        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", _LLAMA)
+        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", "llama.cpp runs such files.")
     for sign, what, remedy in _BY_NAME:
         if re.search(sign, path.name):
             raise _refused(path, what, "its name", remedy)
@@ -213,8 +214,7 @@ def refuse_directory(path: Path) -> NoReturn:
             raise _refused(path, row.what, how, row.remedy)
     raise CheckpointError(
         f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
-        f" config.json and model.safetensors of LeRobot's {LEROBOT_TYPES}, or give a .ckpt file of Diffusion Policy."
-        f" Otherwise: {_BUILD}."
+        f" config.json and model.safetensors of LeRobot's {LEROBOT_TYPES}, or a .ckpt of Diffusion Policy. {_BUILD}."
     )
 
 
