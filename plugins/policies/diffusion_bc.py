@@ -275,7 +275,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
 def _saved(path: Path) -> dict[str, Any]:
     payload = read_checkpoint(path)
     saved = next((payload[name] for name in _ENTRIES if isinstance(payload.get(name), Mapping)), payload)
-    return {str(name).removeprefix("module."): value for name, value in saved.items()}
+    return {str(name).replace("_orig_mod.", "").removeprefix("module."): value for name, value in saved.items()}
 
 
 def _schedule(path: Path, saved: Mapping[str, Any]) -> tuple[list[float], list[float]]:

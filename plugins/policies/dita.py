@@ -134,7 +134,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a head from a checkpoint and the configuration of its training; see ``Family.load``."""
     where = next(each for each in config_files(path) if each.is_file())
     settings = Settings(read_yaml(where), f"{where}: ", _REMEDY)
-    settings.require(use_action_head_diff=0, dim_align_type=0)
+    settings.require(use_action_head_diff=0, dim_align_type=0, abs_sup=0, cfg=0)
     horizon, predicted = _lengths(settings)
     saved = _saved(path)
     width, hidden, layers, actions = _sizes(path, saved)
@@ -191,7 +191,7 @@ def _saved(path: Path) -> Mapping[str, Any]:
     names = [str(name) for name in saved]
     if adapted := next((name for name in names if ".lora_A." in name), None):
         raise CheckpointError(f"{path}: holds an adapter (LoRA: {adapted:.120}). {MERGE}")
-    return {str(name).removeprefix("module."): value for name, value in saved.items()}
+    return {str(name).replace("_orig_mod.", "").removeprefix("module."): value for name, value in saved.items()}
 
 
 def _sizes(path: Path, saved: Mapping[str, Any]) -> tuple[int, int, int, int]:

@@ -100,8 +100,10 @@ def test_other_files_that_hold_the_same_policy(tmp_path: Path) -> None:
     torch.testing.assert_close(other.state_dict(), expected, rtol=0, atol=0)
     assert same.sampler.same_as(spec.sampler)
     saved = torch.load(tmp_path / "bc.pt")
-    torch.save({f"module.{name}": value for name, value in saved.items()}, tmp_path / "c.pth")
-    torch.testing.assert_close(load_checkpoint_policy(tmp_path / "c.pth")[0].state_dict(), expected, rtol=0, atol=0)
+    for wrapper in ("module.", "_orig_mod.", "_orig_mod.module.", "module._orig_mod."):
+        torch.save({f"{wrapper}{name}": value for name, value in saved.items()}, tmp_path / "c.pth")
+        found = load_checkpoint_policy(tmp_path / "c.pth")[0].state_dict()
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
     changed = {name: value.half() if name.startswith("nn_model.") else value for name, value in saved.items()}
     torch.save(changed, tmp_path / "d.pth")
     halved = {name: value.half().float() for name, value in expected.items()}

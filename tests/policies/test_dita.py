@@ -85,7 +85,7 @@ def test_the_lengths_and_the_sampler_are_the_configurations(tmp_path: Path) -> N
 
 def test_other_files_that_hold_the_same_head(tmp_path: Path) -> None:
     expected = {name: value for name, value in weights().items() if name not in QUERIES}
-    path = save(tmp_path, {f"module.{name}": value.half() for name, value in weights().items()})
+    path = save(tmp_path, {f"module._orig_mod.{name}": value.half() for name, value in weights().items()})
     module = load_checkpoint_policy(path)[0]
     halved = {name: value.half().float() for name, value in expected.items()}
     torch.testing.assert_close(dict(module.state_dict()), halved, rtol=0, atol=0)
@@ -98,6 +98,8 @@ LAYER = "transformer.model.layers.0.mlp."
 REFUSED: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"use_action_head_diff": 2}, {}, "use_action_head_diff is 2; expected 0: another is not rebuilt here"),
     ({"dim_align_type": 1}, {}, "dim_align_type is 1; expected 0"),
+    ({"cfg": 1.5}, {}, "cfg is 1.5; expected 0: another is not rebuilt here"),
+    ({"abs_sup": 3}, {}, "abs_sup is 3; expected 0: another is not rebuilt here"),
     (
         {"dataset": None},
         {},
