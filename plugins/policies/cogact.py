@@ -105,7 +105,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
             " number of heads: build it with the code that trained it and use ttscompile.compile_denoiser."
         )
     sizes = {"layers": layers, "horizon": horizon, "actions": actions, "cognition": cognition}
-    head = filled(lambda: CogACTHead(width, heads, guidance=GUIDANCE, **sizes), weights, "its own shapes", path)
+    head = filled(lambda: CogACTHead(width, heads, guidance=GUIDANCE, **sizes), weights, "the first of each kind", path)
     settings = {"_target_": "DDIMScheduler", **_TRAINED}
     loops = configured_loops(settings, STEPS, options, where=f"{path}: the sampler")
     loops = changed(loops, lambda table: clipped(table, 1.0))  # predict_action clips what the loop gives

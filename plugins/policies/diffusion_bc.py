@@ -252,9 +252,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     if unknown := sorted(name for name in saved if name not in known and not name.endswith(_UNREAD)):
         raise CheckpointError(f"{path}: its entry {unknown[0]:.80} is none of a Model_Cond_Diffusion's. {_REMEDY}")
     sizes = replace(_sizes(path, weights), timesteps=len(betas) - 1)
-    network = filled(
-        lambda: DiffusionBC(sizes), as_float32(weights, f"{path}: "), "The first weight of each kind", path
-    )
+    network = filled(lambda: DiffusionBC(sizes), as_float32(weights, f"{path}: "), "the first of each kind", path)
     loops = loops_of(lambda asked: _table(betas, signal, asked), options, "ddpm")
     spec = PolicySpec(
         sample=(1, sizes.actions),

@@ -187,7 +187,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     count = sizes.actions
     grippers = {7: (GRIPPER,), 14: (GRIPPER, GRIPPER + 7)}.get(count, ())
     own = read_statistics(path, count, grippers, state=count)
-    network = filled(lambda: HybridVLAHead(sizes, own.state), weights, "A Llama 2 of the width of its last norm", path)
+    network = filled(lambda: HybridVLAHead(sizes, own.state), weights, "a Llama 2 as wide as the last norm", path)
     loops = ddim_loops(where, STEPS, options, num_train_timesteps=TIMESTEPS, clip_sample=False)
     loops = changed(loops, lambda table: clipped(table, 1.0))  # predict_action clips what the loop gives
     seen = None if own.state is None else (tuple(own.state.low.tolist()), tuple(own.state.high.tolist()))

@@ -81,7 +81,7 @@ def test_adaptors_are_what_their_names_say(adaptor: str, depths: tuple[int, int,
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rdt": RDT["rdt"] | {"depth": 5}}, r"missing model\.blocks\.4.*config\.json describes another network"),
+        ({"rdt": RDT["rdt"] | {"depth": 5}}, r"missing model\.blocks\.4.*another network than config\.json describes"),
         (
             {"rdt": RDT["rdt"] | {"hidden_size": 2**30}},
             "rdt.hidden_size is 1073741824; expected a positive whole number,",

@@ -40,8 +40,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
 
     The default is ``best_plan`` of those within ``Request.farthest``, where those within ``Request.bound`` are near
     enough; there is a warning if it is not one of them. ``schedule`` is the name of the default, ``safe`` that of the
-    fastest plan that is near enough and a good deal nearer, and ``fast`` that of the fastest of all that are kept, where
-    it saves more than what counts as equally fast.
+    fastest plan that is near enough and a good deal nearer, and ``fast`` that of the fastest within
+    ``Request.farthest``, where it saves more than what counts as equally fast.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.

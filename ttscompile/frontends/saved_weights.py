@@ -140,13 +140,13 @@ def require_weights(
     if missing or extra:
         parts = [f"missing {names_of(missing)}"] * bool(missing) + [f"unexpected {names_of(extra)}"] * bool(extra)
         raise CheckpointError(
-            f"{what}: {'; '.join(parts)}. {source} describes another network than the one that was saved, or the file"
-            " is incomplete; ttscompile.compile_denoiser(module, spec) takes any network."
+            f"{what}: {'; '.join(parts)}. What was saved is another network than {source} describes, or the file is"
+            " incomplete; ttscompile.compile_denoiser(module, spec) takes any network."
         )
     for name, value in found.items():
         if value.shape != expected[name].shape:
             shapes = f"{tuple(value.shape)}; expected {tuple(expected[name].shape)}"
-            raise CheckpointError(f"weight {name} has shape {shapes} from {source}.")
+            raise CheckpointError(f"weight {name} has shape {shapes}, which {source} describes.")
         # The extremes are no number where any is none; asking each number would take more memory than all of them have.
         if name not in masks and value.numel() and not torch.isfinite(torch.stack(torch.aminmax(value))).all():
             count = int((~torch.isfinite(value)).sum())
