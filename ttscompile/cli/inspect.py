@@ -82,7 +82,7 @@ def inspect(
             if verifies:
                 passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
             policy = open_policy(artifact, seed=0)
-            told = write_page(output, artifact, policy, Given(episode, section, 1), status.update)
+            told = write_page(output, artifact, policy, Given(episode, section), status.update)
         say(console, told)
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)
