@@ -67,11 +67,7 @@ class Backend(Protocol[Lowered]):
     keeps: BoolArray
 
     def lower(self, plan: PlanArray) -> Lowered:
-        """What ``other_steps`` needs of the plan of one stream. The runtime keeps it, and gives it again.
-
-        Args:
-            plan: int8 ``[K, blocks]``, legal.
-        """
+        """What ``other_steps`` needs of a stream's plan, int8 ``[K, blocks]`` and legal. The runtime gives it again."""
 
     def prepare(self, streams: int, plans: Sequence[Lowered] | None) -> None:
         """Have everything that a call needs beside its inputs: memory, for the most part. It is not timed.
@@ -94,11 +90,7 @@ class Backend(Protocol[Lowered]):
         """Step 0, which is dense in every plan. A backend that cannot begin without a plan does nothing here."""
 
     def other_steps(self, plans: Sequence[Lowered]) -> FloatArray:
-        """The rest of the call.
-
-        Returns:
-            The denoised sample, float32 ``[B, T, D]``: an array that no later call changes.
-        """
+        """The rest of the call: the denoised sample, float32 ``[B, T, D]``, which no later call changes."""
 
 
 @contextmanager

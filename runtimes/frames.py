@@ -84,7 +84,6 @@ class FrameMemory:
         """Compute the rows that are not known; nothing is kept of one whose computing fails.
 
         Args:
-            contents: of the rows.
             compute: asked once for each new row.
             stop: asked before each; the rest is left out if it says so.
         """
@@ -113,11 +112,9 @@ class FrameMemory:
 
 
 def contents_of(rows: Sequence[Array], lanes: Sequence[Lane] = ()) -> list[Content]:
-    """The content of each row, of the inputs of a piece ``[N, ...]``.
+    """The content of each row, of rows ``[N, ...]`` for each input of a piece.
 
-    Args:
-        rows: of each input.
-        lanes: of the rows, where what is given for one depends on the frames of its lane before it.
+    ``lanes`` are those of the rows, where what is given for one depends on the frames of its lane before it.
     """
     own = [[lane] for lane in lanes] or [[] for _ in rows[0]]
     return [(*lane, *(row.tobytes() for row in one)) for lane, *one in zip(own, *rows, strict=True)]
@@ -161,22 +158,24 @@ class FramePieces:
 
     def learn(self, obs: Mapping[str, Array], stop: Stop = _never) -> FrameWork:
         """Compute what is new in normalised observations ``[B, ...]``, until ``stop`` says so."""
-        rows, work = self._rows_of(obs), FrameWork()
-        for name, piece in self._pieces.items():
-            own = [rows[n] for n in piece.inputs]
-            lanes = self._lanes_of(name, obs)
-            work += self._memory[name].learn(contents_of(own, lanes), self._compute(name, own, lanes), stop)
-        return work
+        return self._learned(obs, stop)[0]
 
     def values(self, obs: Mapping[str, Array]) -> dict[str, Array]:
         """What the condition piece reads beside normalised observations ``[B, ...]``; nothing without frame pieces."""
-        rows, found, self.work = self._rows_of(obs), dict[str, Array](), FrameWork()
-        for name, piece in self._pieces.items():
-            own, memory, lanes = [rows[n] for n in piece.inputs], self._memory[name], self._lanes_of(name, obs)
-            contents = contents_of(own, lanes)
-            self.work += memory.learn(contents, self._compute(name, own, lanes))
-            found |= zip(piece.outputs, memory.values(contents), strict=True)
+        found = dict[str, Array]()
+        self.work, known = self._learned(obs)
+        for name, contents in known.items():
+            found |= zip(self._pieces[name].outputs, self._memory[name].values(contents), strict=True)
         return found
+
+    def _learned(self, obs: Mapping[str, Array], stop: Stop = _never) -> tuple[FrameWork, dict[str, list[Content]]]:
+        """What was done for new rows, until ``stop`` said so; and the contents of all rows, by piece."""
+        rows, work, known = self._rows_of(obs), FrameWork(), dict[str, list[Content]]()
+        for name, piece in self._pieces.items():
+            own, lanes = [rows[n] for n in piece.inputs], self._lanes_of(name, obs)
+            known[name] = contents_of(own, lanes)
+            work += self._memory[name].learn(known[name], self._compute(name, own, lanes), stop)
+        return work, known
 
     def _rows_of(self, obs: Mapping[str, Array]) -> dict[str, Array]:
         if self._rows is None:

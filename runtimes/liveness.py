@@ -50,11 +50,6 @@ def readable_rollout(view: View) -> BoolArray:
     return readable
 
 
-def reading_earlier_calls(view: View) -> set[str]:
-    """Names of the plans that can read what an earlier call of the episode computed."""
-    return {name for name, plan in view.plans.items() if reads_earlier_calls(view, plan)}
-
-
 def reads_earlier_calls(view: View, plan: Plan) -> bool:
     """Whether the cells of a plan can read what an earlier call of the episode computed; ``view`` is the plan's."""
     if plan.cells is None:

@@ -3,7 +3,7 @@
 import threading
 import weakref
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,9 @@ from .runtime import Runtime
 from .tokens import Seen
 
 NO_PREFIX = "its plan begins with the chunk of the call before, and so keeps to it already."
+
+AnyPlan: TypeAlias = str | Plan | npt.ArrayLike | None
+"""What ``predict_action`` takes as a plan."""
 
 
 class CompiledPolicy:
@@ -81,15 +84,12 @@ class CompiledPolicy:
     def info(self) -> PolicyInfo:
         """What this policy is: with the plan that it was loaded with."""
         view, default = self._runtime.view(self._default), self._default
-        refusal, spec = self._prefix_refusal(default), self._spec
-        manifest, blocks = view.manifest, []
-        begun = self._runtime.noise_spec(default).sampler
-        for block in manifest.blocks:
-            shape = tuple(n for i, n in enumerate(block.type.at(1)) if i != block.type.batch_axis)
-            blocks.append(BlockInfo(block.kind, shape, block.flops))
+        manifest, begun = view.manifest, self._runtime.noise_spec(default).sampler
+        shapes = [tuple(n for i, n in enumerate(b.type.at(1)) if i != b.type.batch_axis) for b in manifest.blocks]
+        blocks = zip(manifest.blocks, shapes, strict=True)
         return PolicyInfo(
             K=manifest.steps,
-            blocks=tuple(blocks),
+            blocks=tuple(BlockInfo(block.kind, shape, block.flops) for block, shape in blocks),
             dense_flops=manifest.flops.dense,
             observation=manifest.spec.observations,
             action=manifest.spec.chunk,
@@ -103,13 +103,13 @@ class CompiledPolicy:
             default_plan=self._artifact.told(default) or GIVEN,
             precision=" and ".join(dict.fromkeys(default.precision.values())) or FP32,
             rollout=rollout_needs(view),
-            prefix_refusal=refusal,
+            prefix_refusal=self._prefix_refusal(default),
             frames=len(self._runtime.frames),
             reuses_tokens=self._runtime.frames.reuses_tokens,
             follows=default.otherwise is not None,
             noise=manifest.spec.noise,
             other_noise=(self._artifact.manifest.calibration or {}).get("other_noise") or None,
-            trained_prefix=spec.trained_prefix,
+            trained_prefix=manifest.spec.trained_prefix,
         )
 
     @property
@@ -139,11 +139,7 @@ class CompiledPolicy:
                 self._rng = np.random.default_rng(seed)
 
     def predict_action(
-        self,
-        obs_dict: Mapping[str, Any],
-        noise: Noise | None = None,
-        plan: str | Plan | npt.ArrayLike | None = None,
-        prefix: Any = None,
+        self, obs_dict: Mapping[str, Any], noise: Noise | None = None, plan: AnyPlan = None, prefix: Any = None
     ) -> dict[str, Any]:
         """One call of the policy.
 
@@ -171,9 +167,8 @@ class CompiledPolicy:
             NonFiniteActionsError: the arithmetic overflowed, and the episode has ended.
         """
         with self._turn():
-            spec = self._spec
             obs, example = self._read(obs_dict)
-            predicted, chunk = self._predict(obs, noise, plan, prefix), spec.chunk
+            predicted, chunk = self._predict(obs, noise, plan, prefix), self._spec.chunk
             executed = predicted[:, chunk.start : chunk.stop]
             return {"action": like(executed.copy(), example), "action_pred": like(predicted.copy(), example)}
 
@@ -210,11 +205,7 @@ class CompiledPolicy:
                 return self._runtime.frames.learn(normalized, stop)
 
     def seen(self) -> tuple[Seen, ...]:
-        """What the policy sees of each camera of each stream, and which patches were computed last.
-
-        Returns:
-            A ``Seen`` a camera and stream; nothing after ``reset``, and where no tokens are reused.
-        """
+        """What it sees of each camera of each stream; nothing after ``reset``, and where no tokens are reused."""
         with self._turn():
             return self._runtime.frames.seen()
 
@@ -233,9 +224,7 @@ class CompiledPolicy:
         with self._turn():
             self._runtime.forget_frames()
 
-    def select_action(
-        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: str | Plan | npt.ArrayLike | None = None
-    ) -> Any:
+    def select_action(self, batch: Mapping[str, Any], noise: Noise | None = None, plan: AnyPlan = None) -> Any:
         """The next action, as LeRobot's policies give it: a chunk is computed when the one before it is used up.
 
         Args:
@@ -247,8 +236,7 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: a frame or noise that does not fit; nothing was executed, and the frame was not kept.
-            IllegalPlanError: as ``predict_action``.
-            NonFiniteActionsError: as ``predict_action``.
+            TtscompileError: as ``predict_action``.
         """
         with self._turn():
             obs, example = self._read(batch, others=True)
@@ -259,11 +247,7 @@ class CompiledPolicy:
             return like(self._queues.pop().copy(), example)
 
     def predict_action_chunk(
-        self,
-        batch: Mapping[str, Any],
-        noise: Noise | None = None,
-        plan: str | Plan | npt.ArrayLike | None = None,
-        prefix: Any = None,
+        self, batch: Mapping[str, Any], noise: Noise | None = None, plan: AnyPlan = None, prefix: Any = None
     ) -> Any:
         """A chunk of actions ``[B, Ta, Da]``, as LeRobot's policies give it; the queue of ``select_action`` stays.
 
@@ -274,8 +258,7 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: a window, a frame, noise or a prefix that does not fit; nothing was executed or kept.
-            IllegalPlanError: as ``predict_action``.
-            NonFiniteActionsError: as ``predict_action``.
+            TtscompileError: as ``predict_action``.
         """
         with self._turn():
             specs = self._spec.observations
@@ -293,16 +276,12 @@ class CompiledPolicy:
         given = given if self._instruct is None else self._instruct(given)
         return read_observation(given, self._spec.observations, others)
 
-    def _chunk(
-        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
-    ) -> FloatArray:
+    def _chunk(self, obs: Mapping[str, Array], noise: Noise | None, plan: AnyPlan, prefix: Any = None) -> FloatArray:
         """What is executed of a call, ``[B, Ta, Da]``."""
         chunk = self._spec.chunk
         return self._predict(obs, noise, plan, prefix)[:, chunk.start : chunk.stop]
 
-    def _predict(
-        self, obs: Mapping[str, Array], noise: Noise | None, plan: str | Plan | npt.ArrayLike | None, prefix: Any = None
-    ) -> FloatArray:
+    def _predict(self, obs: Mapping[str, Array], noise: Noise | None, plan: AnyPlan, prefix: Any) -> FloatArray:
         """One call; the actions ``[B, T, Da]``, which are finite."""
         self._report, wanted = None, self._plan(plan)
         spec = self._runtime.view(wanted).manifest.spec
@@ -330,7 +309,7 @@ class CompiledPolicy:
         self._report = report
         return actions
 
-    def _plan(self, plan: str | Plan | npt.ArrayLike | None) -> Plan:
+    def _plan(self, plan: AnyPlan) -> Plan:
         if plan is None:
             return self._default
         if isinstance(plan, str | Plan):
@@ -373,11 +352,7 @@ def _end_calls(lock: threading.Lock, process: Process) -> None:
 
 
 def plan_of(artifact: Artifact, plan: str | Plan | None) -> Plan:
-    """A plan, or the one of this name; None for the artifact's default.
-
-    Raises:
-        IllegalPlanError: the artifact has none of this name.
-    """
+    """A plan, or the one of this name; None for the default. Raises IllegalPlanError: the artifact has no such plan."""
     if plan is None:
         return artifact.default
     return plan if isinstance(plan, Plan) else artifact.plan(plan)

@@ -111,11 +111,7 @@ class Runtime:
         self._executed: int | None = None  # steps of it; None for all of ``action``
 
     def view(self, plan: Plan) -> View:
-        """The artifact as a plan sees it. Nothing is opened.
-
-        Raises:
-            IllegalPlanError: the plan names what the artifact lacks.
-        """
+        """The artifact as a plan sees it; nothing is opened. Raises IllegalPlanError: it names what there is not."""
         if plan.variant not in self._views:
             self._views[plan.variant] = view_of(self._artifact, plan)
         view = self._views[plan.variant]
@@ -161,11 +157,7 @@ class Runtime:
         self._written = self._dropped = self._chunk = self.streams = self._executed = None
 
     def require_streams(self, streams: int) -> None:
-        """Raise unless a call of so many streams may be the next one.
-
-        Raises:
-            ObservationError: the episode under way has another number.
-        """
+        """Raise ObservationError if the episode under way has another number of streams."""
         if self.streams not in (None, streams):
             found = f"the observation holds {streams} streams, and the episode under way {self.streams}"
             raise ObservationError(f"{found}. Call reset() before changing the number of streams.")

@@ -85,11 +85,9 @@ class RayPool:
         with needing("--ray", "ray"):
             import ray
         self._ray = ray
+        own: dict[str, Any] = {"num_cpus": cores, "include_dashboard": False} if address == LOCAL else {}
         try:
-            if address == LOCAL:
-                ray.init(address=LOCAL, num_cpus=cores, include_dashboard=False, log_to_driver=False)
-            else:
-                ray.init(address=address, log_to_driver=False)
+            ray.init(address=address, log_to_driver=False, **own)
         except Exception as error:  # a node that does not start in time raises a bare one
             told = f"no cluster can be reached ({first_line(error)}). Start it, or give {LOCAL!r}."
             raise ClusterError(f"--ray {address}: {told}") from error
@@ -160,11 +158,7 @@ def opened_pool(address: str | None) -> Iterator[Pool]:
 
 
 def artifact_elsewhere(path: str, identity: str) -> Artifact:
-    """The artifact in another process, which may be on another machine.
-
-    Raises:
-        CalibrationError: there is another one, or none.
-    """
+    """The artifact in another process. Raises CalibrationError: on its machine there is another one, or none."""
     try:
         artifact = load_artifact(Path(path))
     except TtscompileError as error:

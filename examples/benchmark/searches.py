@@ -54,10 +54,10 @@ class ComparisonState(StateFile):
         super().__init__(artifact if artifact.is_dir() else None, settings)
         self.warning = "" if artifact.is_dir() else "its artifact is no directory"
 
-    def save(self) -> None:
+    def save(self, **progress: Any) -> None:
         """Write everything, at once or not at all; where that fails nothing is kept from here on."""
         try:
-            super().save()
+            super().save(**progress)
         except CalibrationError as error:
             self.warning, self._path = str(error), None
 

@@ -278,7 +278,7 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         raise ExecutorError(
             f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
         )
-    found = {
+    found = vars(settings) | {
         "policy_hz": policy_hz,
         "horizon": horizon,
         "reserve": reserve,
@@ -294,4 +294,4 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         "switches": chunk.switches,
         "poses": poses,
     }
-    return Resolved(**{**vars(settings), **found})
+    return Resolved(**found)

@@ -29,13 +29,12 @@ class Samples:
 
     def __init__(self, size: int) -> None:
         self._ring = np.empty(size, np.float64)
-        self._size = size
         self.count = 0
         self._low, self._high = float("inf"), float("-inf")
 
     def add(self, value: float) -> None:
         """Take a measurement."""
-        self._ring[self.count % self._size] = value
+        self._ring[self.count % len(self._ring)] = value
         self.count += 1
         if value > self._high:
             self._high = value
@@ -44,7 +43,7 @@ class Samples:
 
     def copy(self) -> tuple[npt.NDArray[np.float64], int, float, float]:
         """The kept measurements, how many there were, the least and the largest: all that ``summary`` needs."""
-        return self._ring[: min(self.count, self._size)].copy(), self.count, self._low, self._high
+        return self._ring[: self.count].copy(), self.count, self._low, self._high
 
 
 @dataclass(frozen=True)

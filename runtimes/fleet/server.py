@@ -18,7 +18,7 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
 from ttscompile.runtimes.executor.window import Array
-from ttscompile.runtimes.liveness import reading_earlier_calls
+from ttscompile.runtimes.liveness import reads_earlier_calls
 from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock
@@ -50,11 +50,8 @@ class Plans(NamedTuple):
         Raises:
             IllegalPlanError: there is no such plan, or it reads the call before, which here is another robot's.
         """
-        names = tuple(
-            name
-            for name, plan in artifact.plans.items()
-            if plan.otherwise is None and name not in reading_earlier_calls(view_of(artifact, plan))
-        )
+        plans = {name: plan for name, plan in artifact.plans.items() if plan.otherwise is None}
+        names = tuple(name for name, plan in plans.items() if not reads_earlier_calls(view_of(artifact, plan), plan))
         found = cls(names, artifact.manifest.default_plan if default is None else default)
         return found._replace(default=found.known(found.default))
 
@@ -70,25 +67,19 @@ class Copies(Protocol):
     """Copies of the policy, wherever they are."""
 
     async def predict(self, plan: str, obs: Mapping[str, Array]) -> Answered:
-        """Answer an observation of one stream, without the axis of the batch.
-
-        Raises:
-            TtscompileError: the policy refused it.
-        """
+        """Answer an observation of one stream, without the axis of the batch, or raise why the policy refuses it."""
 
     async def trouble(self) -> str:
         """Why no copy can answer at present; empty where one can."""
 
 
 class FleetServer(Listener):
-    """Serves one artifact to many robots.
+    """Serves one artifact to many robots. ``Listener`` has limits and lock.
 
     Args:
         artifact: loaded and checked; only what it says of itself is looked at.
         plan: of requests that name none; None for the artifact's default.
         waiting: requests that may be under way; further ones are refused.
-        limits: what clients may do; None for the defaults.
-        lock: who may come in; None lets every program of this machine in, and nobody else.
 
     Raises:
         IllegalPlanError: see ``Plans.of``.

@@ -10,7 +10,8 @@ with one thread, the caller's. With more, one session holds all of them (``ir.pi
 sleep. Between calls nothing runs. ``docs/decisions.md`` has the figures.
 
 A session keeps its weights as its products read them, so sessions of single blocks, which most calibrated plans do not
-need, are opened when some plan does.
+need, are opened when some plan does. Whatever runs a graph raises an ``ArtifactError`` where that does not do what the
+manifest says.
 """
 
 import ctypes
@@ -105,11 +106,7 @@ class Sessions:
             return self._of_blocks(view, _contents(view))
 
     def of_layers(self, view: View) -> dict[str, Any]:
-        """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
-
-        Raises:
-            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
-        """
+        """What runs the piece ``layers``, by its name; see ``of_blocks``. For ``verify``."""
         with view.artifact.reading():
             return {kinds.LAYERS: self._session(view, kinds.LAYERS, _contents(view))}
 
@@ -279,7 +276,7 @@ class Bound:
         self._binding = _binding(session, inputs, outputs)
 
     def run(self) -> None:
-        """Run once. Raises ArtifactError: the graph does not do what the manifest says."""
+        """Run once."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's own classes, and what it raises itself
@@ -295,11 +292,7 @@ def _binding(session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Ar
 
 
 def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Run a session on arrays of the moment; its outputs by name.
-
-    Raises:
-        ArtifactError: the graph does not do what the manifest says.
-    """
+    """Run a session on arrays of the moment; its outputs by name."""
     try:
         return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
     except Exception as error:
@@ -309,11 +302,7 @@ def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array])
 def run_piece(
     sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], name: str, inputs: Mapping[str, Array]
 ) -> tuple[Array, ...]:
-    """Run a piece on arrays of the moment; its outputs in order. For who must not hold on to a backend, see ``frames``.
-
-    Raises:
-        ArtifactError: the graph does not do what the manifest says.
-    """
+    """The same for a piece; its outputs in order. For who must not hold on to a backend, see ``frames``."""
     return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
 
 
@@ -326,10 +315,8 @@ def renew_piece(
 ) -> tuple[Array, ...]:
     """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
 
-    A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else.
-
-    Raises:
-        ArtifactError: the graph does not do what the manifest says. What is kept may have some of the new rows.
+    A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else. If this fails
+    what is kept may have some of them.
     """
     into = {kinds.renewed_name(key): array for key, array in kept.items()}
     given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]
@@ -354,11 +341,7 @@ def _failed(error: Exception) -> ArtifactError:
 def run_prologue(
     sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], obs: Mapping[str, Array], contexts: ContextValues
 ) -> None:
-    """Keep what the normalised observations ``[B, ...]`` decide before the loop.
-
-    Raises:
-        ArtifactError: the graphs do not do what the manifest says.
-    """
+    """Keep what the normalised observations ``[B, ...]`` decide before the loop."""
     condition, step = pieces[kinds.CONDITION], pieces.get(kinds.STEP)
     if condition.outputs:
         feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}

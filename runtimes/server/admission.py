@@ -109,11 +109,7 @@ class Connection:
 
 
 class Admission:
-    """Counts and limits; used by the server's event loop alone.
-
-    Args:
-        clock: seconds that never go back.
-    """
+    """Counts and limits; used by the server's event loop alone."""
 
     def __init__(self, limits: ServerLimits, clock: Callable[[], float] = time.monotonic) -> None:
         self.limits = limits

@@ -21,11 +21,7 @@ WAITS_PER_CLIENT = 4
 
 
 class ExecutorServer(Listener):
-    """Serves one executor; it is the caller's, and is not closed here.
-
-    Args:
-        lock: who may come in; None lets every program of this machine in, and nobody else.
-    """
+    """Serves one executor, which is the caller's and is not closed here. ``Listener`` has limits and lock."""
 
     methods = METHODS
 

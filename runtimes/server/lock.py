@@ -53,11 +53,7 @@ class Lock:
         return " and ".join(f"no {name}" for name, there in lacks if there is None)
 
     def require(self, address: str) -> None:
-        """Refuse an address of a machine that others may reach, unless it is locked or that was asked for.
-
-        Raises:
-            ExecutorError: see above.
-        """
+        """Raise ExecutorError for an address that others may reach, unless it is locked or that was asked for."""
         lacks = self.missing()
         if self.insecure or not lacks or ip_address(address).is_loopback:
             return
@@ -86,11 +82,7 @@ def hashed(token: str, where: str) -> bytes:
 
 
 def read_token(path: Path) -> str:
-    """The text of a file that holds a token and nothing else.
-
-    Raises:
-        ExecutorError: there is no such file, it is too large, or it is no text.
-    """
+    """The text of a file that holds a token and nothing else. Raises ExecutorError: it is no such file."""
     require_path(path, ExecutorError, "Give a file with a token in it.")
     try:
         with path.open("rb") as file:

@@ -105,11 +105,7 @@ def placed(array: npt.NDArray[np.generic], device: torch.device) -> Tensor:
 
 
 def narrow_type(precision: str, device: torch.device) -> torch.dtype | None:
-    """The type that products are computed in; None for float32.
-
-    Raises:
-        RuntimeUnavailableError: not a precision of this runtime, or none of the device.
-    """
+    """The type that products are computed in; None for float32. Raises RuntimeUnavailableError: it cannot be had."""
     if precision not in NARROW:
         expected = ", ".join(NARROW)
         raise RuntimeUnavailableError(f"runtime 'torch' has no precision {precision!r}; expected one of {expected}.")

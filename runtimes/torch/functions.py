@@ -121,9 +121,8 @@ class _Writer:
         if square.args != (value, 2) or mean.args[1:] != ((-1,), True) or not isinstance(weight, Ref):
             return None
         shape, factor = self._values[scaled.name].shape[-1:], self._values[weight.name]
-        alike = (
-            factor.shape == shape and factor.dtype == self._value(node, value).dtype
-        )  # else torch has no kernel for it
+        # For a weight of another type torch has no kernel.
+        alike = factor.shape == shape and factor.dtype == self._value(node, value).dtype
         if weight.name not in self._fixed or not alike or not isinstance(eps, float):
             return None
         return replace(node, args=(value, tuple(shape), weight, eps)), torch.rms_norm

@@ -225,11 +225,7 @@ class CallModule(nn.Module):
     def _moves(
         self, network: PlainNetwork, initial: Tensor, steps: Tensor | None, corrected: bool = True
     ) -> tuple[Advance, Tensor, Tensor | None]:
-        """The sampler; what each step adds, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``.
-
-        Raises:
-            ObservationError: noise of the steps of another shape, or missing.
-        """
+        """The sampler; what each step adds, ``[K, D, B, (1 + S) T]``; and what the correction reads, ``[B, F]``."""
         advance = self._advance.on(self.kept("advance"))
         if not corrected:
             assert self._far is not None

@@ -91,7 +91,6 @@ class Workspace:
             read, added = advance.of_condition(self.network.condition())
             own, rest = offset[..., : self._horizon], offset[..., self._horizon :]
             offset = torch.cat([own + added * self._free.tensor, rest], 3)
-        stored = np.flatnonzero(plan.rollout).tolist()
         sample, residuals = denoise(
             self.network,
             plan,
@@ -99,7 +98,7 @@ class Workspace:
             advance,
             self._initial.tensor,
             offset.unbind(),
-            {cell: self.rollout[cell] for cell in stored},
+            {cell: self.rollout[cell] for cell in np.flatnonzero(plan.rollout).tolist()},
             read,
             self._free.tensor,
         )

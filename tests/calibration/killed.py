@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -19,9 +20,9 @@ def killed(saves: int = 1) -> Iterator[None]:
     """What calibrates in the block is killed when it has saved its state so often."""
     save, done = StateFile.save, 0
 
-    def dying(self: StateFile) -> None:
+    def dying(self: StateFile, **progress: Any) -> None:
         nonlocal done
-        save(self)
+        save(self, **progress)
         done += 1
         if done == saves:
             raise Killed

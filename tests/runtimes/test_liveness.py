@@ -16,7 +16,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes import open_runtime
-from ttscompile.runtimes.liveness import readable_rollout, reading_earlier_calls, rollout_needs
+from ttscompile.runtimes.liveness import readable_rollout, reads_earlier_calls, rollout_needs
 from ttscompile.runtimes.load import load
 
 from .agreement import call_terms, random_inputs
@@ -38,7 +38,8 @@ def scheduled(own_artifact: Artifact) -> Artifact:
 
 def test_schedules_say_exactly_what_they_read(scheduled: Artifact, toy_artifact: Artifact) -> None:
     assert np.argwhere(readable_rollout(view_of(scheduled))).tolist() == [[2, 1], [3, 4]]
-    assert reading_earlier_calls(view_of(scheduled)) == {"reads"}
+    view = view_of(scheduled)
+    assert {name for name, plan in view.plans.items() if reads_earlier_calls(view, plan)} == {"reads"}
     needs = load(scheduled.path).info.rollout
     assert (needs.read, needs.bytes_read, needs.cells, needs.bytes_most) == (2, 2 * ENTRY, 25, 25 * ENTRY)
     assert rollout_needs(view_of(toy_artifact)).read == 0  # its pruner is no plan of it
@@ -73,7 +74,10 @@ def test_a_pruner_is_known_by_the_bounds_of_its_logits(
     assert readable_rollout(view_of(artifact)).all()  # the toy's own pruner is of another form
     changed = replace(artifact, pruner=head(**changes))
     assert np.argwhere(readable_rollout(view_of(changed))).tolist() == cells
-    assert reading_earlier_calls(view_of(changed)) == ({"tts"} if cells else set())
+    view = view_of(changed)
+    assert {name for name, plan in view.plans.items() if reads_earlier_calls(view, plan)} == (
+        {"tts"} if cells else set()
+    )
 
 
 def test_calls_with_the_artifacts_plans_keep_what_these_read(scheduled: Artifact) -> None:

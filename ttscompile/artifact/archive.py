@@ -49,12 +49,9 @@ def _remove(folder: Path, process: Process) -> None:
 
 
 def unpack(path: Path) -> Unpacked:
-    """Unpack a zipped artifact into a temporary folder.
+    """Unpack a zipped artifact into a temporary folder: the files that its manifest declares, and no others.
 
-    The files may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
-
-    Returns:
-        The folder, with the files that the manifest declares and no others.
+    They may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
 
     Raises:
         ArtifactError: no zip file, no artifact in it, an entry with a name or of a kind that an artifact cannot have,
@@ -109,11 +106,10 @@ def _extract(archive: zipfile.ZipFile, path: Path, folder: Path) -> None:
             f"{path}: expected at most {allowed} bytes in so small an archive; its manifest declares {total}. {_AGAIN}"
         )
     for name, record in manifest.files.items():
-        if name not in entries and manifest.precision is not None and name == manifest.precision.fp32:
-            continue
-        if name not in entries:
+        if name in entries:
+            _copy(archive, entries[name], record.bytes, path, folder / name)
+        elif manifest.precision is None or name != manifest.precision.fp32:
             raise ArtifactError(f"{path}: the file {name} is missing; {MANIFEST} lists it. {_AGAIN}")
-        _copy(archive, entries[name], record.bytes, path, folder / name)
 
 
 def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:

@@ -73,23 +73,17 @@ def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: b
         model: from ``lower``; initializers that are constants of the program hold no data.
         places: by name of the constant.
         again: the model is bound already; the constants in ``places`` get new values.
-
-    Raises:
-        ArtifactError: an empty initializer that is no constant of the program, or is one of another type.
     """
     from onnx import ModelProto
 
     bound = ModelProto()
     bound.CopyFrom(model)
     for tensor in _initializers(bound.graph):
-        if not (_is_empty(tensor) or (again and tensor.name in places)):
-            continue
-        if tensor.name not in places:
-            raise ArtifactError(
-                f"ONNX model {piece!r}: initializer {tensor.name!r} has no data and is no constant of the program."
-                f" {REPORT}"
-            )
-        _set(tensor, places[tensor.name], piece)
+        if tensor.name in places and (again or _is_empty(tensor)):
+            _set(tensor, places[tensor.name], piece)
+        elif _is_empty(tensor):
+            problem = f"initializer {tensor.name!r} has no data and is no constant of the program"
+            raise ArtifactError(f"ONNX model {piece!r}: {problem}. {REPORT}")
     return bytes(bound.SerializeToString(deterministic=True))
 
 

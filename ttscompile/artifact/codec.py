@@ -28,11 +28,7 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def decode(content: bytes, where: str = MANIFEST) -> Manifest:
-    """Read ``manifest.json``.
-
-    Raises:
-        ArtifactError: no manifest, another schema version, or one that was changed or damaged.
-    """
+    """Read ``manifest.json``; refuses another schema version, and one that was changed or damaged."""
     document = _document(content, where)
     if document.get("format") != FORMAT:
         raise ArtifactError(
@@ -67,12 +63,7 @@ def _document(content: bytes, where: str) -> dict[str, Any]:
 
 
 def is_as_written(manifest: Manifest, content: bytes) -> bool:
-    """Whether these bytes are how ttscompile writes a manifest, or wrote it in the schema before, which says the same.
-
-    Args:
-        manifest: what ``decode`` made of the bytes.
-        content: of ``manifest.json``.
-    """
+    """Whether the bytes that a manifest was decoded from are how ttscompile writes it, or wrote it a schema before."""
     document = _document(content, MANIFEST)
     return content == (encode(manifest) if document["schema_version"] == SCHEMA_VERSION else dump(document))
 
@@ -84,11 +75,7 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
 
 
 def from_json(root: Value) -> Manifest:
-    """Inverse of ``to_json``; checks that the parts fit each other.
-
-    Raises:
-        ArtifactError: names the path in the document, expected and found.
-    """
+    """Inverse of ``to_json``; checks that the parts fit each other."""
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))

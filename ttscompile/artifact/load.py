@@ -103,11 +103,7 @@ class Artifact:
 
     @contextmanager
     def reading(self, *given: str) -> Iterator[None]:
-        """Within the block these files, in ``files``, are those that were checked.
-
-        Raises:
-            ArtifactChangedError: a file was changed or replaced since it was checked.
-        """
+        """Within the block these files, in ``files``, are those that were checked. Else ArtifactChangedError."""
         wanted = given or self.present
         with self._folder.unchanged(wanted) as now:
             for name in wanted:
@@ -215,12 +211,8 @@ class Artifact:
 def load_artifact(path: str | Path) -> Artifact:
     """Open an artifact and check all of it: schema, sizes and hashes of all files, identity, plans, onnxruntime.
 
-    Returns:
-        The artifact; arrays are mapped, not read.
-
     Raises:
         ArtifactChangedError: it was replaced or changed meanwhile.
-        ArtifactError: says what is wrong, where, and what to do.
     """
     place = Path(path)
     require_artifact_path(place)
@@ -241,11 +233,7 @@ def require_artifact_path(path: Path) -> None:
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Read ``manifest.json`` of a directory, and nothing else.
-
-    Raises:
-        ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
-    """
+    """Read ``manifest.json`` of a directory, and nothing else."""
     path = directory / MANIFEST
     require_artifact_path(directory)
     if not os.path.lexists(path):

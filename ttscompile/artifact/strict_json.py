@@ -86,12 +86,7 @@ class Value:
 
 
 def parse(content: bytes, where: str, limit: int = MAX_BYTES, values: int = MAX_VALUES) -> Value:
-    """Parse a file of an artifact; see ``core.untrusted_json`` for what is refused.
-
-    Args:
-        limit: largest accepted size in bytes.
-        values: largest accepted number of values.
-    """
+    """Parse a file of an artifact of so many bytes and values at most; see ``parse_json`` for what is refused."""
     try:
         return Value(parse_json(content, limit, values=values, shown=True), where)
     except ValueError as error:

@@ -63,20 +63,6 @@ class Entry:
     length: int
 
 
-def read_header(path: Path) -> dict[str, Entry]:
-    """Read and check the header of a safetensors file.
-
-    Returns:
-        The entries in the order of their data.
-
-    Raises:
-        ArtifactError: unreadable or truncated; a dtype that numpy lacks; sizes that contradict each other; data that
-            overlap, have gaps, are not aligned or lie outside of the file.
-    """
-    with opened(path) as file:
-        return _header(file, path)
-
-
 def require_few(paths: Iterable[Path], where: object) -> None:
     """Raise ArtifactError if the headers of these files together have more values than JSON may have."""
 
@@ -99,6 +85,11 @@ def _content(file: BufferedReader, path: Path) -> bytes:
 
 
 def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
+    """The entries in the order of their data.
+
+    Refused are dtypes that numpy lacks, sizes that contradict each other, and data that overlap, have gaps, are not
+    aligned or lie outside of the file.
+    """
     content, size = _content(file, path), os.fstat(file.fileno()).st_size
     root = parse(content, path.name, MAX_HEADER_BYTES)
     members = root.members()
@@ -121,8 +112,9 @@ def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
 
 
 def offsets(path: Path) -> dict[str, tuple[int, int]]:
-    """Byte offset in the file, and length in bytes, of each tensor. Raises ArtifactError: see ``read_header``."""
-    return {name: (entry.offset, entry.length) for name, entry in read_header(path).items()}
+    """Byte offset in the file, and length in bytes, of each tensor."""
+    with opened(path) as file:
+        return {name: (entry.offset, entry.length) for name, entry in _header(file, path).items()}
 
 
 def read(path: Path) -> Mapping[str, Array]:

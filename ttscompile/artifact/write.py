@@ -251,8 +251,9 @@ def _fill(
     loops = {ORIGINAL: program.pieces.tables, **program.pieces.loop_tables}
     tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in own_rows}
     apart = {} if lowered is None else read_in_fp32(stored, models, lowered)
-    tensors.write(folder / WEIGHTS, {**{n: value for n, value in stored.items() if n not in apart}, **tables})
-    places = places_of(folder / WEIGHTS, {n: value for n, value in stored.items() if n not in apart})
+    common = {name: value for name, value in stored.items() if name not in apart}
+    tensors.write(folder / WEIGHTS, {**common, **tables})
+    places = places_of(folder / WEIGHTS, common)
     if apart:
         tensors.write(folder / WEIGHTS_FP32, apart)
         places |= places_of(folder / WEIGHTS_FP32, apart)
@@ -353,11 +354,7 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
-
-    Raises:
-        ArtifactError: somebody else is at it; or it cannot be locked.
-    """
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too."""
     with ExitStack() as held:
         try:
             held.enter_context(files.lock_folder(directory))

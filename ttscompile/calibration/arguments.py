@@ -54,11 +54,7 @@ def require_alone(learn: Sequence[str], *budgets: float | None) -> None:
 
 
 def require_directory(path: Path) -> None:
-    """Raise unless an artifact is one that can be written into.
-
-    Raises:
-        ArtifactError: it is none at all.
-    """
+    """Raise unless an artifact is one that can be written into, ArtifactError where it is none at all."""
     if not path.is_dir():
         load_artifact(path)
         raise CalibrationError(f"{path}: only a directory can be changed. Unzip the artifact and give the directory.")

@@ -75,11 +75,7 @@ def goal_of(
     *,
     usual: float = TYPICAL_SPARSITY,
 ) -> Goal:
-    """The one thing that was asked for; the sparsity ``usual`` if nothing was.
-
-    Raises:
-        CalibrationError: more than one, or a value that nothing can have.
-    """
+    """The one thing that was asked for; the sparsity ``usual`` if nothing was."""
     asked = {SPARSITY: target_sparsity, FLOPS: target_flops, LATENCY: latency_ms, ERROR: max_action_error}
     given = {kind: value for kind, value in asked.items() if value is not None}
     if len(given) > 1:
@@ -101,11 +97,7 @@ def goal_of(
 def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
     """Computed cells of a goal that can be worked out: ``target_sparsity`` or ``target_flops``.
 
-    Args:
-        pruned: whether the pruner may run.
-
-    Raises:
-        CalibrationError: no plan, or only the dense one, is what was asked for.
+    ``pruned`` says whether the pruner may run. Refused is what no plan, or only the dense one, can keep.
     """
     steps, blocks, flops = manifest.steps, len(manifest.blocks), manifest.flops
     step = sum(flops.blocks)
@@ -139,10 +131,7 @@ def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> 
 
     Bisection over the number of steps; each candidate is the median of some calls on one stream. Where the pruner may
     run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``; ``base`` is a plan of the
-    loop, in the precision that calls will have.
-
-    Raises:
-        CalibrationError: not even a call of one computed step fits, or a dense one does.
+    loop, in the precision that calls will have. Refused is one that not even one computed step keeps, or all steps do.
     """
     assert goal.kind == LATENCY
     manifest = view_of(artifact, base).manifest

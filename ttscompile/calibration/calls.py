@@ -31,12 +31,7 @@ calibration judges on episodes that it saw nothing of."""
 
 @dataclass(frozen=True)
 class Split:
-    """Calls by episode: what plans are learned from, and what they are judged on.
-
-    Attributes:
-        calibration: numbers of the episodes to learn from.
-        validation: numbers of the episodes to judge on; none of them is in ``calibration``.
-    """
+    """Numbers of the episodes that plans are learned from, and of others that they are judged on."""
 
     calibration: tuple[int, ...]
     validation: tuple[int, ...]
@@ -44,22 +39,15 @@ class Split:
 
 def split_episodes(count: int, fraction: float, seed: int) -> Split:
     """Divide episodes at random; at least one for validation, and at least one is left to learn from."""
-    order = np.random.default_rng((seed, 0)).permutation(count)
+    order = np.random.default_rng((seed, 0)).permutation(count).tolist()
     held_out = min(max(round(count * fraction), 1), count - 1)
-    return Split(
-        calibration=tuple(sorted(int(i) for i in order[held_out:])),
-        validation=tuple(sorted(int(i) for i in order[:held_out])),
-    )
+    return Split(calibration=tuple(sorted(order[held_out:])), validation=tuple(sorted(order[:held_out])))
 
 
 def load_episodes(
     spec: PolicySpec, trajectories: Sequence[str | os.PathLike[str]], observation: Mapping[str, Sequence[str]] | None
 ) -> list[Episode]:
-    """The recorded episodes, as the policy observes them; see ``load_trajectories``.
-
-    Raises:
-        TrajectoryError: the recordings do not fit the policy.
-    """
+    """The recorded episodes, as the policy observes them; see ``load_trajectories``."""
     steps = spec.chunk.stop - spec.chunk.start
     episodes = load_trajectories(trajectories, spec.observations, steps, observation, spec.instruction)
     if len(episodes) < 2:
@@ -109,11 +97,21 @@ class Calls:
         """Where the contexts are; samples and noise are on the CPU."""
         return next((each.device for each in self.contexts.condition.values()), self.initial.device)
 
+    def parts(self, most: int) -> list[IntArray]:
+        """Numbers of the calls, at most so many together; windows stay whole, however long."""
+        size = max(1, most // self.window) * self.window
+        return [np.arange(i, min(i + size, self.count)) for i in range(0, self.count, size)]
+
     @property
     def targets(self) -> Tensor:
         """The denoised sample of the dense policy, ``[N, T, D]``."""
         assert self.path is not None
         return self.path[:, -1]
+
+
+def calls_of(windows: IntArray, window: int) -> IntArray:
+    """Numbers of the calls of these windows, in their order."""
+    return np.asarray((windows[:, None] * window + np.arange(window)).reshape(-1))
 
 
 def window_of(episodes: Sequence[Episode], split: Split) -> int:
@@ -151,12 +149,7 @@ def prepare_calls(
     seed: tuple[int, ...],
     window: int = 1,
 ) -> Calls:
-    """Calls without targets: draw their noise and run the prologue.
-
-    Args:
-        spec: of the policy, with the loop of the model.
-        chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
-    """
+    """Calls without targets, with noise that is drawn now; see ``calls_at``."""
     return calls_at(model, spec, episodes, chosen, draw_noise(spec, len(chosen), seed), window)
 
 
@@ -168,7 +161,13 @@ def calls_at(
     noise: tuple[Tensor, Tensor | None],
     window: int = 1,
 ) -> Calls:
-    """The same with given noise: initial samples ``[N, T, D]``, and draws ``[K, N, T, D]`` or None."""
+    """Calls without targets: runs the prologue.
+
+    Args:
+        spec: of the policy, with the loop of the model.
+        chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
+        noise: initial samples ``[N, T, D]``, and draws ``[K, N, T, D]`` or None.
+    """
 
     def parts() -> Iterator[Contexts]:
         for begin in range(0, len(chosen), OBSERVED_AT_ONCE):
@@ -208,9 +207,8 @@ class Actions:
         self._scale = torch.from_numpy(np.array(spec.chunk.scale))
 
     def executed(self, samples: Tensor) -> Tensor:
-        """The executed part of samples ``[..., T, D]`` as ``[..., size]``, as the network has it: normalised."""
-        part = samples[..., self._chunk.start : self._chunk.stop, : self._chunk.action_dim]
-        return part.reshape(*part.shape[:-2], self.size)
+        """The same of samples ``[..., T, D]`` as ``ChunkSpec.executed``, flat: ``[..., size]``."""
+        return torch.as_tensor(self._chunk.executed(samples)).flatten(-2)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:
         """Mean absolute difference of the executed actions of each call; at most ``LARGEST``, also where they are NaN.

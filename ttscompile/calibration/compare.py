@@ -72,12 +72,6 @@ def compare(
         plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
             all where none is named. ``NAME@PRECISION`` is one in another precision.
         joining: finds further plans, given the trials of the artifact, before anything is judged.
-
-    Raises:
-        CalibrationError: an artifact of another policy.
-        TrajectoryError: the recordings do not fit the policy.
-        ArtifactError: an artifact cannot be opened.
-        IllegalPlanError: the artifact has no plan of this name.
     """
     calls, threads = integer(calls, "calls", CalibrationError, 1), integer(threads, "threads", CalibrationError, 1)
     seed = integer(seed, "seed", CalibrationError)
@@ -142,7 +136,7 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
 def _apart(trials: Trials, score: Score) -> dict[str, Any]:
     """``by_number``, ``errors`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
     spec, sample = trials.artifact.manifest.spec, trials.held_out
-    x, y = score.answers, sample.answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
+    x, y = score.answers, spec.chunk.executed(sample.answers)
     assert x is not None  # ``judge`` made the score
     each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(spec.chunk.action_dim)]
     h, far = pairs(*(one.reshape(*one.shape[:2], -1).astype(np.float64) for one in (x, y)))

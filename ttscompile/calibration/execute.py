@@ -26,7 +26,7 @@ from ..runtimes.reference.model import Blocks, Contexts, ReferenceModel
 from .calls import Calls, IntArray
 
 STREAMS = 256
-"""Calls with plans of their own that go through the loop at once, about: windows stay whole."""
+"""Calls with plans of their own that go through the loop at once."""
 
 
 class Executor:
@@ -102,8 +102,7 @@ class Executor:
         with torch.no_grad():
             if plan.ndim == 2:
                 return last(self._samples(plan[None], calls))
-            size = max(1, STREAMS // calls.window) * calls.window
-            parts = [np.arange(i, min(i + size, len(plan))) for i in range(0, len(plan), size)]
+            parts = calls.parts(STREAMS)
             return torch.cat([last(self._samples(plan[part], self.select(calls, part))) for part in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:

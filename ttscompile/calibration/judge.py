@@ -102,11 +102,7 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
 
 
 def further(score: Score, other: Score) -> tuple[float, float]:
-    """By how much a score is further from the original than another of the same calls, and 95 % limits of that.
-
-    Returns:
-        The difference of the distances, and its upper limit, over episodes.
-    """
+    """By how much a score is further from the original than another of the same calls, and the upper 95 % limit."""
     difference = score.distance - other.distance
     own, theirs = (_resampled(np.array(one.gaps[0]), one.gaps[1]) for one in (score, other))
     return difference, float(np.quantile(own - theirs, 0.975))
@@ -171,9 +167,8 @@ def other_observations(trials: Trials) -> float:
 
 def _in_units(trials: Trials) -> Numbers:
     """What the original executes, ``[N, R, Ta, Da]``."""
-    spec, answers = trials.artifact.manifest.spec, trials.held_out.answers.astype(np.float64)
-    part = answers[..., spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim]
-    return np.asarray(part / spec.chunk.scale)
+    chunk = trials.artifact.manifest.spec.chunk
+    return np.asarray(chunk.executed(trials.held_out.answers.astype(np.float64)) / chunk.scale)
 
 
 class _Answers:
@@ -205,10 +200,8 @@ class _Answers:
         apart = [(stretch, row, row) for stretch, row in sample.calls.tolist()]
         if plan.otherwise is not None:
             if any(first == last for _, first, last in in_order):
-                told = (
-                    "a plan that begins with the chunk of the call before is judged on episodes of two calls at least"
-                )
-                raise CalibrationError(f"{told}; one that was recorded has one call. Record longer ones.")
+                told = "a plan that begins with the chunk of the call before is judged on episodes of two calls at"
+                raise CalibrationError(f"{told} least; one that was recorded has one call. Record longer ones.")
             yield self._of(in_order)
             yield self._of(apart, after_another=True)
         else:
@@ -264,8 +257,7 @@ def _scored(
     trials: Trials, plan: Plan, sample: Sample, made: FloatArray, reports: Sequence[tuple[CallReport, int]]
 ) -> Score:
     spec, flops, answers = trials.artifact.manifest.spec, trials.artifact.manifest.flops, sample.answers
-    part = (..., slice(spec.chunk.start, spec.chunk.stop), slice(spec.chunk.action_dim))
-    x, y = (samples[part].astype(np.float64).reshape(*samples.shape[:2], -1) for samples in (made, answers))
+    x, y = (spec.chunk.executed(one).astype(np.float64).reshape(*one.shape[:2], -1) for one in (made, answers))
     x = np.nan_to_num(x, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST).clip(-LARGEST, LARGEST)
     h, apart = pairs(x, y)
     numbers = np.unique(sample.episodes)

@@ -98,14 +98,9 @@ class CalibrationResult:
 
     def record(self) -> dict[str, Any]:
         """As JSON, for the artifact. Without the time it took: the same calibration gives the same bytes."""
-        record = asdict(self)
-        del record["seconds"]
-        record["plans"] = {name: score.record() for name, score in self.plans.items()}
-        record["frontier"] = [dict(one) for one in self.frontier]
-        if not record["frontier"]:
-            del record["frontier"]
-        record["episodes"] = {name: list(numbers) for name, numbers in self.episodes.items()}
-        return record
+        left_out = ("seconds",) if self.frontier else ("seconds", "frontier")
+        record = {name: value for name, value in asdict(self).items() if name not in left_out}
+        return record | {"plans": {name: score.record() for name, score in self.plans.items()}}
 
 
 def calibrate(

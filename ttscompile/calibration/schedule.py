@@ -75,8 +75,7 @@ def searched(
 
     def save(done: int, longest: float) -> None:
         state.put(name, search.state())
-        state.progress.update({done_so_far: done, "seconds": clock.elapsed()})
-        state.save()
+        state.save(**{done_so_far: done}, seconds=clock.elapsed())
         left = min(clock.left(), (count - done) * longest)
         bar.update(done, f"error {search.loss:.4f}, sparsity {sparsity(search.plan):.2%}", left)
 
@@ -163,10 +162,8 @@ class Schedule(Proposer):
             found, budget = task.whole_steps(best.steps), replace(budget, cells=more * blocks)
         if not kept:
             return
-        told = f"{self.intervals} interval{'s' * (self.intervals != 1)}"
-        self.told = (
-            f"{budget.cells} of {steps * blocks} cells may be computed; strategy {request.strategy!r} took {told}"
-        )
+        self.told = f"{budget.cells} of {steps * blocks} cells may be computed; strategy {request.strategy!r} took "
+        self.told += f"{self.intervals} interval{'s' * (self.intervals != 1)}"
         if "steps" in found.notes and (heard := task.whole.told_of_episodes(found.notes["steps"])):
             self.told += f"; {heard}"
         if found.pruner is not None:
@@ -188,8 +185,7 @@ class Schedule(Proposer):
         if known is None:
             budget = measure_budget(trials.artifact, trials.base, goal, self._may_prune(view))
             known = {"cells": budget.cells, "measured": budget.measured}
-            trials.state.progress.update(latency=known, seconds=clock.elapsed())
-            trials.state.save()
+            trials.state.save(latency=known, seconds=clock.elapsed())
         budget = replace(goal, cells=known["cells"], measured=known["measured"])
         self._strategy.require_reach(manifest.steps, len(manifest.blocks), budget.cells)
         return budget

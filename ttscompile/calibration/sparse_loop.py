@@ -105,9 +105,8 @@ class SparseLoop:
         def batches(calls: Calls | None) -> tuple[_Batch, ...]:
             if calls is None:
                 return ()
-            size = max(1, STREAMS // calls.window) * calls.window
-            parts = [np.arange(i, min(i + size, calls.count)) for i in range(0, calls.count, size)]
-            return tuple(_Batch(executor, executor.select(calls, part), whole and executor.alike) for part in parts)
+            parts, sums = calls.parts(STREAMS), whole and executor.alike
+            return tuple(_Batch(executor, executor.select(calls, part), sums) for part in parts)
 
         self.begin = Place(0, batches(fitted), batches(judged))
 

@@ -47,14 +47,7 @@ class StateFile:
         self.progress: dict[str, Any] = {}
 
     def load(self) -> bool:
-        """Read what an earlier run left.
-
-        Returns:
-            Whether there was anything.
-
-        Raises:
-            CalibrationError: it is damaged, or belongs to a run with other settings.
-        """
+        """Read what an earlier run left; whether there was anything. Refused is that of a run with other settings."""
         if self._path is None or not self._path.exists():
             return False
         try:
@@ -80,8 +73,9 @@ class StateFile:
         self.arrays, self.progress = arrays, progress
         return True
 
-    def save(self) -> None:
-        """Write everything, at once or not at all. Raises CalibrationError: the directory cannot be written."""
+    def save(self, **progress: Any) -> None:
+        """Write everything with this progress, at once or not at all. Raises CalibrationError: it cannot be written."""
+        self.progress |= progress
         if self._path is None:
             return
         texts = {_SETTINGS: self._settings, _PROGRESS: json.dumps(self.progress, sort_keys=True)}

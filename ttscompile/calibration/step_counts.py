@@ -111,8 +111,7 @@ class SpacedSchedules:
             self._whole.expect(coming)
             errors = self._whole.errors(steps)
             known[key] = [errors.normalised, errors.units]
-            self._state.progress["seconds"] = self._clock.elapsed()
-            self._state.save()
+            self._state.save(seconds=self._clock.elapsed())
         with self._state.reading():
             normalised, units = known[key]
             return Errors(float(normalised), float(units))

@@ -51,8 +51,7 @@ def with_targets(
     while len(path) < count and (len(path) < least or clock.left() > 0):
         path = torch.cat([path, next(rounds)])
         state.put("targets", {**state.get("targets"), name: path.numpy()})
-        state.progress["seconds"] = clock.elapsed()
-        state.save()
+        state.save(seconds=clock.elapsed())
         bar.update(len(path), "", clock.left())
     state.progress[key] = len(path)
     if len(path) < calls.count:

@@ -187,10 +187,8 @@ class Trials:
             calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
             loop = self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
-            clock = self.clock.until(self.until)
-            self._calls[window] = with_targets(
-                self.executor, name, calls, fewest, self.state, clock, self.bar, self.pool
-            )
+            work = self.state, self.clock.until(self.until), self.bar, self.pool
+            self._calls[window] = with_targets(self.executor, name, calls, fewest, *work)
             if self.clock.left() < 0:
                 self.bar.warn(
                     f"{self.clock.limit / 60:g} minutes were over when the calls to learn from had been answered:"
@@ -289,8 +287,7 @@ class Trials:
             for found in dense_rounds(executor, drawn, len(known), self.pool):
                 known = np.concatenate([known, found[:, -1].numpy()])
                 self.state.put(key, {"samples": known, "calls": calls})
-                self.state.progress["seconds"] = self.clock.elapsed()
-                self.state.save()
+                self.state.save(seconds=self.clock.elapsed())
                 self.bar.update(len(known), "", self.clock.left())
         return known.reshape(len(calls), self.draws, *spec.sample)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..core.correction import Correction
 from ..core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 from ..pool import Here, Pool, Work, workers
-from .calls import Actions, Calls, IntArray
+from .calls import Actions, Calls, IntArray, calls_of
 from .clock import Clock
 from .execute import Executor
 from .sparse_loop import Place, SparseLoop, anchors_of, fit_correction
@@ -64,13 +64,11 @@ class WholeSteps:
         apart = _set_apart(calls.episodes[:: calls.window][order])
 
         def some(windows: IntArray, most: int) -> Calls:
-            chosen = windows[: max(1, most // calls.window), None] * calls.window + np.arange(calls.window)
-            return executor.select(calls, chosen.reshape(-1))
+            return executor.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
 
-        fitted, compared = _sizes(calls.count)
-        self._compared = self._fitted = some(order[apart], compared)
+        self._compared = self._fitted = some(order[apart], max(COMPARED, calls.count // COMPARED_SHARE))
         if not apart.all():
-            self._fitted = some(order[~apart], fitted)
+            self._fitted = some(order[~apart], max(FITTED, calls.count // FITTED_SHARE))
 
     @property
     def steps(self) -> int:
@@ -195,11 +193,6 @@ def _measured_elsewhere(
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:
     return plan(calls) if callable(plan) else plan
-
-
-def _sizes(count: int) -> tuple[int, int]:
-    """Of so many calls, how many candidates are fitted on and measured on, at most."""
-    return max(FITTED, count // FITTED_SHARE), max(COMPARED, count // COMPARED_SHARE)
 
 
 def _set_apart(episodes: IntArray) -> BoolArray:

@@ -22,7 +22,7 @@ from ttscompile.cli.verify import verify
 
 @click.group(
     cls=Commands,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog="Exit status: 0 done; 1 a check failed; 2 bad usage or bad input; 70 a defect of ttscompile;"
     " 130 interrupted; 141 nobody reads the output; 143 ended by SIGTERM.",
 )

@@ -152,7 +152,9 @@ def bench(
         if checkpoint is not None:
             entered = [*originals(checkpoint, encoders, threads[0], artifact, device), *entered]
     default = artifact.manifest.default_plan
-    _warn(directory, artifact, console)
+    warn_if_busy(console)
+    if default == DENSE and artifact.manifest.steps > 1:
+        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
     with console.status("timing") as status:
         measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
     # The longest call has to fit.
@@ -165,10 +167,13 @@ def bench(
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
     identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
-        of = {"identity": artifact.manifest.identity, "machine": fingerprint()}
-        among = [{"path": str(path), "identity": identity} for path, identity in identities.items()]
         plans_in_loop = {label: one.to_json() for label, one in verdicts.items()}
-        found = {
+        document = {
+            "identity": artifact.manifest.identity,
+            "machine": fingerprint(),
+            "with": [{"path": str(path), "identity": identity} for path, identity in identities.items()],
+            "runtime": runtime,
+            "device": device or CPU,
             "calls": calls,
             "threads": list(by_threads),
             "best_threads": fewest_threads(by_threads),
@@ -177,7 +182,7 @@ def bench(
             "comparison": None if compared is None else compared.to_json(),
             "chosen": chosen,
         }
-        print_json(of | {"with": among, "runtime": runtime, "device": device or CPU, **found})
+        print_json(document)
     else:
         output = results()
         _print_times(measured, default, by_threads, output)
@@ -193,12 +198,6 @@ def bench(
         say(console, draw_comparison(compared, directory, picture))
     if (verdicts and not any(one.feasible for one in verdicts.values())) or (chooses and chosen is None):
         context.exit(1)
-
-
-def _warn(directory: Path, artifact: Artifact, console: Console) -> None:
-    warn_if_busy(console)
-    if artifact.manifest.default_plan == DENSE and artifact.manifest.steps > 1:
-        say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
 
 
 def _print_times(
@@ -227,11 +226,7 @@ def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
 
 
 def _ways(runtimes: Sequence[str], device: str | None, threads: Sequence[int]) -> list[Way]:
-    """Each runtime with each number of threads; the device is torch's where it is one of the runtimes.
-
-    Raises:
-        click.UsageError: no runtime; or several numbers of threads for torch.
-    """
+    """Each runtime with each number of threads; the device is torch's where it is one of the runtimes."""
     if not runtimes:
         raise click.UsageError("--runtime: nothing was given.")
     if len(threads) > 1 and "torch" in runtimes:
@@ -279,10 +274,8 @@ IN_FP32 = f"@{FP32}"
 def choosable(artifact: Artifact, bound: float = FARTHEST) -> dict[str, float]:
     """How far plans are from the original that were judged to be within a bound, by name.
 
-    Plans of fewer bits are among them in fp32, too, in which they are no further away.
-
-    Raises:
-        ArtifactError: none is within ``FARTHEST``.
+    Plans of fewer bits are among them in fp32, too, in which they are no further away. Raises ArtifactError: none is
+    within ``FARTHEST``.
     """
     found: dict[str, float] = {}
     for name, score in scores(artifact.manifest.calibration, ("distance", "interval")).items():

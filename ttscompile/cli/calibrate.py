@@ -14,7 +14,7 @@ from ttscompile.cli.ending import Status
 from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.sections import Recordings, SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_artifact
-from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, NumberOption
+from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 
 
 @click.command(cls=SectionedCommand)
@@ -60,18 +60,15 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT, Numb
     "--strategy",
     type=click.Choice(NAMES),
     default=DEFAULT,
-    show_default=True,
     help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
 @options.seed_option("Seed of the split, the noise and the training.")
-@click.option(
+@options.number_option(
     "--max-minutes",
-    cls=NumberOption,
-    type=MINUTES,
+    MINUTES,
+    "Take the best plan that is found in so many minutes of work, about: where the machine does other things, too, it"
+    " takes up to twice as long. Also decides how many calls are used.",
     default=15.0,
-    show_default=True,
-    help="Take the best plan that is found in so many minutes of work, about: where the machine does other things, too,"
-    " it takes up to twice as long. Also decides how many calls are used.",
 )
 @click.option(
     "--device",

@@ -110,8 +110,7 @@ def originals(
     """The network in eager PyTorch, in the loop it was saved with, and in the default plan's where that is another.
 
     Args:
-        checkpoint: as ``convert`` took it.
-        encoders: the folder that ``convert`` was given with it, if it was.
+        checkpoint: see ``original_policy``, as for ``encoders``.
         threads: of PyTorch.
         device: where PyTorch computes, None for the CPU. Its settings are torch's own: convolutions may use TF32.
 
@@ -148,8 +147,8 @@ def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = 
 
     Args:
         checkpoint: as ``convert`` took it.
-        spec: specification of the policy in the artifact.
-        encoders: see ``originals``.
+        spec: of the policy in the artifact.
+        encoders: the folder that ``convert`` was given with the checkpoint, if it was.
 
     Raises:
         SpecError: the checkpoint is of another policy.
@@ -196,12 +195,7 @@ def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
 def compare(
     directory: Path, artifacts: Mapping[str, Artifact], others: Sequence[Path], recordings: Recordings, **how: Any
 ) -> Comparison:
-    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
-
-    Raises:
-        ArtifactChangedError: an artifact was replaced meanwhile.
-        RuntimeUnavailableError: there is no torch.
-    """
+    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error."""
     with needing("-t", "compile"):
         from ttscompile.calibration.compare import compare as measure
     with only_results_on_stdout(), Bar(shown=True) as bar:

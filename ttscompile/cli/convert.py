@@ -50,7 +50,6 @@ SECTIONS = (Section("Another denoising loop", ("sampler", "steps")), LEROBOT)
     "--precision",
     type=click.Choice(PRECISIONS),
     default=FP32,
-    show_default=True,
     help="Keep the weights of residual blocks and prologue in this precision. int8 is faster on processors with VNNI,"
     " int4 half as large and slower;"
     " 'ttscompile calibrate --learn precision' measures what it does, and leaves out the parts where that is much.",

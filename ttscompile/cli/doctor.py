@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from ttscompile.cli.options import json_option
-from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json
 from ttscompile.cli.sections import Recordings, SectionedCommand, require_recordings, trajectories_options
 from ttscompile.cli.types import PathOrHub
 from ttscompile.doctor import diagnosis as examination
@@ -35,7 +35,7 @@ def doctor(
         found = examination.examine(target, recordings=trajectories, **how)
     if as_json:
         opened = any(finding.what == "identity" for finding in found)
-        of = {"identity": identity_of(target)} if isinstance(target, Path) and opened else {}
+        of = {"identity": manifest_of(target).identity} if isinstance(target, Path) and opened else {}
         print_json(of | examination.document(found))
     else:
         click.echo(examination.text(found))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import click
+import numpy as np
 
 import ttscompile
 from ttscompile.artifact.files import replace_file
@@ -81,7 +82,7 @@ def inspect(
             if verifies:
                 passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
             policy = open_policy(artifact, seed=0)
-            told = write_page(output, artifact, policy, Given(episode, section, 1), status.update)
+            told = write_page(output, artifact, policy, Given(episode, section), status.update)
         say(console, told)
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)
@@ -118,18 +119,12 @@ def _plan(artifact: Artifact, name: str, episode: Episode | None) -> PlanArray:
             f"{artifact.path}: plan {name!r} is made for each observation, and none was given. Add --trajectories"
             f" FILE, or draw a schedule with --plan: {others}."
         )
-    course = run_episode(open_policy(artifact, seed=0), episode, name)  # of this artifact, whatever is there by now
-    plan: PlanArray = course.plans[-1]
-    return plan
+    # Of this artifact, whatever is there by now.
+    return np.asarray(run_episode(open_policy(artifact, seed=0), episode, name).plans[-1])
 
 
 def require_page(path: Path) -> None:
-    """See, before minutes of work, whether a page can be made there.
-
-    Raises:
-        OutputError: there is no such folder, or the name is of no page.
-        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
-    """
+    """Raise OutputError or RuntimeUnavailableError, before minutes of work, unless a page can be made there."""
     if not path.absolute().parent.is_dir():
         raise OutputError(f"{path}: the page cannot be written: no such folder. Give one that exists.")
     if path.suffix not in (".html", ".htm"):
@@ -140,15 +135,7 @@ def require_page(path: Path) -> None:
 def write_page(
     path: Path, artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None]
 ) -> str:
-    """Write the page; it replaces another one only when it is whole.
-
-    Args:
-        path: see ``require_page``.
-        policy: the same, with a seed; its calls are timed now.
-        given: what the page shows beside the artifact.
-
-    Returns:
-        What was written, for people.
+    """Write the page, which replaces another one only when it is whole, and say so; the policy's calls are timed now.
 
     Raises:
         OutputError: it cannot be written.
@@ -173,10 +160,10 @@ def checked(
         found = ttscompile.verify(
             directory, trajectories, sources=sources, progress=lambda it: progress(f"verifying: {it}")
         )
-        if found.identity not in (None, identity):
-            raise ArtifactChangedError(f"{directory}: was replaced meanwhile. Inspect it again.")
-        return found.passed, verified(found)
     except ArtifactChangedError:
         raise
     except ArtifactError as error:  # it has nothing to check against, and so fails nothing
         return True, OfPage("Verification", (f"Could not be run: {error}",))
+    if found.identity not in (None, identity):
+        raise ArtifactChangedError(f"{directory}: was replaced meanwhile. Inspect it again.")
+    return found.passed, verified(found)

@@ -30,8 +30,7 @@ def count_option(name: str, help: str, *, default: int | None = 1, least: int = 
 
 def number_option(name: str, kind: click.ParamType[Any], help: str, **settings: Any) -> Decorator:
     """An option that takes a number of this kind; see ``click.option`` for the settings."""
-    shown = settings.get("default") is not None
-    return click.option(name, cls=NumberOption, type=kind, metavar="NUMBER", show_default=shown, help=help, **settings)
+    return click.option(name, cls=NumberOption, type=kind, metavar="NUMBER", help=help, **settings)
 
 
 def threads_option(help: str) -> Decorator:
@@ -46,7 +45,7 @@ def several_threads_option(help: str) -> Decorator:
     def parsed(context: click.Context, option: click.Parameter, value: str) -> tuple[int, ...]:
         return tuple(dict.fromkeys(number(part.strip(), option, context) for part in value.split(",")))
 
-    return click.option("--threads", type=ANY_TEXT, default="1", show_default=True, callback=parsed, help=help)
+    return click.option("--threads", type=ANY_TEXT, default="1", callback=parsed, help=help)
 
 
 def together(*options: Decorator) -> Decorator:
@@ -89,7 +88,6 @@ runtime_options = together(
         "--runtime",
         type=click.Choice(["onnxruntime", "torch"]),
         default="onnxruntime",
-        show_default=True,
         help="Runtime that executes the policy; torch needs the extra 'compile'.",
     ),
     click.option(
@@ -121,7 +119,7 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
             raise click.BadParameter(f"{unknown[0]!r} is not one of {', '.join(known)}.")
         return names
 
-    return click.option(name, type=ANY_TEXT, default=default, show_default=True, callback=parsed, help=help)
+    return click.option(name, type=ANY_TEXT, default=default, callback=parsed, help=help)
 
 
 policy_hz_option = number_option(

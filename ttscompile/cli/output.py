@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import click
 from rich import box
@@ -72,11 +72,9 @@ def progress() -> Console:
     return _Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 
-@contextmanager
-def only_results_on_stdout() -> Iterator[None]:
+def only_results_on_stdout() -> redirect_stdout[TextIO]:
     """Send to standard error what libraries print while they work."""
-    with redirect_stdout(sys.stderr):
-        yield
+    return redirect_stdout(sys.stderr)
 
 
 def print_json(document: Mapping[str, Any]) -> None:
@@ -115,18 +113,9 @@ def table(*columns: str, rows: Iterable[Iterable[str]] = ()) -> Table:
 
 
 def manifest_of(path: Path) -> Manifest:
-    """Manifest of an artifact; in a directory nothing else is read and checked.
-
-    Raises:
-        ArtifactError: there is no artifact.
-    """
+    """Manifest of an artifact; in a directory nothing else is read and checked. Raises ArtifactError: there is none."""
     require_artifact_path(path)
     return read_manifest(path) if path.is_dir() else load_artifact(path).manifest
-
-
-def identity_of(path: Path) -> str:
-    """Identity of an artifact, 64 digits. Raises ArtifactError: there is no artifact."""
-    return manifest_of(path).identity
 
 
 def print_identity(identity: str, console: Console) -> None:

@@ -57,7 +57,6 @@ server_options = shared.together(
         "--host",
         type=ADDRESS,
         default="127.0.0.1",
-        show_default=True,
         help="Listen on this IP address of this machine, or on localhost. One that other machines may reach needs a"
         " token and a certificate.",
     ),
@@ -200,7 +199,6 @@ SECTIONS = (
     type=ANY_TEXT,
     metavar="ADDRESS|local",
     default=LOCAL,
-    show_default=True,
     help="Run the copies on this Ray cluster, or on cores of this machine.",
 )
 @server_options

@@ -190,6 +190,10 @@ class ChunkSpec:
             scale[one.channel], offset[one.channel] = 2 / width, -(one.above + one.below) / width
         return Affine(scale, offset)
 
+    def executed(self, samples: Any) -> Any:
+        """The executed part ``[..., Ta, Da]`` of denoised samples ``[..., T, D]``, normalised as these are."""
+        return samples[..., self.start : self.stop, : self.action_dim]
+
     def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
         """What the actions of a call with these observations, as they are given, are relative to; None for nothing.
 

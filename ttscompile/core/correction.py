@@ -146,11 +146,7 @@ class Correction:
         return int(self.reading.shape[1])
 
     def require_fit(self, steps: int, sample: tuple[int, int], numbers: int, groups: int | None = None) -> None:
-        """Raise unless it is for a policy of K steps, samples ``(T, D)`` and conditions of N numbers.
-
-        Raises:
-            IllegalPlanError: it is not.
-        """
+        """Raise IllegalPlanError unless it is for K steps, samples ``(T, D)`` and conditions of N numbers."""
         expected = (steps, groups or groups_of(steps, sample), FEATURES * sample[0], sample[0])
         if self.weights.shape != expected:
             raise IllegalPlanError(
@@ -181,11 +177,7 @@ class Correction:
         return np.asarray(condition @ self.reading, np.float32)
 
     def from_condition(self, read: FloatArray) -> FloatArray:
-        """What the observation adds to the sample of every step, float32 ``[K, D, B, T]``.
-
-        Args:
-            read: of the condition, float32 ``[B, F]``.
-        """
+        """What ``read [B, F]`` of the condition adds to the sample of every step, float32 ``[K, D, B, T]``."""
         count, *shape = self.observed.shape
         added = read @ self.observed.reshape(count, -1)
         return np.asarray(added, np.float32).reshape(-1, *shape).transpose(1, 2, 0, 3)
@@ -193,10 +185,7 @@ class Correction:
     def jump(self, j: int, read: FloatArray, history: FloatArray) -> FloatArray:
         """What jump number j adds to the sample, float32 ``[D, B, T]``.
 
-        Args:
-            j: of the jumps.
-            read: of the condition, float32 ``[B, F]``.
-            history: after the jump's anchor, ``[D, B, 4 T]``.
+        It is of ``read [B, F]`` of the condition, and of the history after the jump's anchor, ``[D, B, 4 T]``.
         """
         dimensions, streams, width = history.shape
         value = np.concatenate([read, history.transpose(1, 0, 2).reshape(streams, -1)], 1)

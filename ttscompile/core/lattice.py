@@ -51,10 +51,7 @@ class Origins:
 
 
 def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> PlanArray:
-    """A plan ``[K, blocks]`` or ``[B, K, blocks]`` of ``Source``, of any integer dtype, with a row for each stream.
-
-    Returns:
-        int8 ``[B, K, blocks]``, contiguous.
+    """A plan ``[K, blocks]`` or ``[B, K, blocks]`` of any integer dtype as int8 ``[B, K, blocks]``, contiguous.
 
     Raises:
         IllegalPlanError: wrong dtype, shape or values.
@@ -120,15 +117,12 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
-    """Raise if any stream's plan is illegal.
+    """Raise IllegalPlanError if any stream's plan is illegal.
 
     Args:
         plans: int8 ``[B, K, blocks]``.
         groups: FORWARD group of each block.
         written: bool ``[B, K, blocks]``.
-
-    Raises:
-        IllegalPlanError: names the first cell, and how many there are.
     """
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
@@ -183,11 +177,7 @@ def dense_plan(steps: int, blocks: int) -> PlanArray:
 
 
 def check_schedule(name: str, plan: npt.NDArray[Any], steps: int, blocks: int) -> None:
-    """Raise unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0.
-
-    Raises:
-        IllegalPlanError: it is not.
-    """
+    """Raise IllegalPlanError unless this is a schedule of a loop: int8 ``[K, blocks]`` with a dense step 0."""
     if plan.dtype != np.int8 or plan.ndim != 2:
         found = f"{plan.dtype}{list(plan.shape)}"
         raise IllegalPlanError(f"schedule {name!r}: expected int8[{steps}, {blocks}]; found {found}.")

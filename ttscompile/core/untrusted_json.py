@@ -38,12 +38,10 @@ def parse_json(
     with suppress(RecursionError):
         data = json.loads(content.decode("utf-8"), object_pairs_hook=_unique, **numbers)
         level = [data]
-        unseen = (
-            None if content.isascii() and not re.search(rb"[\\\x7f]", content) else _NOT_SHOWN if shown else _NO_TEXT
-        )
+        plain = content.isascii() and not re.search(rb"[\\\x7f]", content)
         for _ in range(MAX_DEPTH + 1):
-            if unseen is not None:
-                _require_shown(level, unseen)
+            if not plain:
+                _require_shown(level, _NOT_SHOWN if shown else _NO_TEXT)
             held = [item for item in level if isinstance(item, dict | list)]
             level = [child for item in held for child in (item.values() if isinstance(item, dict) else item)]
             if not level:

@@ -54,14 +54,7 @@ class HubName:
 
 
 def read_name(text: str) -> HubName:
-    """Read a name.
-
-    Args:
-        text: begins with ``hf://``. A slash in a revision is written ``%2F``.
-
-    Raises:
-        HubError: it is none.
-    """
+    """Read a name that begins with ``hf://``; a slash in a revision is written ``%2F``. Raises HubError: it is none."""
     organisation, _, rest = text.removeprefix(HUB).partition("/")
     first, _, inside = rest.strip("/").partition("/")
     name, at, revision = first.partition("@")
@@ -75,7 +68,7 @@ def read_name(text: str) -> HubName:
 
 
 def require_repository(repository: str, told: str) -> None:
-    """Raise HubError unless this is ``org/name``. It is not; the message begins with ``told``."""
+    """Raise HubError, with a message that begins with ``told``, unless this is ``org/name``."""
     if _REPOSITORY.fullmatch(repository) is None or "--" in repository or ".." in repository:
         raise HubError(f"{told:.200}: this is no name of a repository; {EXPECTED}.")
 
@@ -89,10 +82,8 @@ MANIFEST = "manifest.json"
 CARD = "README.md"
 _ABOUT = (CARD, "LICENSE", "LICENSE.md", "LICENSE.txt")
 _CONFIG, _WEIGHTS = "config.json", "model.safetensors"
-_POLICIES = (
-    {_CONFIG, _WEIGHTS},
-    {_CONFIG, "adapter_config.json", "adapter_model.safetensors"},
-)  # a whole one or an adapter
+_POLICIES = {_CONFIG, _WEIGHTS}, {_CONFIG, "adapter_config.json", "adapter_model.safetensors"}
+"""A whole one, or an adapter."""
 _OF_LEROBOT = re.compile(
     rf"(adapter_|train_)?{_CONFIG}|policy_(pre|post)processor\.json|[^/]+\.safetensors"
     r"|[^/]+/(config|vocab|tokenizer|tokenizer_config|special_tokens_map|added_tokens)\.json|[^/]+/merges\.txt"
@@ -144,7 +135,6 @@ def fetch_artifact(text: str, anew: bool = False) -> Fetched:
 
     Raises:
         HubError: there is no such repository, no artifact in it, or no network and nothing in the cache.
-        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     name, hub = read_name(text), library()
     with told(text):
@@ -164,7 +154,6 @@ def fetch_checkpoint(text: str) -> Fetched:
 
     Raises:
         HubError: there is no such repository, no checkpoint in it or several, or no network and nothing in the cache.
-        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     name, hub = read_name(text), library()
     with told(text):
@@ -189,7 +178,6 @@ def fetch_recording(text: str) -> Path:
 
     Raises:
         HubError: there is no such data set, it is not LeRobot's, or there is no network and nothing in the cache.
-        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     if not text.startswith(DATA_SETS):
         raise HubError(f"{text:.200}: expected {DATA_SETS}ORGANISATION/NAME, and perhaps @REVISION after it.")
@@ -285,11 +273,7 @@ def _licence(card: Path) -> str | None:
 
 
 def library() -> Any:
-    """The package ``huggingface_hub``.
-
-    Raises:
-        RuntimeUnavailableError: it is not installed.
-    """
+    """The package ``huggingface_hub``."""
     with needing("the Hugging Face hub", "hub"):
         import huggingface_hub
         import huggingface_hub.errors
@@ -328,7 +312,6 @@ def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, pr
     Raises:
         HubError: the repository holds something else than an artifact, is public although ``private`` was asked for, or
             cannot be written.
-        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     require_repository(repository, repository)
     hub = library()

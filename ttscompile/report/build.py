@@ -41,7 +41,6 @@ class Given:
 
     episode: Episode | None = None
     verification: Section = NOT_RUN
-    threads: int = 1
     calls: int = 10
 
 
@@ -52,10 +51,6 @@ def build(
 
     Args:
         policy: the same, with its default runtime and a seed.
-        given: what the report shows beside the artifact.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
     """
     manifest = artifact.manifest
     require_packages()
@@ -76,7 +71,7 @@ def build(
         facts.blocks(manifest),
         _plans(artifact, course),
         *(() if course is None else (_episode(course),)),
-        _latency(measured, given, manifest.default_plan),
+        _latency(measured, manifest.default_plan),
         *[frontier] * (not chosen),
         _calibration(manifest),
         given.verification,
@@ -160,10 +155,10 @@ def _episode(course: Course) -> Section:
     return Section("Episode", (text,), pictures=tuple(drawn))
 
 
-def _latency(measured: Sequence[Measurement], given: Given, default: str) -> Section:
+def _latency(measured: Sequence[Measurement], default: str) -> Section:
     alt = "Bars: what the calls of each plan spend their time on. The table has the figures."
     drawn = Picture(pictures.latency_picture(measured), "What the calls of each plan spend their time on.", alt)
-    return replace(latency(measured, default, given.threads), pictures=(drawn,))
+    return replace(latency(measured, default), pictures=(drawn,))
 
 
 def _frontier(artifact: Artifact, measured: Sequence[Measurement]) -> Section:

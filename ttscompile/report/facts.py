@@ -156,15 +156,8 @@ def block_table(manifest: Manifest) -> Table:
     rows = []
     for key, members in groupby(sorted(enumerate(manifest.blocks), key=alike), alike):
         group, kind, type_, cost, reason = key
-        rows.append(
-            (
-                of_blocks([index for index, _ in members]),
-                kind + (f": {reason}" if reason else ""),
-                type_,
-                str(group),
-                flops(cost),
-            )
-        )
+        told = f"{kind}: {reason}" if reason else kind
+        rows.append((of_blocks([index for index, _ in members]), told, type_, str(group), flops(cost)))
     return Table(("block", "kind", "residual", "group", "FLOPs, one evaluation"), tuple(rows))
 
 

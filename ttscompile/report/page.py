@@ -81,11 +81,7 @@ def require_packages() -> None:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document without scripts, which refers to nothing outside of itself.
-
-    Raises:
-        RuntimeUnavailableError: Jinja2 is not installed.
-    """
+    """The page as one HTML document without scripts, which refers to nothing outside of itself."""
     require_packages()
     from jinja2 import Environment, StrictUndefined
 

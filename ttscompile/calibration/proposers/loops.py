@@ -234,8 +234,7 @@ class Loops(Proposer):
         if loop not in known:
             trials.bar.stage(f"timing {loop}", 1)
             known[loop] = self._measured(trials, loop)
-            trials.state.progress["seconds"] = clock.elapsed()
-            trials.state.save()
+            trials.state.save(seconds=clock.elapsed())
         with trials.state.reading():
             one, step = known[loop]
             return Cost(float(one), float(step))

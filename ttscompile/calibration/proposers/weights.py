@@ -62,21 +62,11 @@ SMALLEST = 2
 
 
 def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
-    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads.
-
-    Raises:
-        CalibrationError: there are none for so large a rank.
-    """
-    pieces = artifact.pieces
-    others = {
-        name for key, graph in artifact.graphs.items() if not key.startswith("block_") for name in graph.constants
-    }
-    mine = {name for piece in pieces.blocks for name in piece.graph.constants} - others
-    sizes = {
-        name: min(_sides(artifact.weights[name].shape))
-        for name in mine
-        if artifact.weights[name].dtype == np.float32 and artifact.weights[name].ndim >= 2
-    }
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
+    others = {name for key, graph in artifact.graphs.items() if not is_block(key) for name in graph.constants}
+    mine = {name for piece in artifact.pieces.blocks for name in piece.graph.constants} - others
+    values = {name: artifact.weights[name] for name in mine}
+    sizes = {n: min(_sides(a.shape)) for n, a in values.items() if a.dtype == np.float32 and a.ndim >= 2}
     found = tuple(sorted(name for name, size in sizes.items() if size >= SMALLEST * rank))
     if not found:
         most = max(sizes.values(), default=0) // SMALLEST
@@ -95,11 +85,7 @@ def _sides(shape: tuple[int, ...]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Lesson:
-    """Calls, and what their loop carries to the first step that is trained.
-
-    Attributes:
-        carried: to step ``Student.begin``.
-    """
+    """Calls, and what their loop carries to step ``Student.begin``, the first that is trained."""
 
     calls: Calls
     carried: Carried
@@ -305,8 +291,7 @@ class Weights(Proposer):
             trials.bar.update(student.done, f"loss {loss:.2e}", clock.left())
             if student.done % SAVED == 0:
                 state.put("weights", student.state())
-                state.progress |= {"updates": student.done, "seconds": clock.elapsed()}
-                state.save()
+                state.save(updates=student.done, seconds=clock.elapsed())
 
 
 def _require_whole_steps(trials: Trials, plan: Plan) -> None:

@@ -22,7 +22,7 @@ from torch import Tensor
 from ...core.lattice import PlanArray, Source, whole_steps_plan
 from ...ir.plan_head import first_numbers, has_head
 from ...runtimes.plans import pruner_plan
-from ..calls import Calls, IntArray
+from ..calls import Calls, IntArray, calls_of
 from ..step_counts import spacings
 from ..task import Array, Found, NothingAfter, Task
 from .straight_through import Practice, legal, written
@@ -132,8 +132,7 @@ class Paper(NothingAfter):
                 self._values[BASE] = self._base(self._best_steps(self._most))
         window = self._practice.calls.window
         order = self._task.draw(interval, 4).permutation(self._practice.calls.count // window)
-        chosen = order[: max(1, BATCH // window), None] * window + np.arange(window)
-        self._update(self._practice, chosen.reshape(-1), interval)
+        self._update(self._practice, calls_of(order[: max(1, BATCH // window)], window), interval)
         self._interval = interval + 1
         if self._interval % EVERY == 0 or self._interval == self.intervals:
             self._compare()
@@ -298,6 +297,5 @@ def _divided(task: Task) -> tuple[IntArray, IntArray]:
     if len(known) == 1:
         apart = np.arange(len(order)) < max(len(order) // 4, int(len(order) > 1))
     parts = [order[~apart], order[apart][: max(1, COMPARED // window)]]
-    whole = [part if len(part) else order[:1] for part in parts]
-    practised, compared = ((part[:, None] * window + np.arange(window)).reshape(-1) for part in whole)
+    practised, compared = (calls_of(part if len(part) else order[:1], window) for part in parts)
     return practised, compared
