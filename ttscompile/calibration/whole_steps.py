@@ -66,9 +66,10 @@ class WholeSteps:
         def some(windows: IntArray, most: int) -> Calls:
             return executor.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
 
-        self._compared = self._fitted = some(order[apart], max(COMPARED, calls.count // COMPARED_SHARE))
+        fitted, compared = _sizes(calls.count)
+        self._compared = self._fitted = some(order[apart], compared)
         if not apart.all():
-            self._fitted = some(order[~apart], max(FITTED, calls.count // FITTED_SHARE))
+            self._fitted = some(order[~apart], fitted)
 
     @property
     def steps(self) -> int:
@@ -193,6 +194,11 @@ def _measured_elsewhere(
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:
     return plan(calls) if callable(plan) else plan
+
+
+def _sizes(count: int) -> tuple[int, int]:
+    """Of so many calls, how many candidates are fitted on and measured on, at most."""
+    return max(FITTED, count // FITTED_SHARE), max(COMPARED, count // COMPARED_SHARE)
 
 
 def _set_apart(episodes: IntArray) -> BoolArray:
