@@ -59,7 +59,7 @@ def draw(path: Path) -> None:
     axes.axhline(-MARGIN, color="grey", linewidth=0.8, linestyle=":")
     for bound, name in ((BOUND, "the default"), (FARTHEST, "fast")):
         axes.axvline(bound, color="grey", linewidth=0.8, linestyle="--")
-        axes.annotate(f" {name}", (bound, 1), xycoords=("data", "axes fraction"), va="top", color="grey")
+        axes.annotate(f" {name}", (bound, 0.98), xycoords=("data", "axes fraction"), va="top", color="grey")
     axes.set_xlabel("distance from the original, in units of what other noise changes")
     axes.set_ylabel("success, difference in points")
     axes.set_xlim(0, None)
