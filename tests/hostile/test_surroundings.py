@@ -59,9 +59,10 @@ def test_what_is_left_behind_is_found(tmp_path: Path) -> None:
 
 def test_without_memory_to_be_loaded_the_program_says_so() -> None:
     """Python's own errors come out of an import then, of several kinds."""
-    code = "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (150_000_000, 150_000_000));"
+    code = "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (100_000_000, 100_000_000));"
     code += "from ttscompile.__main__ import main; sys.argv = ['ttscompile', 'inspect', 'nothing']; main()"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    one = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each takes memory of its own
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=one)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.splitlines()[-1].startswith("ttscompile cannot be loaded: ")
     assert "Traceback" not in result.stderr

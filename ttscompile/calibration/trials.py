@@ -33,15 +33,15 @@ from .execute import Executor
 from .progress import Bar
 from .regression import envelope_of
 from .state import StateFile
-from .targets import dense_rounds, draw_calls, with_targets
+from .targets import TARGETS_AT_ONCE, dense_rounds, draw_calls, with_targets
 
 SHARE = 0.5
 """Share of the time limit after which no more calls to learn from are answered than there have to be."""
 
-DRAWS, MANY_DRAWS = 4, 16
+DRAWS, MANY_DRAWS, MOST_DRAWS = 4, 16, 64
 """Of noise for each observation; the second where the artifact has further loops, with half as many observations. Noise
 cannot be paired between samplers. Where two plans answer alike the error of an energy distance falls as the number of
-draws, and only as the root of that of observations."""
+draws, and only as the root of that of observations. So a network that answers quickly is asked for up to the third."""
 
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
@@ -51,6 +51,10 @@ FEWEST_OBSERVATIONS = 4
 
 JUDGING = 0.15
 """Share of the time limit for the answers of either part that plans are judged by. A slow policy gives fewer."""
+
+QUICKLY, MORE_DRAWS = 0.2, 0.01
+"""Share of the time for calls to learn from in which a small network answers more than usual, and of the time limit for
+more draws of noise."""
 
 EPISODES = 16
 """That these are of, at most."""
@@ -101,9 +105,10 @@ class Trials:
         seed: of the split, the noise, and everything else that is random.
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
-        limits: of the calls to learn from: how many there are whatever the time, and if there is enough.
+        limits: of the calls to learn from: how many there are whatever the time, if there is enough, and if the network
+            answers quickly.
         observations: that the original answers, at most, of either part.
-        draws: of noise for each of them.
+        draws: of noise for each of them, at least.
         until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
@@ -124,7 +129,7 @@ class Trials:
     device: torch.device | None = None
     runtime: str = "onnxruntime"
     fresh: bool = False
-    limits: tuple[int, int] = (FEWEST_CALLS, FEWEST_CALLS)
+    limits: tuple[int, int, int] = (FEWEST_CALLS, FEWEST_CALLS, FEWEST_CALLS)
     observations: int = OBSERVATIONS
     name: str = DENSE
     draws: int = DRAWS
@@ -183,11 +188,10 @@ class Trials:
 
     def _to_learn_from(self, window: int) -> Calls:
         if window not in self._calls:
-            spec, (fewest, most) = self.executor.view.manifest.spec, self.limits
-            calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
-            loop = self.base.loop
+            (fewest, *_), loop, clock = self.limits, self.base.loop, self.clock.until(self.until)
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
-            work = self.state, self.clock.until(self.until), self.bar, self.pool
+            calls = self._drawn(self._affordable(name, window, clock), window)
+            work = self.state, clock, self.bar, self.pool
             self._calls[window] = with_targets(self.executor, name, calls, fewest, *work)
             if self.clock.left() < 0:
                 self.bar.warn(
@@ -195,6 +199,26 @@ class Trials:
                     f" {fewest} are needed. The search is the shortest there is; allow more time."
                 )
         return self._calls[window]
+
+    def _drawn(self, most: int, window: int) -> Calls:
+        spec = self.executor.view.manifest.spec
+        return draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
+
+    def _affordable(self, name: str, window: int, clock: Clock) -> int:
+        """How many calls to learn from are drawn: as many as usual, or more if the network answers these quickly.
+
+        Their noise depends on the number, so it is kept; a state that has answers without it has the usual ones.
+        """
+        (_, usual, most), key = self.limits, f"{name} drawn"
+        if key not in self.state.progress:
+            self.state.progress[key] = usual
+            if usual < most and name not in self.state.get("targets"):
+                begun, few = self.clock.elapsed(), self._drawn(TARGETS_AT_ONCE, window)
+                self.executor.run_dense(few)
+                took = max(self.clock.elapsed() - begun, 1e-9) / few.count
+                self.state.progress[key] = int(np.clip(QUICKLY * clock.left() / took, usual, most))
+            self.state.save(seconds=self.clock.elapsed())
+        return int(self.state.progress[key])
 
     @property
     def changed_name(self) -> str:
@@ -221,8 +245,8 @@ class Trials:
         if part not in self._samples:
             numbers = self.split.calibration if part == LEARNED else self.split.validation
             stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), self.observations)
-            calls = self._in_time(part, stretches, calls)
-            self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls))
+            calls, draws = self._in_time(part, stretches, calls)
+            self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls, draws))
         return self._samples[part]
 
     def observation(self, places: Sequence[tuple[int, int]]) -> Observation:
@@ -247,49 +271,57 @@ class Trials:
         """See ``noise``."""
         return _NUMBERS[part], stretch, row, draw
 
-    def _in_time(self, part: str, stretches: IntArray, calls: IntArray) -> IntArray:
-        """As many of these calls as the original answers in their share of the time, evenly spread."""
-        key, begun = f"{part} observations", self.clock.elapsed()
+    def _in_time(self, part: str, stretches: IntArray, calls: IntArray) -> tuple[IntArray, int]:
+        """As many of these calls as the original answers in their share of the time, evenly spread; and how often."""
+        key, draws, begun = f"{part} observations", f"{part} draws", self.clock.elapsed()
         if self.state.get(f"{part} answers"):
             self.state.progress.setdefault(key, len(calls))
         if key not in self.state.progress:
-            self._answers(part, stretches, calls[:1])
+            for _ in dense_rounds(*self._asked(part, stretches, calls[:1], self.draws), pool=self.pool):
+                pass
             took = max(self.clock.elapsed() - begun, 1e-9)
             found = min(JUDGING * self.clock.limit / took, len(calls))
             self.state.progress[key] = max(int(found), min(FEWEST_OBSERVATIONS, len(calls)))
+            if np.isfinite(self.clock.limit):
+                often = MORE_DRAWS * self.clock.limit / (took / self.draws * len(calls))
+                self.state.progress[draws] = int(np.clip(often, self.draws, max(self.draws, MOST_DRAWS)))
             if self.state.progress[key] < len(calls):
                 self.bar.warn(
                     f"the original answers {self.state.progress[key]} of {len(calls)} {part} observations: it takes"
                     f" {took:.3g} s for each. Limits of a distance are wider so; allow more time."
                 )
         count = min(int(self.state.progress[key]), len(calls))
-        return calls[np.linspace(0, len(calls) - 1, count).round().astype(np.int64)]
+        chosen = calls[np.linspace(0, len(calls) - 1, count).round().astype(np.int64)]
+        return chosen, int(self.state.progress.get(draws, self.draws))
 
-    def _answers(self, part: str, stretches: IntArray, calls: IntArray) -> FloatArray:
-        """What the original answers; what is in the state already is not asked for again."""
-        view = view_of(self.artifact, DENSE)
-        spec = view.manifest.spec
-        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(self.draws)]
-        noise = self.noise(spec, [self.key(part, *one) for one in asked])
-        places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
-        key = f"{part} answers"
+    def _answers(self, part: str, stretches: IntArray, calls: IntArray, draws: int) -> FloatArray:
+        """What the original answers, ``[N, draws, T, D]``; what is in the state already is not asked for again."""
+        spec, key, count = view_of(self.artifact, DENSE).manifest.spec, f"{part} answers", draws * len(calls)
         kept = self.state.get(key)
         if not np.array_equal(before := kept.get("calls", np.zeros((1, 2))), calls[: len(before)]):  # of others
             kept = {}
         known = kept.get("samples", np.zeros((0, *spec.sample), np.float32))
         with self.state.reading():
-            if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > len(asked):
+            if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > count:
                 raise ValueError(f"expected answers float32 [n, {spec.sample}]; found {known.dtype} {known.shape}")
-        if len(known) < len(asked):
-            executor = self.executor if self.executor.view.variant == view.variant else Executor(view, self.device)
-            drawn = calls_at(executor.model, spec, self.episodes, places, noise_tensors(noise, spec.sampler.stochastic))
-            self.bar.stage(f"original, {part} episodes", len(asked), len(known))
-            for found in dense_rounds(executor, drawn, len(known), self.pool):
+        if len(known) < count:
+            self.bar.stage(f"original, {part} episodes", count, len(known))
+            for found in dense_rounds(*self._asked(part, stretches, calls, draws), len(known), self.pool):
                 known = np.concatenate([known, found[:, -1].numpy()])
                 self.state.put(key, {"samples": known, "calls": calls})
                 self.state.save(seconds=self.clock.elapsed())
                 self.bar.update(len(known), "", self.clock.left())
-        return known.reshape(len(calls), self.draws, *spec.sample)
+        return known.reshape(len(calls), draws, *spec.sample)
+
+    def _asked(self, part: str, stretches: IntArray, calls: IntArray, draws: int) -> tuple[Executor, Calls]:
+        """What the original is given, so many draws of noise of each call, one after the other; and what runs it."""
+        view = view_of(self.artifact, DENSE)
+        executor = self.executor if self.executor.view.variant == view.variant else Executor(view, self.device)
+        spec, asked = view.manifest.spec, [(int(s), int(row), draw) for s, row in calls for draw in range(draws)]
+        noise = self.noise(spec, [self.key(part, *one) for one in asked])
+        places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
+        given = noise_tensors(noise, spec.sampler.stochastic)
+        return executor, calls_at(executor.model, spec, self.episodes, places, given)
 
 
 def base_of(artifact: Artifact) -> Plan:

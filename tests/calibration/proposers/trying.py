@@ -27,7 +27,7 @@ def trials_of(directory: Path, recordings: Sequence[Path], calls: int = 64) -> T
     """Of an artifact, with so many calls to learn from."""
     artifact = load_artifact(directory)
     episodes = load_episodes(artifact.manifest.spec, list(recordings), None)
-    return Trials.of(artifact, episodes, StateFile(directory, {}), limits=(calls, calls))
+    return Trials.of(artifact, episodes, StateFile(directory, {}), limits=(calls,) * 3)
 
 
 def proposed(proposer: Proposer, trials: Trials, plan: Plan) -> list[Proposal]:

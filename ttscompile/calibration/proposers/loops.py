@@ -202,8 +202,8 @@ class Loops(Proposer):
         until = (now + ANSWERING * seconds) / limit if np.isfinite(limit) else 1.0
         own = replace(trials.of_loop(loop), until=until)
         minutes = max(seconds, 1.0) / 60 if np.isfinite(seconds) else 1e3
-        fewest, most = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
-        return replace(own, limits=(fewest, own.state.progress.setdefault(f"most of {loop}", most)))
+        fewest, usual, most = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
+        return replace(own, limits=(fewest, own.state.progress.setdefault(f"most of {loop}", usual), most))
 
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""
