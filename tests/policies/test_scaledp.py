@@ -161,7 +161,7 @@ def test_what_is_no_such_head_is_refused(tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match=message) as caught:
             load_checkpoint_policy(path)
         assert str(path) in str(caught.value)
-    with pytest.raises(CheckpointError, match=r"missing pos_embed\. .* another network than policy_head_config in config\.json"):
+    with pytest.raises(CheckpointError, match=r"missing pos_embed\. .* than policy_head_config in"):
         load_checkpoint_policy(save(tmp_path, changes={"pos_embed": None}))
     with pytest.raises(CheckpointError, match=r"x_embedder.bias holds 24 values that are not finite"):
         load_checkpoint_policy(save(tmp_path, changes={"x_embedder.bias": torch.full((24,), torch.nan)}))

@@ -52,7 +52,7 @@ FEWEST_OBSERVATIONS = 4
 JUDGING = 0.15
 """Share of the time limit for the answers of either part that plans are judged by. A slow policy gives fewer."""
 
-QUICKLY, MORE_DRAWS = 0.2, 0.01
+QUICKLY, MORE_DRAWS = 0.7, 0.03
 """Share of the time for calls to learn from in which a small network answers more than usual, and of the time limit for
 more draws of noise."""
 
