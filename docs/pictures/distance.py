@@ -62,7 +62,7 @@ def draw(path: Path) -> None:
         axes.annotate(f" {name}", (bound, 0.98), xycoords=("data", "axes fraction"), va="top", color="grey")
     axes.set_xlabel("distance from the original, in units of what other noise changes")
     axes.set_ylabel("success, difference in points")
-    axes.set_xlim(0, None)
+    axes.set_xlim(min(0.0, *(row["distance"] - 0.01 for row in rows)), None)
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncol=4, frameon=False)
     figure.savefig(path, dpi=110)
 

@@ -67,12 +67,13 @@ def require_directory(path: Path) -> None:
 def calls_to_learn_from(
     manifest: Manifest, max_minutes: float, corrects: bool, distils: bool = False
 ) -> tuple[int, int, int]:
-    """How many calls there have to be, how many there are if the time is enough to answer them, and at most."""
+    """How many calls there have to be, how many there are if there is time, and if they take little of it."""
     spec, most = manifest.spec, MOST_CALLS
     if distils or (corrects and may_jump(spec.sample)):
         most = int(np.clip(ROOM // _context_bytes(manifest), MOST_CALLS, MOST_LEARNED))
     fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED) if corrects else FEWEST_CALLS
-    return fewest, int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, most)), most
+    usual = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, most))
+    return fewest, usual, most
 
 
 def _context_bytes(manifest: Manifest) -> int:
