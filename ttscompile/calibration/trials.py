@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ..artifact.load import Artifact
-from ..artifact.view import view_of
+from ..artifact.view import View, view_of
 from ..core.correction import COMPONENTS, numbers_of
 from ..core.envelope import Envelope
 from ..core.lattice import dense_plan
@@ -33,7 +33,7 @@ from .execute import Executor
 from .progress import Bar
 from .regression import envelope_of
 from .state import StateFile
-from .targets import TARGETS_AT_ONCE, dense_rounds, draw_calls, with_targets
+from .targets import dense_rounds, draw_calls, with_targets
 
 SHARE = 0.5
 """Share of the time limit after which no more calls to learn from are answered than there have to be."""
@@ -41,7 +41,7 @@ SHARE = 0.5
 DRAWS, MANY_DRAWS, MOST_DRAWS = 4, 16, 64
 """Of noise for each observation; the second where the artifact has further loops, with half as many observations. Noise
 cannot be paired between samplers. Where two plans answer alike the error of an energy distance falls as the number of
-draws, and only as the root of that of observations. So a network that answers quickly is asked for up to the third."""
+draws, and only as the root of that of observations. So a small network is asked more often, up to the third."""
 
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
@@ -55,6 +55,10 @@ JUDGING = 0.15
 QUICKLY, MORE_DRAWS = 0.7, 0.03
 """Share of the time for calls to learn from in which a small network answers more than usual, and of the time limit for
 more draws of noise."""
+
+RATE = 4.6e10
+"""FLOPs a second of a core with AVX-512, in dense calls of a small network. How many answers fit into a time follows
+from it, so that it is the same on every machine; the clock ends them where one is slower."""
 
 EPISODES = 16
 """That these are of, at most."""
@@ -105,8 +109,8 @@ class Trials:
         seed: of the split, the noise, and everything else that is random.
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
-        limits: of the calls to learn from: how many there are whatever the time, if there is enough, and if the network
-            answers quickly.
+        limits: of the calls to learn from: how many there are whatever the time, if there is enough, and if they take
+            little of it.
         observations: that the original answers, at most, of either part.
         draws: of noise for each of them, at least.
         until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
@@ -188,10 +192,11 @@ class Trials:
 
     def _to_learn_from(self, window: int) -> Calls:
         if window not in self._calls:
-            (fewest, *_), loop, clock = self.limits, self.base.loop, self.clock.until(self.until)
+            spec, (fewest, *_), loop = self.executor.view.manifest.spec, self.limits, self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
-            calls = self._drawn(self._affordable(name, window, clock), window)
-            work = self.state, clock, self.bar, self.pool
+            most = self._affordable(name)
+            calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
+            work = self.state, self.clock.until(self.until), self.bar, self.pool
             self._calls[window] = with_targets(self.executor, name, calls, fewest, *work)
             if self.clock.left() < 0:
                 self.bar.warn(
@@ -200,24 +205,16 @@ class Trials:
                 )
         return self._calls[window]
 
-    def _drawn(self, most: int, window: int) -> Calls:
-        spec = self.executor.view.manifest.spec
-        return draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
-
-    def _affordable(self, name: str, window: int, clock: Clock) -> int:
-        """How many calls to learn from are drawn: as many as usual, or more if the network answers these quickly.
+    def _affordable(self, name: str) -> int:
+        """How many calls to learn from are drawn: as many as usual, or more of a small network.
 
         Their noise depends on the number, so it is kept; a state that has answers without it has the usual ones.
         """
         (_, usual, most), key = self.limits, f"{name} drawn"
         if key not in self.state.progress:
-            self.state.progress[key] = usual
-            if usual < most and name not in self.state.get("targets"):
-                begun, few = self.clock.elapsed(), self._drawn(TARGETS_AT_ONCE, window)
-                self.executor.run_dense(few)
-                took = max(self.clock.elapsed() - begun, 1e-9) / few.count
-                self.state.progress[key] = int(np.clip(QUICKLY * clock.left() / took, usual, most))
-            self.state.save(seconds=self.clock.elapsed())
+            found = QUICKLY * self.until * self.clock.limit / _seconds(self.executor.view)
+            known = name in self.state.get("targets")
+            self.state.progress[key] = usual if known else int(np.clip(found, usual, most))
         return int(self.state.progress[key])
 
     @property
@@ -245,7 +242,8 @@ class Trials:
         if part not in self._samples:
             numbers = self.split.calibration if part == LEARNED else self.split.validation
             stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), self.observations)
-            calls, draws = self._in_time(part, stretches, calls)
+            draws = self._draws(part, len(calls))
+            calls = self._in_time(part, stretches, calls, draws)
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls, draws))
         return self._samples[part]
 
@@ -271,57 +269,64 @@ class Trials:
         """See ``noise``."""
         return _NUMBERS[part], stretch, row, draw
 
-    def _in_time(self, part: str, stretches: IntArray, calls: IntArray) -> tuple[IntArray, int]:
-        """As many of these calls as the original answers in their share of the time, evenly spread; and how often."""
-        key, draws, begun = f"{part} observations", f"{part} draws", self.clock.elapsed()
+    def _draws(self, part: str, calls: int) -> int:
+        """Of noise for each of so many calls; a state that has answers without their number has the usual ones."""
+        key, seconds = f"{part} draws", self.clock.limit
+        if key not in self.state.progress:
+            few = bool(self.state.get(f"{part} answers")) or not np.isfinite(seconds)
+            found = self.draws if few else MORE_DRAWS * seconds / (calls * _seconds(view_of(self.artifact, DENSE)))
+            self.state.progress[key] = int(np.clip(found, self.draws, max(self.draws, MOST_DRAWS)))
+        return int(self.state.progress[key])
+
+    def _in_time(self, part: str, stretches: IntArray, calls: IntArray, draws: int) -> IntArray:
+        """As many of these calls as the original answers in their share of the time, evenly spread."""
+        key, begun = f"{part} observations", self.clock.elapsed()
         if self.state.get(f"{part} answers"):
             self.state.progress.setdefault(key, len(calls))
         if key not in self.state.progress:
-            for _ in dense_rounds(*self._asked(part, stretches, calls[:1], self.draws), pool=self.pool):
-                pass
+            self._answers(part, stretches, calls[:1], draws)
             took = max(self.clock.elapsed() - begun, 1e-9)
             found = min(JUDGING * self.clock.limit / took, len(calls))
             self.state.progress[key] = max(int(found), min(FEWEST_OBSERVATIONS, len(calls)))
-            if np.isfinite(self.clock.limit):
-                often = MORE_DRAWS * self.clock.limit / (took / self.draws * len(calls))
-                self.state.progress[draws] = int(np.clip(often, self.draws, max(self.draws, MOST_DRAWS)))
             if self.state.progress[key] < len(calls):
                 self.bar.warn(
                     f"the original answers {self.state.progress[key]} of {len(calls)} {part} observations: it takes"
                     f" {took:.3g} s for each. Limits of a distance are wider so; allow more time."
                 )
         count = min(int(self.state.progress[key]), len(calls))
-        chosen = calls[np.linspace(0, len(calls) - 1, count).round().astype(np.int64)]
-        return chosen, int(self.state.progress.get(draws, self.draws))
+        return calls[np.linspace(0, len(calls) - 1, count).round().astype(np.int64)]
 
     def _answers(self, part: str, stretches: IntArray, calls: IntArray, draws: int) -> FloatArray:
         """What the original answers, ``[N, draws, T, D]``; what is in the state already is not asked for again."""
-        spec, key, count = view_of(self.artifact, DENSE).manifest.spec, f"{part} answers", draws * len(calls)
+        view = view_of(self.artifact, DENSE)
+        spec = view.manifest.spec
+        asked = [(int(s), int(row), draw) for s, row in calls for draw in range(draws)]
+        noise = self.noise(spec, [self.key(part, *one) for one in asked])
+        places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
+        key = f"{part} answers"
         kept = self.state.get(key)
         if not np.array_equal(before := kept.get("calls", np.zeros((1, 2))), calls[: len(before)]):  # of others
             kept = {}
         known = kept.get("samples", np.zeros((0, *spec.sample), np.float32))
         with self.state.reading():
-            if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > count:
+            if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > len(asked):
                 raise ValueError(f"expected answers float32 [n, {spec.sample}]; found {known.dtype} {known.shape}")
-        if len(known) < count:
-            self.bar.stage(f"original, {part} episodes", count, len(known))
-            for found in dense_rounds(*self._asked(part, stretches, calls, draws), len(known), self.pool):
+        if len(known) < len(asked):
+            executor = self.executor if self.executor.view.variant == view.variant else Executor(view, self.device)
+            drawn = calls_at(executor.model, spec, self.episodes, places, noise_tensors(noise, spec.sampler.stochastic))
+            self.bar.stage(f"original, {part} episodes", len(asked), len(known))
+            for found in dense_rounds(executor, drawn, len(known), self.pool):
                 known = np.concatenate([known, found[:, -1].numpy()])
                 self.state.put(key, {"samples": known, "calls": calls})
                 self.state.save(seconds=self.clock.elapsed())
                 self.bar.update(len(known), "", self.clock.left())
         return known.reshape(len(calls), draws, *spec.sample)
 
-    def _asked(self, part: str, stretches: IntArray, calls: IntArray, draws: int) -> tuple[Executor, Calls]:
-        """What the original is given, so many draws of noise of each call, one after the other; and what runs it."""
-        view = view_of(self.artifact, DENSE)
-        executor = self.executor if self.executor.view.variant == view.variant else Executor(view, self.device)
-        spec, asked = view.manifest.spec, [(int(s), int(row), draw) for s, row in calls for draw in range(draws)]
-        noise = self.noise(spec, [self.key(part, *one) for one in asked])
-        places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
-        given = noise_tensors(noise, spec.sampler.stochastic)
-        return executor, calls_at(executor.model, spec, self.episodes, places, given)
+
+def _seconds(view: View) -> float:
+    """About what a dense call takes, if its arithmetic is all."""
+    manifest = view.manifest
+    return manifest.flops.call(dense_plan(manifest.steps, len(manifest.blocks)), pruned=False) / RATE
 
 
 def base_of(artifact: Artifact) -> Plan:
