@@ -67,7 +67,11 @@ class Backend(Protocol[Lowered]):
     keeps: BoolArray
 
     def lower(self, plan: PlanArray) -> Lowered:
-        """What ``other_steps`` needs of a stream's plan, int8 ``[K, blocks]`` and legal. The runtime gives it again."""
+        """What ``other_steps`` needs of the plan of one stream. The runtime keeps it, and gives it again.
+
+        Args:
+            plan: int8 ``[K, blocks]``, legal.
+        """
 
     def prepare(self, streams: int, plans: Sequence[Lowered] | None) -> None:
         """Have everything that a call needs beside its inputs: memory, for the most part. It is not timed.

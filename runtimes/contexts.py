@@ -58,7 +58,11 @@ class ContextValues:
                 self.values[name][...] = value
 
     def for_step_piece(self, names: Iterable[str]) -> list[Any]:
-        """What the step piece reads for all steps in one batch of K * B, step-major; errors as ``keep_steps``."""
+        """What the step piece reads for all steps in one batch of K * B, step-major.
+
+        Raises:
+            ArtifactError: one of them has no axis for the streams.
+        """
         found, steps, together = list[Any](), self._manifest.steps, self._module.concatenate
         for name in names:
             value, axis = self.values[name], self._manifest.contexts[name].type.batch_axis

@@ -84,6 +84,7 @@ class FrameMemory:
         """Compute the rows that are not known; nothing is kept of one whose computing fails.
 
         Args:
+            contents: of the rows.
             compute: asked once for each new row.
             stop: asked before each; the rest is left out if it says so.
         """
@@ -112,9 +113,11 @@ class FrameMemory:
 
 
 def contents_of(rows: Sequence[Array], lanes: Sequence[Lane] = ()) -> list[Content]:
-    """The content of each row, of rows ``[N, ...]`` for each input of a piece.
+    """The content of each row, of the inputs of a piece ``[N, ...]``.
 
-    ``lanes`` are those of the rows, where what is given for one depends on the frames of its lane before it.
+    Args:
+        rows: of each input.
+        lanes: of the rows, where what is given for one depends on the frames of its lane before it.
     """
     own = [[lane] for lane in lanes] or [[] for _ in rows[0]]
     return [(*lane, *(row.tobytes() for row in one)) for lane, *one in zip(own, *rows, strict=True)]

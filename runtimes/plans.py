@@ -33,7 +33,11 @@ def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tup
 
 
 def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
-    """The largest of the four sources in logits ``[B, K, blocks, 4]``; raises IllegalPlanError where these are NaN."""
+    """Plans from the pruner's logits ``[B, K, blocks, 4]``: the largest of the four sources, int8 ``[B, K, blocks]``.
+
+    Raises:
+        IllegalPlanError: the logits are not numbers.
+    """
     if np.isnan(logits).any():
         problem = "the pruner's logits hold NaN, so there is no plan to execute: its weights are broken."
         raise IllegalPlanError(f"{problem} Calibrate the artifact again, or use plan='dense'.")
@@ -42,7 +46,12 @@ def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
 
 
 class LoweringCache(Generic[Lowered]):
-    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change."""
+    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change.
+
+    Args:
+        lower: what a backend makes of a plan ``[K, blocks]``.
+        capacity: plans to keep.
+    """
 
     def __init__(self, lower: Callable[[PlanArray], Lowered], capacity: int = 64) -> None:
         self._lower, self._capacity = lower, capacity

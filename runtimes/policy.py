@@ -205,7 +205,11 @@ class CompiledPolicy:
                 return self._runtime.frames.learn(normalized, stop)
 
     def seen(self) -> tuple[Seen, ...]:
-        """What it sees of each camera of each stream; nothing after ``reset``, and where no tokens are reused."""
+        """What the policy sees of each camera of each stream, and which patches were computed last.
+
+        Returns:
+            A ``Seen`` a camera and stream; nothing after ``reset``, and where no tokens are reused.
+        """
         with self._turn():
             return self._runtime.frames.seen()
 
@@ -236,7 +240,8 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: a frame or noise that does not fit; nothing was executed, and the frame was not kept.
-            TtscompileError: as ``predict_action``.
+            IllegalPlanError: as ``predict_action``.
+            NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
             obs, example = self._read(batch, others=True)
@@ -258,7 +263,8 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: a window, a frame, noise or a prefix that does not fit; nothing was executed or kept.
-            TtscompileError: as ``predict_action``.
+            IllegalPlanError: as ``predict_action``.
+            NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
             specs = self._spec.observations

@@ -98,6 +98,8 @@ class AsyncExecutor:
         Raises:
             ObservationError: it does not fit the policy, is not finite, or comes from the future.
             ExecutorError: ``t`` is no number.
+            WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
+            ExecutorClosedError: after ``close``.
         """
         worker = self._here()
         frame, t = self._resolved.frames.check(obs), _seconds(t, "t")
@@ -122,6 +124,8 @@ class AsyncExecutor:
             DeadlineMissedError: there is none, and the last one was held for as long as it may be.
             StaleObservationError: the same, because no recent observation came.
             ExecutorError: ``t`` or ``timeout`` is no number.
+            WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
+            ExecutorClosedError: after ``close``.
         """
         worker, t, timeout = self._here(), _seconds(t, "t"), _seconds(timeout, "timeout")
         with worker.lock:
@@ -154,6 +158,8 @@ class AsyncExecutor:
             seed: of the policy's noise from here on; None goes on with the sequence under way.
 
         Raises:
+            WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
+            ExecutorClosedError: after ``close``.
             TtscompileError: the seed is no whole number of at least 0; the episode goes on.
         """
         worker = self._here()
@@ -216,7 +222,12 @@ class AsyncExecutor:
 
     @property
     def ready(self) -> bool:
-        """Whether a chunk of this episode has come: from then on, a tick without an action is a fault."""
+        """Whether a chunk of this episode has come: from then on, a tick without an action is a fault.
+
+        Raises:
+            WorkerDeadError: the policy's thread has ended; ``__cause__`` says why.
+            ExecutorClosedError: after ``close``.
+        """
         with self._here().lock:
             return self._checked().ready
 

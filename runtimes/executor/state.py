@@ -121,7 +121,11 @@ class ExecutorState:
     # Actions
 
     def play(self, time: float, now: float) -> FloatArray | None:
-        """The scheduled action for a time, the caller's own; None if there is none. Errors: see ``Schedule.tick``."""
+        """The scheduled action for a time; None if there is none. What is returned belongs to the caller.
+
+        Raises:
+            ExecutorError: an action for a later time was given out before, or the time is of another clock.
+        """
         schedule, recorder = self._schedule, self.recorder
         tick, last = schedule.tick(time, now), schedule.last
         if last is not None and tick == last[0]:

@@ -74,12 +74,14 @@ class Copies(Protocol):
 
 
 class FleetServer(Listener):
-    """Serves one artifact to many robots. ``Listener`` has limits and lock.
+    """Serves one artifact to many robots.
 
     Args:
         artifact: loaded and checked; only what it says of itself is looked at.
         plan: of requests that name none; None for the artifact's default.
         waiting: requests that may be under way; further ones are refused.
+        limits: what clients may do; None for the defaults.
+        lock: who may come in; None lets every program of this machine in, and nobody else.
 
     Raises:
         IllegalPlanError: see ``Plans.of``.

@@ -106,7 +106,11 @@ class Sessions:
             return self._of_blocks(view, _contents(view))
 
     def of_layers(self, view: View) -> dict[str, Any]:
-        """What runs the piece ``layers``, by its name; see ``of_blocks``. For ``verify``."""
+        """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
+
+        Raises:
+            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
+        """
         with view.artifact.reading():
             return {kinds.LAYERS: self._session(view, kinds.LAYERS, _contents(view))}
 
@@ -276,7 +280,7 @@ class Bound:
         self._binding = _binding(session, inputs, outputs)
 
     def run(self) -> None:
-        """Run once."""
+        """Run once. Raises ArtifactError: the graph does not do what the manifest says."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's own classes, and what it raises itself
@@ -292,7 +296,11 @@ def _binding(session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Ar
 
 
 def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Run a session on arrays of the moment; its outputs by name."""
+    """Run a session on arrays of the moment; its outputs by name.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says.
+    """
     try:
         return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
     except Exception as error:
@@ -302,7 +310,11 @@ def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array])
 def run_piece(
     sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], name: str, inputs: Mapping[str, Array]
 ) -> tuple[Array, ...]:
-    """The same for a piece; its outputs in order. For who must not hold on to a backend, see ``frames``."""
+    """Run a piece on arrays of the moment; its outputs in order. For who must not hold on to a backend, see ``frames``.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says.
+    """
     return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
 
 
@@ -315,8 +327,10 @@ def renew_piece(
 ) -> tuple[Array, ...]:
     """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
 
-    A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else. If this fails
-    what is kept may have some of them.
+    A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says. What is kept may have some of the new rows.
     """
     into = {kinds.renewed_name(key): array for key, array in kept.items()}
     given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]
@@ -341,7 +355,11 @@ def _failed(error: Exception) -> ArtifactError:
 def run_prologue(
     sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], obs: Mapping[str, Array], contexts: ContextValues
 ) -> None:
-    """Keep what the normalised observations ``[B, ...]`` decide before the loop."""
+    """Keep what the normalised observations ``[B, ...]`` decide before the loop.
+
+    Raises:
+        ArtifactError: the graphs do not do what the manifest says.
+    """
     condition, step = pieces[kinds.CONDITION], pieces.get(kinds.STEP)
     if condition.outputs:
         feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}

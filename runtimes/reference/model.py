@@ -111,7 +111,11 @@ class ReferenceModel:
 
     @classmethod
     def from_view(cls, view: View, device: torch.device | None = None) -> ReferenceModel:
-        """The model of a view of an artifact, in fp32, on a device; None for the CPU."""
+        """The model of a view of an artifact, in fp32, on a device; None for the CPU.
+
+        Raises:
+            ArtifactError: its graphs cannot be read.
+        """
         manifest, weights = view.manifest, {**view.weights, **view.pruner}
         types = [block.type for block in manifest.blocks]
         return cls(view.pieces, manifest.spec, types, manifest.groups, weights, device, view.first_weights)

@@ -163,7 +163,9 @@ class PrunedCall(CallModule):
         """One call.
 
         Args:
-            obs: as in ``SparseCall.forward``, like ``initial`` and ``steps``.
+            obs: observations by key, ``[B, ...]`` each, not normalised: as ``predict_action`` takes them.
+            initial: the noise that the sample starts from, float32 ``[B, T, D]``.
+            steps: noise of the steps, float32 ``[K, B, T, D]``; needed if the sampler draws noise, else not looked at.
             rollout: what the call before gave, or ``empty_rollout`` in the first call of an episode. Without it no
                 residual of an earlier call is there, and cells that want one have TIMESTEP.
 

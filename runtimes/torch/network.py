@@ -134,7 +134,7 @@ class StreamsNetwork:
         return made if narrow is None else [each.float() if each.dtype == narrow else each for each in made]
 
     def condition(self) -> Tensor:
-        """What a correction reads, ``[B, N]``; see ``ContextValues.features``."""
+        """What a correction reads: the features, one row of numbers a stream, ``[B, N]``."""
         features: Tensor = self.contexts.features()
         return features
 

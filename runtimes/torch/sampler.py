@@ -84,7 +84,11 @@ class Advance(devices.OnTensors):
         return other
 
     def of_condition(self, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """What it reads of ``condition [B, N]``: ``[B, F]``; and what that adds to each step, ``[K, D, B, T]``."""
+        """What the correction reads, ``[B, F]``, and what that adds to the sample of every step, ``[K, D, B, T]``.
+
+        Args:
+            condition: ``[B, N]``.
+        """
         assert self.reading is not None and self.observed is not None
         read = condition @ self.reading
         added = (read @ self.observed).reshape(len(condition), self.steps, -1, self.horizon)

@@ -49,9 +49,12 @@ def _remove(folder: Path, process: Process) -> None:
 
 
 def unpack(path: Path) -> Unpacked:
-    """Unpack a zipped artifact into a temporary folder: the files that its manifest declares, and no others.
+    """Unpack a zipped artifact into a temporary folder.
 
-    They may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
+    The files may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
+
+    Returns:
+        The folder, with the files that the manifest declares and no others.
 
     Raises:
         ArtifactError: no zip file, no artifact in it, an entry with a name or of a kind that an artifact cannot have,

@@ -73,6 +73,9 @@ def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: b
         model: from ``lower``; initializers that are constants of the program hold no data.
         places: by name of the constant.
         again: the model is bound already; the constants in ``places`` get new values.
+
+    Raises:
+        ArtifactError: an empty initializer that is no constant of the program, or is one of another type.
     """
     from onnx import ModelProto
 

@@ -28,7 +28,11 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def decode(content: bytes, where: str = MANIFEST) -> Manifest:
-    """Read ``manifest.json``; refuses another schema version, and one that was changed or damaged."""
+    """Read ``manifest.json``.
+
+    Raises:
+        ArtifactError: no manifest, another schema version, or one that was changed or damaged.
+    """
     document = _document(content, where)
     if document.get("format") != FORMAT:
         raise ArtifactError(
@@ -75,7 +79,11 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
 
 
 def from_json(root: Value) -> Manifest:
-    """Inverse of ``to_json``; checks that the parts fit each other."""
+    """Inverse of ``to_json``; checks that the parts fit each other.
+
+    Raises:
+        ArtifactError: names the path in the document, expected and found.
+    """
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))

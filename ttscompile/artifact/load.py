@@ -211,8 +211,12 @@ class Artifact:
 def load_artifact(path: str | Path) -> Artifact:
     """Open an artifact and check all of it: schema, sizes and hashes of all files, identity, plans, onnxruntime.
 
+    Returns:
+        The artifact; arrays are mapped, not read.
+
     Raises:
         ArtifactChangedError: it was replaced or changed meanwhile.
+        ArtifactError: says what is wrong, where, and what to do.
     """
     place = Path(path)
     require_artifact_path(place)
@@ -233,7 +237,11 @@ def require_artifact_path(path: Path) -> None:
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Read ``manifest.json`` of a directory, and nothing else."""
+    """Read ``manifest.json`` of a directory, and nothing else.
+
+    Raises:
+        ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
+    """
     path = directory / MANIFEST
     require_artifact_path(directory)
     if not os.path.lexists(path):

@@ -95,7 +95,11 @@ def without_weights(manifest: Manifest, kept: Collection[str]) -> Manifest:
 
 
 def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockWeights) -> Manifest:
-    """Write weights of blocks, in files that nothing has yet; the manifest with their record."""
+    """Write weights of blocks, in files that nothing has yet; the manifest with their record.
+
+    Raises:
+        OSError: they cannot be written.
+    """
     files = dict(manifest.files)
     if unknown := sorted(set(own.weights) - set(artifact.weights)):
         raise ArtifactError(f"weights {name!r}: expected constants of the artifact; found {unknown[0]!r}.")

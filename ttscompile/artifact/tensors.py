@@ -112,7 +112,7 @@ def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
 
 
 def offsets(path: Path) -> dict[str, tuple[int, int]]:
-    """Byte offset in the file, and length in bytes, of each tensor."""
+    """Byte offset in the file, and length in bytes, of each tensor. Raises ArtifactError: see ``read_header``."""
     with opened(path) as file:
         return {name: (entry.offset, entry.length) for name, entry in _header(file, path).items()}
 

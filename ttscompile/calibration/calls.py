@@ -31,7 +31,12 @@ calibration judges on episodes that it saw nothing of."""
 
 @dataclass(frozen=True)
 class Split:
-    """Numbers of the episodes that plans are learned from, and of others that they are judged on."""
+    """Calls by episode: what plans are learned from, and what they are judged on.
+
+    Attributes:
+        calibration: numbers of the episodes to learn from.
+        validation: numbers of the episodes to judge on; none of them is in ``calibration``.
+    """
 
     calibration: tuple[int, ...]
     validation: tuple[int, ...]
@@ -47,7 +52,11 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
 def load_episodes(
     spec: PolicySpec, trajectories: Sequence[str | os.PathLike[str]], observation: Mapping[str, Sequence[str]] | None
 ) -> list[Episode]:
-    """The recorded episodes, as the policy observes them; see ``load_trajectories``."""
+    """The recorded episodes, as the policy observes them; see ``load_trajectories``.
+
+    Raises:
+        TrajectoryError: the recordings do not fit the policy.
+    """
     steps = spec.chunk.stop - spec.chunk.start
     episodes = load_trajectories(trajectories, spec.observations, steps, observation, spec.instruction)
     if len(episodes) < 2:
@@ -149,7 +158,12 @@ def prepare_calls(
     seed: tuple[int, ...],
     window: int = 1,
 ) -> Calls:
-    """Calls without targets, with noise that is drawn now; see ``calls_at``."""
+    """Calls without targets: draw their noise and run the prologue.
+
+    Args:
+        spec: of the policy, with the loop of the model.
+        chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
+    """
     return calls_at(model, spec, episodes, chosen, draw_noise(spec, len(chosen), seed), window)
 
 
@@ -207,7 +221,7 @@ class Actions:
         self._scale = torch.from_numpy(np.array(spec.chunk.scale))
 
     def executed(self, samples: Tensor) -> Tensor:
-        """The same of samples ``[..., T, D]`` as ``ChunkSpec.executed``, flat: ``[..., size]``."""
+        """The executed part of samples ``[..., T, D]`` as ``[..., size]``, as the network has it: normalised."""
         return torch.as_tensor(self._chunk.executed(samples)).flatten(-2)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:

@@ -72,6 +72,12 @@ def compare(
         plans: of the artifact, and of others where they have one of this name, which take part beside the dense one;
             all where none is named. ``NAME@PRECISION`` is one in another precision.
         joining: finds further plans, given the trials of the artifact, before anything is judged.
+
+    Raises:
+        CalibrationError: an artifact of another policy.
+        TrajectoryError: the recordings do not fit the policy.
+        ArtifactError: an artifact cannot be opened.
+        IllegalPlanError: the artifact has no plan of this name.
     """
     calls, threads = integer(calls, "calls", CalibrationError, 1), integer(threads, "threads", CalibrationError, 1)
     seed = integer(seed, "seed", CalibrationError)

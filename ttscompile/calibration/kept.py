@@ -18,7 +18,10 @@ from .trials import Trials
 
 
 class Kept:
-    """See the module. ``anew`` begins with the base of the calibration, and not with the artifact's plans.
+    """See the module.
+
+    Args:
+        anew: whether to begin with the base of the calibration. Else with the artifact's plans, to which others come.
 
     Attributes:
         trials: of the artifact with all that is kept.

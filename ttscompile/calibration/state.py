@@ -47,7 +47,14 @@ class StateFile:
         self.progress: dict[str, Any] = {}
 
     def load(self) -> bool:
-        """Read what an earlier run left; whether there was anything. Refused is that of a run with other settings."""
+        """Read what an earlier run left.
+
+        Returns:
+            Whether there was anything.
+
+        Raises:
+            CalibrationError: it is damaged, or belongs to a run with other settings.
+        """
         if self._path is None or not self._path.exists():
             return False
         try:

@@ -94,6 +94,9 @@ class Task:
         """What a strategy found, with corrections where they are better: of the schedule, and of the pruner's plans.
 
         The pruner's plans share one correction, fitted along the plan that each call has.
+
+        Raises:
+            CalibrationError: the schedule reads the rollout cache, and the calls are independent of each other.
         """
         if self.calls.window == 1 and (found.schedule == Source.ROLLOUT.value).any():
             raise CalibrationError(

@@ -195,7 +195,12 @@ def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
 def compare(
     directory: Path, artifacts: Mapping[str, Artifact], others: Sequence[Path], recordings: Recordings, **how: Any
 ) -> Comparison:
-    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error."""
+    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
+
+    Raises:
+        ArtifactChangedError: an artifact was replaced meanwhile.
+        RuntimeUnavailableError: there is no torch.
+    """
     with needing("-t", "compile"):
         from ttscompile.calibration.compare import compare as measure
     with only_results_on_stdout(), Bar(shown=True) as bar:

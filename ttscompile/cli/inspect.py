@@ -135,7 +135,15 @@ def require_page(path: Path) -> None:
 def write_page(
     path: Path, artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None]
 ) -> str:
-    """Write the page, which replaces another one only when it is whole, and say so; the policy's calls are timed now.
+    """Write the page; it replaces another one only when it is whole.
+
+    Args:
+        path: see ``require_page``.
+        policy: the same, with a seed; its calls are timed now.
+        given: what the page shows beside the artifact.
+
+    Returns:
+        What was written, for people.
 
     Raises:
         OutputError: it cannot be written.

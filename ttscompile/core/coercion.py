@@ -26,6 +26,9 @@ def integer(value: Any, what: str, error: Errors, least: int = 0, most: int | No
         least: the smallest that is taken.
         most: the largest; None for no limit.
         more: what else is taken, for the message.
+
+    Raises:
+        TtscompileError: of the class ``error``: not a whole number, or outside the limits.
     """
     try:
         boolean = isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")
@@ -51,7 +54,9 @@ def plain(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array
         what: for the message, ``observation 'obs'``.
         dtype: that is expected in the end, for the message; it is not checked.
 
-    Refused are a masked array, one that computes in its own way, and a tensor whose numbers numpy cannot have.
+    Raises:
+        TtscompileError: of the class ``error``: neither an array nor a tensor; a masked array, or one that computes in
+            its own way; or a tensor whose numbers numpy cannot have.
     """
     if type(value) is np.ndarray:
         return value
@@ -80,7 +85,11 @@ def listed(value: Any, what: str, error: Errors, dtype: str) -> Array:
 
 
 def numbers(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array:
-    """The same as numbers of a dtype; what that cannot hold becomes infinite."""
+    """The same as numbers of a dtype; what that cannot hold becomes infinite.
+
+    Raises:
+        TtscompileError: of the class ``error``: no array, or not of numbers.
+    """
     array = listed(value, what, error, dtype)
     if array.dtype.kind not in "biuf":
         raise error(f"{what} has dtype {array.dtype!s:.80}; expected numbers, {dtype}.")

@@ -66,6 +66,10 @@ class Tokenizer:
 
     Args:
         path: of ``tokenizer.json``, of CLIP's ``vocab.json``, or of the folder that has one of them.
+        error: class of the errors.
+
+    Raises:
+        TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
     """
 
     def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:

@@ -135,6 +135,7 @@ def fetch_artifact(text: str, anew: bool = False) -> Fetched:
 
     Raises:
         HubError: there is no such repository, no artifact in it, or no network and nothing in the cache.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     name, hub = read_name(text), library()
     with told(text):
@@ -154,6 +155,7 @@ def fetch_checkpoint(text: str) -> Fetched:
 
     Raises:
         HubError: there is no such repository, no checkpoint in it or several, or no network and nothing in the cache.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     name, hub = read_name(text), library()
     with told(text):
@@ -178,6 +180,7 @@ def fetch_recording(text: str) -> Path:
 
     Raises:
         HubError: there is no such data set, it is not LeRobot's, or there is no network and nothing in the cache.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     if not text.startswith(DATA_SETS):
         raise HubError(f"{text:.200}: expected {DATA_SETS}ORGANISATION/NAME, and perhaps @REVISION after it.")
@@ -273,7 +276,11 @@ def _licence(card: Path) -> str | None:
 
 
 def library() -> Any:
-    """The package ``huggingface_hub``."""
+    """The package ``huggingface_hub``.
+
+    Raises:
+        RuntimeUnavailableError: it is not installed.
+    """
     with needing("the Hugging Face hub", "hub"):
         import huggingface_hub
         import huggingface_hub.errors
@@ -312,6 +319,7 @@ def upload(folder: Path, names: Sequence[str], repository: str, card: str, *, pr
     Raises:
         HubError: the repository holds something else than an artifact, is public although ``private`` was asked for, or
             cannot be written.
+        RuntimeUnavailableError: ``huggingface_hub`` is not installed.
     """
     require_repository(repository, repository)
     hub = library()

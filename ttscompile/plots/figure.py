@@ -29,7 +29,13 @@ _CHARACTER = 0.012
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
     """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
 
-    Sizes are in inches; ``told``, for the error, is what it will show and ``--json`` says too.
+    Args:
+        width: in inches.
+        height: in inches.
+        told: what it will show, and ``--json`` says too; for the error.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib is not installed.
     """
     with needing(f"a picture of {told}", "compile", f", or read {told} with --json"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -85,7 +91,14 @@ def encoded(figure: Figure, suffix: str = ".png") -> bytes:
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:
-    """Write a picture, see ``encoded``; its suffix is the format. If that fails a file that was there is as it was."""
+    """Write a picture, see ``encoded``.
+
+    Args:
+        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
+
+    Raises:
+        OutputError: it cannot be written; a file that was there is as it was.
+    """
     place = Path(path)
     require_picture_name(place)
     content = encoded(figure, place.suffix.lower())

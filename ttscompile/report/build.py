@@ -51,6 +51,10 @@ def build(
 
     Args:
         policy: the same, with its default runtime and a seed.
+        given: what the report shows beside the artifact.
+
+    Raises:
+        RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
     """
     manifest = artifact.manifest
     require_packages()

@@ -81,7 +81,11 @@ def require_packages() -> None:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document without scripts, which refers to nothing outside of itself."""
+    """The page as one HTML document without scripts, which refers to nothing outside of itself.
+
+    Raises:
+        RuntimeUnavailableError: Jinja2 is not installed.
+    """
     require_packages()
     from jinja2 import Environment, StrictUndefined
 

@@ -52,7 +52,11 @@ class Success:
 
 
 def read_success(path: Path, identity: str) -> list[Success]:
-    """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact; an error if nothing is."""
+    """Of a document of ``examples/evaluation/evaluate.py --json``, what is of this artifact.
+
+    Raises:
+        ReportError: it is no such document, or not of this artifact.
+    """
     expected = "expected what examples/evaluation/evaluate.py --json printed"
     try:
         document = parse_json(path.read_bytes(), _MOST_BYTES)
@@ -80,7 +84,11 @@ def _interval(value: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def licence_of(manifest: Manifest, given: str | None) -> str | None:
-    """The licence of the base, which the artifact is under too, or the one that was given; an error if they differ."""
+    """The licence of the base, which the artifact is under too; of a base that says none the one that was given.
+
+    Raises:
+        ReportError: both say one, and not the same.
+    """
     own = manifest.spec.source.get(BASE_LICENCE)
     if own is not None and given is not None and own.lower() != given.lower():
         raise ReportError(f"the base is under the licence {own}, which was passed on; found {given}. Leave it out.")

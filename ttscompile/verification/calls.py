@@ -117,7 +117,8 @@ def check_plans(
 ) -> tuple[Rung, dict[str, npt.NDArray[np.bool_]]]:
     """Episodes of two sparse calls with each plan, in fp32, against what calibration stored.
 
-    Beside the rung it gives the cells ``[K, blocks]`` that differ, by plan, where some do.
+    Returns:
+        The rung; and by plan the cells ``[K, blocks]`` that differ, where some do.
     """
     plans = artifact.manifest.plans
     if not any(map(is_sparse, plans.values())):

@@ -62,7 +62,11 @@ SMALLEST = 2
 
 
 def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
-    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads.
+
+    Raises:
+        CalibrationError: there are none for so large a rank.
+    """
     others = {name for key, graph in artifact.graphs.items() if not is_block(key) for name in graph.constants}
     mine = {name for piece in artifact.pieces.blocks for name in piece.graph.constants} - others
     values = {name: artifact.weights[name] for name in mine}
