@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
+import click
 import numpy as np
 import numpy.typing as npt
 from large_calls import lowered, plans_of
@@ -70,6 +71,17 @@ def observed(folder: Path, words: int | None = None) -> tuple[dict[str, Array], 
             mask[..., words:] = False
     made |= {key: value.clip(-1, 1) for key, value in obs.items() if key == STATE}
     return obs | made, noise
+
+
+def race_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The options of ``race``, which a command with any engine has."""
+    for option in (
+        click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory."),
+        click.option("--rounds", default=5, type=click.IntRange(1), help="That are counted."),
+        click.option("--threads", default=1, type=click.IntRange(1), help="Of each engine."),
+    ):
+        command = option(command)
+    return command
 
 
 def race(

@@ -22,7 +22,7 @@ import nncf
 import numpy as np
 import openvino
 import torch
-from beside import Array, observed, policy_of, race
+from beside import Array, observed, policy_of, race, race_options
 from large import saved
 from torch import nn
 
@@ -122,9 +122,7 @@ def quantized(model: Any, seen: list[tuple[Array, ...]]) -> Any:
 
 @click.command(context_settings={"show_default": True})
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--threads", default=1, type=click.IntRange(1))
-@click.option("--rounds", default=5, type=click.IntRange(1), help="That are counted.")
-@click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory.")
+@race_options
 def main(folder: Path, threads: int, rounds: int, fp32: bool) -> None:
     """Time calls of the policy in FOLDER, and of OpenVINO with the same weights."""
     directory, task = saved(folder, policy_of(folder))

@@ -21,7 +21,7 @@ from typing import Any
 import click
 import numpy as np
 import onnxruntime
-from beside import Array, race
+from beside import Array, race, race_options
 from large_smolvla import CAMERAS, STATE
 
 from ttscompile import Noise
@@ -75,9 +75,7 @@ class Tether:
 
 @click.command(context_settings={"show_default": True})
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--threads", default=1, type=click.IntRange(1))
-@click.option("--rounds", default=5, type=click.IntRange(1), help="That are counted.")
-@click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory.")
+@race_options
 def main(folder: Path, threads: int, rounds: int, fp32: bool) -> None:
     """Time calls of the policy in FOLDER, and of what Tether exported of it."""
     tether = Tether(folder / MODEL, threads)

@@ -25,7 +25,7 @@ import click
 import numpy as np
 import numpy.typing as npt
 import torch
-from beside import Array, observed, policy_of, race
+from beside import Array, observed, policy_of, race, race_options
 from large import saved
 from large_evo1 import MODEL
 from large_groot import EMBODIMENT
@@ -169,9 +169,7 @@ class VlaCpp:
 @click.argument("folder", type=click.Path(exists=True, path_type=Path))
 @click.option("--library", required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--model", required=True, type=click.Path(exists=True, path_type=Path))
-@click.option("--threads", default=1, type=click.IntRange(1))
-@click.option("--rounds", default=7, type=click.IntRange(1), help="That are counted.")
-@click.option("--fp32/--no-fp32", default=True, help="Time ours in fp32, too, which takes memory.")
+@race_options
 def main(folder: Path, library: Path, model: Path, threads: int, rounds: int, fp32: bool) -> None:
     """Time calls of the policy in FOLDER, and of vla.cpp with the same weights."""
     prompt = prompt_of(folder, policy_of(folder), observed(folder)[0])

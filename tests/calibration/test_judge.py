@@ -14,6 +14,7 @@ import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
+from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, _Answers, further, judge, timed
@@ -183,7 +184,7 @@ def test_of_a_small_network_as_many_calls_are_learned_from_as_fit(
     compiled: Path, recording: Path, tmp_path: Path, fits: int, drawn: int
 ) -> None:
     """As many are drawn again where a state goes on."""
-    trials = trials_of(compiled, recording, tmp_path, limits=(8, 16, 64))
+    trials = trials_of(compiled, recording, tmp_path, limits=CallLimits(8, 16, 64))
     limit = (fits + 0.5) * _seconds(trials.executor.view) / (QUICKLY * trials.until)
     trials = replace(trials, clock=Clock(limit))
     assert trials._affordable("calibration") == drawn
@@ -193,7 +194,7 @@ def test_of_a_small_network_as_many_calls_are_learned_from_as_fit(
 def test_answers_of_a_state_without_their_number_are_the_usual_ones(
     compiled: Path, recording: Path, tmp_path: Path
 ) -> None:
-    trials = trials_of(compiled, recording, tmp_path, clock=Clock(1e6), limits=(8, 16, 64))
+    trials = trials_of(compiled, recording, tmp_path, clock=Clock(1e6), limits=CallLimits(8, 16, 64))
     trials.state.put("targets", {"calibration": np.zeros((16, 10, policies.HORIZON, policies.CHANNELS), np.float32)})
     assert trials._affordable("calibration") == 16
 

@@ -230,7 +230,7 @@ def calibrate(
         episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
         corrects = correct or any(row.corrects for row in rows if row.name != SCHEDULE)
         corrects |= chosen.fits_correction and SCHEDULE in learn
-        fewest, usual, most = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
+        limits = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
         settings = {
             # Of what replaces no plans, these too: what is learned is learned for one of them.
             "model": (artifact.manifest.model_identity if anew else artifact.manifest.identity)[:16],
@@ -251,11 +251,12 @@ def calibrate(
         state = StateFile(Path(path), settings)
         if not (resume and state.load()):
             state.remove()
-        usual = state.progress.setdefault("calls", usual)  # whatever time there is to go on
+        # The number stays whatever time there is to go on.
+        limits = limits._replace(usual=state.progress.setdefault("calls", limits.usual))
         before = float(state.progress.get("seconds", 0.0)) + begun.elapsed()
         clock = Clock(60 * max_minutes, before, elsewhere)
         with Bar(progress) as bar:
-            opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": (fewest, usual, most)}
+            opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             _warn(trials, rows, chosen, corrects)
             kept = Kept(trials, anew)
@@ -308,7 +309,7 @@ def calibrate(
 
 
 def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
-    bar, view, (fewest, *_) = trials.bar, trials.executor.view, trials.limits
+    bar, view, fewest = trials.bar, trials.executor.view, trials.limits.fewest
     if (warning := few_steps(view.manifest)) is not None:
         bar.warn(warning)
     consecutive = any(row.consecutive or (row.name == SCHEDULE and strategy.consecutive) for row in rows)

@@ -26,7 +26,7 @@ from ..pool import Here, Pool
 from ..runtimes.random_calls import Observation, noise_of_any_horizon, normalized
 from ..runtimes.reference.model import noise_tensors
 from ..trajectories.episodes import Episode
-from .arguments import FEWEST_CALLS
+from .arguments import CallLimits
 from .calls import FRACTION, Calls, IntArray, Split, calls_at, observed, split_episodes, window_of
 from .clock import Clock
 from .execute import Executor
@@ -109,8 +109,7 @@ class Trials:
         seed: of the split, the noise, and everything else that is random.
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
-        limits: of the calls to learn from: how many there are whatever the time, if there is enough, and if they take
-            little of it.
+        limits: of the number of calls to learn from.
         observations: that the original answers, at most, of either part.
         draws: of noise for each of them, at least.
         until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
@@ -133,7 +132,7 @@ class Trials:
     device: torch.device | None = None
     runtime: str = "onnxruntime"
     fresh: bool = False
-    limits: tuple[int, int, int] = (FEWEST_CALLS, FEWEST_CALLS, FEWEST_CALLS)
+    limits: CallLimits = field(default_factory=CallLimits)
     observations: int = OBSERVATIONS
     name: str = DENSE
     draws: int = DRAWS
@@ -192,7 +191,7 @@ class Trials:
 
     def _to_learn_from(self, window: int) -> Calls:
         if window not in self._calls:
-            spec, (fewest, *_), loop = self.executor.view.manifest.spec, self.limits, self.base.loop
+            spec, fewest, loop = self.executor.view.manifest.spec, self.limits.fewest, self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
             most = self._affordable(name)
             calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
@@ -210,10 +209,11 @@ class Trials:
 
         Their noise depends on the number, so it is kept; a state that has answers without it has the usual ones.
         """
-        (_, usual, most), key = self.limits, f"{name} drawn"
+        key = f"{name} drawn"
         if key not in self.state.progress:
             found = QUICKLY * self.until * self.clock.limit / _seconds(self.executor.view)
             known = name in self.state.get("targets")
+            usual, most = self.limits.usual, self.limits.most
             self.state.progress[key] = usual if known else int(np.clip(found, usual, most))
         return int(self.state.progress[key])
 

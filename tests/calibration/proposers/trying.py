@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.budget import SPARSITY, Goal
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.clock import Clock
@@ -27,7 +28,7 @@ def trials_of(directory: Path, recordings: Sequence[Path], calls: int = 64) -> T
     """Of an artifact, with so many calls to learn from."""
     artifact = load_artifact(directory)
     episodes = load_episodes(artifact.manifest.spec, list(recordings), None)
-    return Trials.of(artifact, episodes, StateFile(directory, {}), limits=(calls,) * 3)
+    return Trials.of(artifact, episodes, StateFile(directory, {}), limits=CallLimits(*(calls,) * 3))
 
 
 def proposed(proposer: Proposer, trials: Trials, plan: Plan) -> list[Proposal]:

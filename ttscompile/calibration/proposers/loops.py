@@ -28,7 +28,7 @@ from ...measure.points import TENTH
 from ...runtimes.open import open_runtime
 from ...runtimes.random_calls import Observation
 from ...runtimes.runtime import Runtime
-from ..arguments import MOST_NEEDED, calls_to_learn_from
+from ..arguments import MOST_NEEDED, CallLimits, calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
@@ -202,10 +202,10 @@ class Loops(Proposer):
         until = (now + ANSWERING * seconds) / limit if np.isfinite(limit) else 1.0
         own = replace(trials.of_loop(loop), until=until)
         minutes = max(seconds, 1.0) / 60 if np.isfinite(seconds) else 1e3
-        fewest, usual, _ = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
-        usual = own.state.progress.setdefault(f"most of {loop}", usual)
+        limits = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
+        usual = own.state.progress.setdefault(f"most of {loop}", limits.usual)
         # Each number of steps is fitted to all of them: with thousands the time ends before the steps are enough.
-        return replace(own, limits=(fewest, usual, max(usual, MOST_NEEDED)))
+        return replace(own, limits=CallLimits(limits.fewest, usual, max(usual, MOST_NEEDED)))
 
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""
