@@ -38,6 +38,7 @@ _NO_LOOP = (
     "There is no denoising loop to compile. Export its network with torch.onnx.export and run it with onnxruntime, or"
     " use torch.compile."
 )
+_GGUF = "llama.cpp and vla.cpp run such files. Convert the checkpoint that it was made from, if that denoises actions."
 MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _BY_NAME = (
     (r"\.onnx$", "an ONNX model", "It has no denoising loop. Convert the checkpoint that it was exported from."),
@@ -109,7 +110,11 @@ LEROBOT = (
         f"{_BUILD}: one step of the model over a cached prefix is the module.",
     ),
     Refusal(r"^molmoact2$", "a policy whose backbone, Molmo, is not rebuilt here", _HEAD),
-    Refusal(r"^(fastwam|lingbot_va)$", "a world model of video, Wan2.2, not rebuilt here", "It was not compiled yet."),
+    Refusal(
+        r"^(fastwam|lingbot_va)$",
+        "a world model that denoises video beside actions, Wan2.2, which is not rebuilt here",
+        "No module of it was compiled yet.",
+    ),
     Refusal(r"", "not known", f"Expected {LEROBOT_TYPES}. If it denoises: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
@@ -185,7 +190,7 @@ def refuse_file(path: Path) -> None:
     if head.startswith(b"\x89HDF\r\n"):
         raise _refused(path, "an HDF5 file, data or Keras weights", "its first bytes", _WEIGHTS)
     if head.startswith(b"GGUF"):
-        raise _refused(path, "a GGUF file, a quantised language model", "its first bytes", "llama.cpp runs such files.")
+        raise _refused(path, "a GGUF file, a quantised model", "its first bytes", _GGUF)
     for sign, what, remedy in _BY_NAME:
         if re.search(sign, path.name):
             raise _refused(path, what, "its name", remedy)
@@ -214,7 +219,8 @@ def refuse_directory(path: Path) -> NoReturn:
             raise _refused(path, row.what, how, row.remedy)
     raise CheckpointError(
         f"{path} is a directory without a policy that is read: found {', '.join(names[:6]) or 'nothing'}; expected the"
-        f" config.json and model.safetensors of LeRobot's {LEROBOT_TYPES}, or a .ckpt of Diffusion Policy. {_BUILD}."
+        f" config.json and model.safetensors of LeRobot's {LEROBOT_TYPES}, or give a .ckpt file of Diffusion Policy."
+        f" Otherwise: {_BUILD}."
     )
 
 
