@@ -157,8 +157,9 @@ class Worker:
         elif missing := [name for name in settings.plans if name not in given]:
             raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {settings.plans}.")
         else:
+            below_zero = nextafter(0.0, -1.0)  # a latency of 0 is one
             for name in settings.plans:
-                require_number(given[name], f"the latency of plan {name!r}", inf, "of seconds", nextafter(0, -1))
+                require_number(given[name], f"the latency of plan {name!r}", inf, "of seconds", below_zero)
             measured = {name: [given[name]] for name in settings.plans}
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self.feasibility = {name: settings.feasibility(max(measured[name])) for name in settings.tiers}
