@@ -14,7 +14,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import regression
 from ttscompile.calibration.sparse_loop import anchors_of, fit_correction
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.whole_steps import WholeSteps, _set_apart, _sizes
+from ttscompile.calibration.whole_steps import FITTED_SHARE, SHARE_OF_MANY, WholeSteps, _set_apart, _sizes
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 from ttscompile.errors import CalibrationError
 
@@ -139,8 +139,9 @@ def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeT
 
 
 def test_where_there_are_many_calls_candidates_see_more_of_them() -> None:
-    assert _sizes(100) == _sizes(3072) == (384, 128)
-    assert _sizes(12_288) == (1536, 512)
+    assert _sizes(100, FITTED_SHARE) == _sizes(3072, FITTED_SHARE) == _sizes(1152, SHARE_OF_MANY) == (384, 128)
+    assert _sizes(12_288, FITTED_SHARE) == (1536, 512)
+    assert _sizes(2595, SHARE_OF_MANY) == (865, 288)
 
 
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:

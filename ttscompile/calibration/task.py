@@ -18,7 +18,7 @@ from ..runtimes.plans import pruner_plan
 from .calls import Actions, Calls
 from .clock import Clock
 from .execute import Executor
-from .whole_steps import WholeSteps
+from .whole_steps import FITTED_SHARE, WholeSteps
 
 Array = npt.NDArray[Any]
 
@@ -67,11 +67,19 @@ class Task:
     clock: Clock = field(default_factory=Clock)
 
     @classmethod
-    def of(cls, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None) -> Task:
-        """The task of finding a plan; schedules of whole steps are compared in the pool."""
+    def of(
+        cls,
+        executor: Executor,
+        calls: Calls,
+        budget: int,
+        seed: int,
+        pool: Pool | None = None,
+        share: int = FITTED_SHARE,
+    ) -> Task:
+        """The task of finding a plan; ``pool`` and ``share`` are those of ``WholeSteps``."""
         view = executor.view
         actions, kinds = Actions(view.manifest.spec), tuple(block.kind for block in view.manifest.blocks)
-        whole = WholeSteps(executor, actions, calls, seed, pool)
+        whole = WholeSteps(executor, actions, calls, seed, pool, share)
         return cls(executor, actions, calls, budget, seed, view.pruner, kinds, whole)
 
     def draw(self, *stage: int) -> np.random.Generator:
