@@ -23,9 +23,9 @@ fewer."""
 
 FITTED_SHARE, SHARE_OF_MANY = 8, 3
 """One call in so many is fitted on where that is more, and a third as many are measured on: on Meta-World a correction
-that reads the observation is no better on 384 calls, and a third better on all 12,000. The second is that of a network so
-small that it answered more calls than usual: schedules whose errors on other episodes are 0.044 and 0.071 have 0.049 and
-0.053 on the fewest calls, so a longer search ended with a worse one."""
+that reads the observation is no better on 384 calls, and a third better on all 12,000. The second is that of a network
+so small that it answered more calls than usual: schedules whose errors on other episodes are 0.044 and 0.070 have 0.049
+and 0.053 on the fewest calls, and a longer search ended with the worse one."""
 
 TELLING, WORTH = 4, 0.05
 """Episodes from which on half of them say something, and what they have to bring for more to be worth recording."""
