@@ -147,6 +147,7 @@ def test_where_there_are_many_calls_candidates_see_more_of_them() -> None:
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:
     episodes = np.array([3, 1, 1, 0, 3, 2, 0, 4])
     assert _set_apart(episodes).tolist() == (episodes == 3).tolist()
+    assert _set_apart(episodes, 2).tolist() == (episodes == 0).tolist()
     assert _set_apart(np.array([5, 5, 5, 5])).tolist() == [True, False, False, False]
     assert _set_apart(np.array([5])).tolist() == [True]
 

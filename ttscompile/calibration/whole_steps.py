@@ -27,6 +27,9 @@ that reads the observation is no better on 384 calls, and a third better on all 
 so small that it answered more calls than usual: schedules whose errors on other episodes are 0.044 and 0.070 have 0.049
 and 0.053 on the fewest calls, and a longer search ended with the worse one."""
 
+QUARTERS = 4
+"""Of the episodes: one is compared on, and the others are fitted on."""
+
 TELLING, WORTH = 4, 0.05
 """Episodes from which on half of them say something, and what they have to bring for more to be worth recording."""
 
@@ -71,16 +74,21 @@ class WholeSteps:
         self._runs: dict[bool | None, ScheduleRuns] = {}
         self._pool = pool or Here()
         self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed, share))
-        order = np.random.default_rng((seed, 3, 0)).permutation(calls.count // calls.window)
-        apart = _set_apart(calls.episodes[:: calls.window][order])
+        self._seed, self._share = seed, share
+        self._fitted, self._compared = self._divided(0)
+
+    def _divided(self, part: int) -> tuple[Calls, Calls]:
+        """Calls that corrections are fitted on, and those of a part of the episodes, that they are compared on."""
+        calls = self._calls
+        order = np.random.default_rng((self._seed, 3, 0)).permutation(calls.count // calls.window)
+        apart = _set_apart(calls.episodes[:: calls.window][order], part)
 
         def some(windows: IntArray, most: int) -> Calls:
-            return executor.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
+            return self._executor.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
 
-        fitted, compared = _sizes(calls.count, share)
-        self._compared = self._fitted = some(order[apart], compared)
-        if not apart.all():
-            self._fitted = some(order[~apart], fitted)
+        fitted, compared = _sizes(calls.count, self._share)
+        others = some(order[apart], compared)
+        return others if apart.all() else some(order[~apart], fitted), others
 
     @property
     def steps(self) -> int:
@@ -131,7 +139,7 @@ class WholeSteps:
         tried = (
             self._executor.corrected(one).run(_plans(plan, self._compared), self._compared) for one in (fitted, None)
         )
-        corrected, plain = map(self._errors, tried)
+        corrected, plain = (self._errors(samples, self._compared) for samples in tried)
         if plain.normalised <= corrected.normalised:
             return None
         return fit_correction(self._executor, plans, self._calls, reads)
@@ -141,19 +149,30 @@ class WholeSteps:
 
         They do if that is better on episodes that they were not fitted on. Decided once, on two schedules whose steps
         halve what is left of the loop: the first and the last of 0, 50, 75, 88, 94, 97 of 100. Corrections that read
-        the observation are best with late steps, and others with early ones.
+        the observation are best with late steps, and others with early ones. A small network is asked on every quarter
+        of the episodes, since one may say the opposite of the others.
         """
         if count not in self._reading:
             halving = [self.steps - (self.steps >> i) for i in range(1, 6) if self.steps >> i > 1]
             more = max(0, min(count - 1, len(halving)))
             tried = [(0, *some) for some in (halving[:more], halving[len(halving) - more :])]
             best = {
-                reads: min(self._error_of(steps, reads).normalised for steps in tried)
+                reads: min(self._error_of(steps, reads).normalised for steps in tried) + self._elsewhere(tried, reads)
                 for reads in (True, False)
                 if len(np.unique(self._fitted.episodes)) > 1
             }
             self._reading[count] = bool(best) and best[True] < best[False]
         return self._reading[count]
+
+    def _elsewhere(self, tried: Sequence[Sequence[int]], reads: bool) -> float:
+        """The least errors of these schedules on the other quarters of the episodes, summed; 0 if none is asked."""
+        total, parts = 0.0, min(QUARTERS, len(np.unique(self._calls.episodes)))
+        for part in range(1, parts if self._share == SHARE_OF_MANY else 1):
+            fitted, compared = self._divided(part)
+            loop = SparseLoop(self._executor, fitted, compared, reads=reads, whole=True)
+            runs = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
+            total += min(self._errors(runs.end(steps).samples, compared).normalised for steps in tried)
+        return total
 
     def _error_of(self, steps: Sequence[int], reads: bool | None) -> Errors:
         """Errors of a schedule with a correction that may, or may not, read the observation; None: without one."""
@@ -161,7 +180,7 @@ class WholeSteps:
             fitted = None if reads is None else self._fitted
             loop = SparseLoop(self._executor, fitted, self._compared, reads=bool(reads), whole=True)
             self._runs[reads] = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
-        return self._errors(self._runs[reads].end(steps).samples)
+        return self._errors(self._runs[reads].end(steps).samples, self._compared)
 
     def told_of_episodes(self, steps: Sequence[int]) -> str:
         """Whether more recorded episodes may pay for a schedule: a clause; empty where too few say nothing.
@@ -175,7 +194,7 @@ class WholeSteps:
         count, reads = min(len(half), self._fitted.count), self.reads(len(steps))
         parts = (self._executor.select(self._calls, some[:count]) for some in (half, every))
         loops = (SparseLoop(self._executor, part, self._compared, reads=reads, whole=True) for part in parts)
-        before, now = (self._errors(one.end(self.plan(steps)).samples).normalised for one in loops)
+        before, now = (self._errors(one.end(self.plan(steps)).samples, self._compared).normalised for one in loops)
         gain = max(before - now, 0.0) / max(before, 1e-30)  # 0 where nothing is left
         told = f"learned from {len(episodes)} it is {gain:.0%} nearer than learned from half of them"
         return f"more episodes {'may' if gain >= WORTH else 'would hardly'} pay: {told}"
@@ -189,10 +208,8 @@ class WholeSteps:
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + 2 * share) * self.comparing(full_steps)  # without jumps, and with them
 
-    def _errors(self, samples: Tensor) -> Errors:
-        normalised, units = (
-            float(self._actions.errors(samples, self._compared.targets, units=u).mean()) for u in (False, True)
-        )
+    def _errors(self, samples: Tensor, of: Calls) -> Errors:
+        normalised, units = (float(self._actions.errors(samples, of.targets, units=u).mean()) for u in (False, True))
         return Errors(normalised, units)
 
 
@@ -212,16 +229,17 @@ def _sizes(count: int, share: int) -> tuple[int, int]:
     return max(FITTED, count // share), max(COMPARED, count // (3 * share))
 
 
-def _set_apart(episodes: IntArray) -> BoolArray:
-    """Which calls, of the episodes ``[n]``, are compared on: all of a quarter of the episodes, the first ones.
+def _set_apart(episodes: IntArray, part: int = 0) -> BoolArray:
+    """Which calls, of the episodes ``[n]``, are compared on: all of a quarter of the episodes, the first ones for 0.
 
     A correction reads the observation, and those of one episode are nearly the same. If there is one episode alone, a
     quarter of its calls.
     """
     known = episodes[np.sort(np.unique(episodes, return_index=True)[1])]
     if len(known) > 1:
-        return np.isin(episodes, known[: max(1, len(known) // 4)])
-    return np.arange(len(episodes)) < len(episodes) // 4 if len(episodes) > 1 else np.ones(1, np.bool_)
+        size = max(1, len(known) // QUARTERS)
+        return np.isin(episodes, known[part * size : (part + 1) * size])
+    return np.arange(len(episodes)) < len(episodes) // QUARTERS if len(episodes) > 1 else np.ones(1, np.bool_)
 
 
 BYTES = 2**29
