@@ -12,9 +12,10 @@ import torch
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration import regression
+from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.sparse_loop import anchors_of, fit_correction
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.whole_steps import FITTED_SHARE, SHARE_OF_MANY, WholeSteps, _set_apart, _sizes
+from ttscompile.calibration.whole_steps import FITTED_SHARE, SHARE_OF_MANY, Errors, WholeSteps, _set_apart, _sizes
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 from ttscompile.errors import CalibrationError
 
@@ -136,6 +137,23 @@ def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, p
 
 def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeTask) -> None:
     assert make_task(calls=60, episodes=range(1)).whole.reads(2) is False
+
+
+def test_a_small_network_is_asked_on_every_quarter_of_the_episodes(
+    make_task: MakeTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, errors, asked = make_task(calls=80, episodes=range(4)), WholeSteps._errors, list[frozenset[int]]()
+
+    def told(self: WholeSteps, samples: torch.Tensor, of: Calls) -> Errors:
+        asked.append(frozenset(of.episodes.tolist()))
+        return errors(self, samples, of)
+
+    monkeypatch.setattr(WholeSteps, "_errors", told)
+    for share, parts in ((FITTED_SHARE, 1), (SHARE_OF_MANY, 4)):
+        asked.clear()
+        WholeSteps(task.executor, task.actions, task.calls, 0, share=share).reads(2)
+        assert len(set(asked)) == parts
+    assert sorted(episode for quarter in set(asked) for episode in quarter) == list(range(4))
 
 
 def test_where_there_are_many_calls_candidates_see_more_of_them() -> None:
