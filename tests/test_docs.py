@@ -277,7 +277,7 @@ def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
     between = [row["points"] for row in plans if BOUND < row["distance"] <= FARTHEST]
     beyond = [row["points"] for row in plans if row["distance"] > FARTHEST]
     losses = f"{-few['points']:.1f} points of success in {few['episodes']} episodes"
-    numbers = "none one two three four five six seven".split()
+    numbers = "none one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen".split()
     lost, much = (numbers[sum(points <= -6 for points in some)] for some in (between, beyond))
     said = (
         f"Within a tenth the largest loss was {losses}**, where nothing can be told, **and {-many['points']:.1f} in"

@@ -157,9 +157,9 @@ def test_a_small_network_is_asked_on_every_quarter_of_the_episodes(
 
 
 def test_where_there_are_many_calls_candidates_see_more_of_them() -> None:
-    assert _sizes(100, FITTED_SHARE) == _sizes(3072, FITTED_SHARE) == _sizes(1152, SHARE_OF_MANY) == (384, 128)
+    assert _sizes(100, FITTED_SHARE) == _sizes(3072, FITTED_SHARE) == _sizes(1536, SHARE_OF_MANY) == (384, 128)
     assert _sizes(12_288, FITTED_SHARE) == (1536, 512)
-    assert _sizes(2595, SHARE_OF_MANY) == (865, 288)
+    assert _sizes(2595, SHARE_OF_MANY) == (648, 216)
 
 
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:

@@ -21,7 +21,7 @@ FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
 fewer."""
 
-FITTED_SHARE, SHARE_OF_MANY = 8, 3
+FITTED_SHARE, SHARE_OF_MANY = 8, 4
 """One call in so many is fitted on where that is more, and a third as many are measured on: on Meta-World a correction
 that reads the observation is no better on 384 calls, and a third better on all 12,000. The second is that of a network
 so small that it answered more calls than usual: schedules whose errors on other episodes are 0.044 and 0.070 have 0.049
@@ -75,9 +75,9 @@ class WholeSteps:
         self._pool = pool or Here()
         self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed, share))
         self._seed, self._share = seed, share
-        self._fitted, self._compared = self._divided(0)
+        self._fitted, self._compared = self._divided(0, share)
 
-    def _divided(self, part: int) -> tuple[Calls, Calls]:
+    def _divided(self, part: int, share: int) -> tuple[Calls, Calls]:
         """Calls that corrections are fitted on, and those of a part of the episodes, that they are compared on."""
         calls = self._calls
         order = np.random.default_rng((self._seed, 3, 0)).permutation(calls.count // calls.window)
@@ -86,7 +86,7 @@ class WholeSteps:
         def some(windows: IntArray, most: int) -> Calls:
             return self._executor.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
 
-        fitted, compared = _sizes(calls.count, self._share)
+        fitted, compared = _sizes(calls.count, share)
         others = some(order[apart], compared)
         return others if apart.all() else some(order[~apart], fitted), others
 
@@ -168,7 +168,7 @@ class WholeSteps:
         """The least errors of these schedules on the other quarters of the episodes, summed; 0 if none is asked."""
         total, parts = 0.0, min(QUARTERS, len(np.unique(self._calls.episodes)))
         for part in range(1, parts if self._share == SHARE_OF_MANY else 1):
-            fitted, compared = self._divided(part)
+            fitted, compared = self._divided(part, FITTED_SHARE)
             loop = SparseLoop(self._executor, fitted, compared, reads=reads, whole=True)
             runs = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
             total += min(self._errors(runs.end(steps).samples, compared).normalised for steps in tried)
