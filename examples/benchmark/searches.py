@@ -179,7 +179,7 @@ class Searching:
         manifest = trials.executor.view.manifest
         budgets = {one: cells_of(goal_of(target_sparsity=one), manifest, False) for one in self._sparsities}
         with opened_pool(self._ray) as pool:
-            trials = replace(trials, state=state, pool=pool, limits=CallLimits(*(self._learned,) * 3))
+            trials = replace(trials, state=state, pool=pool, limits=CallLimits(*[self._learned] * 3))
             if not (self._resume and state.load()):
                 state.remove()
             searches = Searches(state, (manifest.steps, len(manifest.blocks)))

@@ -15,7 +15,7 @@ from ttscompile.calibration import regression
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.sparse_loop import anchors_of, fit_correction
 from ttscompile.calibration.task import Found, Task
-from ttscompile.calibration.whole_steps import FITTED_SHARE, SHARE_OF_MANY, Errors, WholeSteps, _set_apart, _sizes
+from ttscompile.calibration.whole_steps import FITTED_SHARE, SMALL_SHARE, Errors, WholeSteps, _set_apart, _sizes
 from ttscompile.core.lattice import PlanArray, Source, dense_plan, uniform_plan
 from ttscompile.errors import CalibrationError
 
@@ -149,17 +149,17 @@ def test_a_small_network_is_asked_on_every_quarter_of_the_episodes(
         return errors(self, samples, of)
 
     monkeypatch.setattr(WholeSteps, "_errors", told)
-    for share, parts in ((FITTED_SHARE, 1), (SHARE_OF_MANY, 4)):
+    for small, parts in ((False, 1), (True, 4)):
         asked.clear()
-        WholeSteps(task.executor, task.actions, task.calls, 0, share=share).reads(2)
+        WholeSteps(task.executor, task.actions, task.calls, 0, small=small).reads(2)
         assert len(set(asked)) == parts
     assert sorted(episode for quarter in set(asked) for episode in quarter) == list(range(4))
 
 
 def test_where_there_are_many_calls_candidates_see_more_of_them() -> None:
-    assert _sizes(100, FITTED_SHARE) == _sizes(3072, FITTED_SHARE) == _sizes(1536, SHARE_OF_MANY) == (384, 128)
+    assert _sizes(100, FITTED_SHARE) == _sizes(3072, FITTED_SHARE) == _sizes(1536, SMALL_SHARE) == (384, 128)
     assert _sizes(12_288, FITTED_SHARE) == (1536, 512)
-    assert _sizes(2595, SHARE_OF_MANY) == (648, 216)
+    assert _sizes(2595, SMALL_SHARE) == (648, 216)
 
 
 def test_schedules_are_compared_on_other_episodes_than_they_were_fitted_on() -> None:

@@ -98,6 +98,7 @@ def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockW
     """Write weights of blocks, in files that nothing has yet; the manifest with their record.
 
     Raises:
+        ArtifactError: there are no such constants in the artifact.
         OSError: they cannot be written.
     """
     files = dict(manifest.files)

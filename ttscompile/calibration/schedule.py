@@ -18,7 +18,6 @@ from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_pl
 from .strategies import FITTED, strategy_of
 from .task import Found, Search, Task
 from .trials import Trials, base_of
-from .whole_steps import FITTED_SHARE, SHARE_OF_MANY
 
 
 def open_search(name: str, task: Task) -> Search:
@@ -136,9 +135,8 @@ class Schedule(Proposer):
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
         calls = trials.windows if self._strategy.consecutive else trials.calls
-        # A small network answered more of them than usual, so each candidate may take more.
-        fitted = SHARE_OF_MANY if calls.count > trials.limits.usual else FITTED_SHARE
-        task = Task.of(trials.executor, calls, 0, trials.seed, trials.pool, fitted)
+        small = calls.count > trials.limits.usual
+        task = Task.of(trials.executor, calls, 0, trials.seed, trials.pool, small)
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)

@@ -18,7 +18,7 @@ from ..runtimes.plans import pruner_plan
 from .calls import Actions, Calls
 from .clock import Clock
 from .execute import Executor
-from .whole_steps import FITTED_SHARE, WholeSteps
+from .whole_steps import WholeSteps
 
 Array = npt.NDArray[Any]
 
@@ -68,18 +68,12 @@ class Task:
 
     @classmethod
     def of(
-        cls,
-        executor: Executor,
-        calls: Calls,
-        budget: int,
-        seed: int,
-        pool: Pool | None = None,
-        share: int = FITTED_SHARE,
+        cls, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None, small: bool = False
     ) -> Task:
-        """The task of finding a plan; ``pool`` and ``share`` are those of ``WholeSteps``."""
+        """The task of finding a plan; ``pool`` and ``small`` are those of ``WholeSteps``."""
         view = executor.view
         actions, kinds = Actions(view.manifest.spec), tuple(block.kind for block in view.manifest.blocks)
-        whole = WholeSteps(executor, actions, calls, seed, pool, share)
+        whole = WholeSteps(executor, actions, calls, seed, pool, small)
         return cls(executor, actions, calls, budget, seed, view.pruner, kinds, whole)
 
     def draw(self, *stage: int) -> np.random.Generator:

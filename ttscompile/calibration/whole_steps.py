@@ -21,11 +21,10 @@ FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
 fewer."""
 
-FITTED_SHARE, SHARE_OF_MANY = 8, 4
+FITTED_SHARE, SMALL_SHARE = 8, 4
 """One call in so many is fitted on where that is more, and a third as many are measured on: on Meta-World a correction
-that reads the observation is no better on 384 calls, and a third better on all 12,000. The second is that of a network
-so small that it answered more calls than usual: schedules whose errors on other episodes are 0.044 and 0.070 have 0.049
-and 0.053 on the fewest calls, and a longer search ended with the worse one."""
+that reads the observation is no better on 384 calls, and a third better on all 12,000. The second is that of a small
+network: there a longer search on the fewest calls ended with a worse schedule (``docs/decisions.md``)."""
 
 QUARTERS = 4
 """Of the episodes: one is compared on, and the others are fitted on."""
@@ -53,7 +52,8 @@ class WholeSteps:
         seed: decides which of the calls corrections are fitted on, and which, of other episodes, schedules are compared
             on.
         pool: where candidates are compared; None for this process.
-        share: one call in so many is fitted on, where that is more than ``FITTED``.
+        small: whether the network is so small that it answered more calls than usual. Then candidates take more of
+            them, and all quarters of the episodes say whether corrections read the observation.
     """
 
     _pace = 0.0
@@ -66,16 +66,16 @@ class WholeSteps:
         calls: Calls,
         seed: int,
         pool: Pool | None = None,
-        share: int = FITTED_SHARE,
+        small: bool = False,
     ) -> None:
         self._executor, self._actions, self._calls = executor, actions, calls
         self._reading: dict[int, bool] = {}
         self._known: dict[tuple[int, ...], Errors] = {}
         self._runs: dict[bool | None, ScheduleRuns] = {}
         self._pool = pool or Here()
-        self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed, share))
-        self._seed, self._share = seed, share
-        self._fitted, self._compared = self._divided(0, share)
+        self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed, small))
+        self._seed, self._small = seed, small
+        self._fitted, self._compared = self._divided(0, SMALL_SHARE if small else FITTED_SHARE)
 
     def _divided(self, part: int, share: int) -> tuple[Calls, Calls]:
         """Calls that corrections are fitted on, and those of a part of the episodes, that they are compared on."""
@@ -157,17 +157,17 @@ class WholeSteps:
             more = max(0, min(count - 1, len(halving)))
             tried = [(0, *some) for some in (halving[:more], halving[len(halving) - more :])]
             best = {
-                reads: min(self._error_of(steps, reads).normalised for steps in tried) + self._elsewhere(tried, reads)
+                reads: min(self._error_of(steps, reads).normalised for steps in tried) + self._on_others(tried, reads)
                 for reads in (True, False)
                 if len(np.unique(self._fitted.episodes)) > 1
             }
             self._reading[count] = bool(best) and best[True] < best[False]
         return self._reading[count]
 
-    def _elsewhere(self, tried: Sequence[Sequence[int]], reads: bool) -> float:
+    def _on_others(self, tried: Sequence[Sequence[int]], reads: bool) -> float:
         """The least errors of these schedules on the other quarters of the episodes, summed; 0 if none is asked."""
         total, parts = 0.0, min(QUARTERS, len(np.unique(self._calls.episodes)))
-        for part in range(1, parts if self._share == SHARE_OF_MANY else 1):
+        for part in range(1, parts if self._small else 1):
             fitted, compared = self._divided(part, FITTED_SHARE)
             loop = SparseLoop(self._executor, fitted, compared, reads=reads, whole=True)
             runs = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
@@ -214,10 +214,10 @@ class WholeSteps:
 
 
 def _measured_elsewhere(
-    path: str, identity: str, loop: str, calls: Calls, seed: int, share: int
+    path: str, identity: str, loop: str, calls: Calls, seed: int, small: bool
 ) -> Callable[[Sequence[int]], tuple[Errors, float]]:
     executor = executor_elsewhere(path, identity, loop)
-    return WholeSteps(executor, Actions(executor.view.manifest.spec), calls, seed, share=share).measured
+    return WholeSteps(executor, Actions(executor.view.manifest.spec), calls, seed, small=small).measured
 
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:
