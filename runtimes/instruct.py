@@ -43,8 +43,18 @@ class Instruct:
         tokens, mask = padded([self._tokens(text) for text in texts], self._length)
         return {**rest, self._told.tokens: tokens, self._told.mask: mask}
 
+    def of_frame(self, frame: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The same for one frame of one robot, without the axis of streams."""
+        if not isinstance(frame, Mapping) or TASK not in frame or self._told.tokens in frame:
+            return frame
+        if not isinstance(frame[TASK], str):
+            raise ObservationError(f"the task of a frame is a {type(frame[TASK]).__name__}; expected a text.")
+        made = self({TASK: frame[TASK]})
+        return {**{key: value for key, value in frame.items() if key != TASK}, **{key: made[key][0] for key in made}}
+
     def _tokens(self, text: str) -> list[int]:
-        """Of one text; the last is kept, since an episode has one."""
-        if text not in self._made:
-            self._made = {text: self._tokenizer.of_task(text, self._told, self._length)}
-        return self._made[text]
+        """Of one text; the last is kept, since an episode has one. Several threads may ask."""
+        if (known := self._made.get(text)) is None:
+            known = self._tokenizer.of_task(text, self._told, self._length)
+            self._made = {text: known}
+        return known

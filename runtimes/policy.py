@@ -204,6 +204,16 @@ class CompiledPolicy:
                 normalized = {key: specs[key].normalized(array) for key, array in obs.items()}
                 return self._runtime.frames.learn(normalized, stop)
 
+    def with_tokens(self, frame: Mapping[str, Any]) -> Mapping[str, Any]:
+        """One frame by key, ``[...]``, with tokens in the place of its text ``task``.
+
+        As it is where the policy was loaded without a tokenizer. Any thread may ask, whoever else calls the policy.
+
+        Raises:
+            ObservationError: the task is no text, or has more tokens than the policy reads.
+        """
+        return frame if self._instruct is None else self._instruct.of_frame(frame)
+
     def seen(self) -> tuple[Seen, ...]:
         """What the policy sees of each camera of each stream, and which patches were computed last.
 

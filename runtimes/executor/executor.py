@@ -3,7 +3,7 @@
 Who owns what:
 
 - The *policy*, with its runtime, its caches and its random numbers, belongs to the worker's thread, from the
-  constructor to the end of ``close``. Nobody else calls it: a reset is a note to the worker.
+  constructor to the end of ``close``. Nobody else calls it, but for ``with_tokens``: a reset is a note to the worker.
 - The *worker* (``worker.Worker``) belongs to the process that made it.
 - The *state* (``state.ExecutorState``) belongs to whoever holds the worker's lock, for microseconds at a time: never
   during a call of the policy, never while frames are copied.
@@ -15,7 +15,7 @@ Who owns what:
 """
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Real
 from types import TracebackType
 from typing import Any, Self
@@ -77,6 +77,7 @@ class AsyncExecutor:
         self._resolved = resolve(settings, info, control_hz)
         if settings.seam == "prefix":
             require_prefix(policy)
+        self._with_tokens: Callable[[Mapping[str, Any]], Mapping[str, Any]] = getattr(policy, "with_tokens", _as_it_is)
         self._clock = clock or MonotonicClock()
         self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
         self.trace = Trace(settings.trace_events, self._identity)
@@ -92,7 +93,8 @@ class AsyncExecutor:
         """Give one frame. Never blocks.
 
         Args:
-            obs: by key, without the axes of batch and time: ``{"obs": float32 [Do]}``. Copied.
+            obs: by key, without the axes of batch and time: ``{"obs": float32 [Do]}``. Copied. The text ``task`` may be
+                among them if the policy was loaded with ``tokenizer=``.
             t: when it was taken, on the executor's clock; None for now. Frames may come late and out of order.
 
         Raises:
@@ -102,7 +104,7 @@ class AsyncExecutor:
             ExecutorClosedError: after ``close``.
         """
         worker = self._here()
-        frame, t = self._resolved.frames.check(obs), _seconds(t, "t")
+        frame, t = self._resolved.frames.check(self._with_tokens(obs)), _seconds(t, "t")
         with worker.lock:
             state = self._checked()
             now = self._clock.now()
@@ -288,6 +290,10 @@ class AsyncExecutor:
             raised = f"a call raised {type(failure).__name__}: {failure}"
             remedy = "Stop the robot safely; close this executor, and make another one when the cause is gone."
             raise WorkerDeadError(f"the thread that owns the policy has ended, because {raised}. {remedy}") from failure
+
+
+def _as_it_is(frame: Mapping[str, Any]) -> Mapping[str, Any]:
+    return frame
 
 
 def _seconds(value: Any, what: str) -> Any:

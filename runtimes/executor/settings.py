@@ -54,6 +54,7 @@ class Policy(Protocol):
         """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``.
 
         A policy that has ``follow``, too, is told how many steps of its last chunk are executed before the next call.
+        One that has ``with_tokens`` puts them into frames, in any thread.
         """
 
 

@@ -14,7 +14,7 @@ from ttscompile.runtimes.executor.executor import AsyncExecutor
 from .admission import ServerLimits
 from .listener import Listener
 from .lock import Lock
-from .protocol import METHODS, Metric, Request, of_statistics, read_arrays
+from .protocol import METHODS, Metric, Request, of_statistics, read_frame
 
 WAITS_PER_CLIENT = 4
 """Threads that may wait for an action, a client: one for it, the others for those before it that vanished waiting."""
@@ -47,7 +47,7 @@ class ExecutorServer(Listener):
         """See ``Listener``."""
         executor, params = self._executor, request.params
         if request.method == "observe":
-            frame = await self.apart(request.large, read_arrays, params["obs"], executor.frames.specs)
+            frame = await self.apart(request.large, read_frame, params["obs"], executor.frames.specs)
             executor.observe(frame, params.get("t"))
             return {}
         if request.method == "action":

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ttscompile.core.spec import ObservationSpec
+from ttscompile.core.tokenizer import TASK
 from ttscompile.core.untrusted_json import MAX_VALUES, most_values
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.statistics import COUNTS, ExecutorStatistics, Summary
@@ -41,6 +42,8 @@ KINDS = {"b": "biu", "i": "iu", "u": "iu", "f": "iuf"}
 """By the kind of an expected dtype: the kinds that the numbers of lists may have."""
 LARGE = 1 << 15
 """Characters of a message that is read beside the event loop, which then serves others meanwhile."""
+LONGEST_TASK = 4096
+"""Characters: a client's text is made tokens while others wait."""
 MOST_SECONDS = 1e15
 """Times are less than this, either way."""
 
@@ -113,6 +116,16 @@ def read_arrays(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) ->
         ProtocolError: something is no array.
     """
     return {key: _array(key, one, specs[key].dtype) if key in specs else np.zeros(0) for key, one in obs.items()}
+
+
+def read_frame(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> dict[str, Array | str]:
+    """The same with the text ``task``, if it has one. Raises ProtocolError, also for a text that is too long."""
+    task = obs.get(TASK)
+    if not isinstance(task, str):
+        return dict(read_arrays(obs, specs))
+    if len(task) > LONGEST_TASK:
+        raise ProtocolError(f"a task has at most {LONGEST_TASK} characters; found {len(task)}.")
+    return {**read_arrays({key: one for key, one in obs.items() if key != TASK}, specs), TASK: task}
 
 
 def _array(key: str, value: Any, dtype: str) -> Array:

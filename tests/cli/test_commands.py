@@ -113,20 +113,20 @@ def test_inspect_tells_the_same_in_tables(scheduled: Path) -> None:
 
 
 def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None:
-    result = run("inspect", scheduled, "--plot", tmp_path / "plan.png", "--json")
+    result = run("inspect", scheduled, "-o", tmp_path / "plan.png", "--json")
     json.loads(result.stdout)
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> None:
     picture = tmp_path / "plan.png"
-    result = CliRunner().invoke(main, ["inspect", str(pruned), "--plot", str(picture)])
+    result = CliRunner().invoke(main, ["inspect", str(pruned), "-o", str(picture)])
     assert result.exit_code == 2
     assert "Add --trajectories FILE" in result.stderr
     assert not picture.exists()
     rng = np.random.default_rng(0)
     np.savez(tmp_path / "calls.npz", obs=rng.uniform(100, 400, (2, 2, 20)).astype(np.float32), episode_ends=[2])
-    run("inspect", pruned, "--plot", picture, "-t", tmp_path / "calls.npz")
+    run("inspect", pruned, "-o", picture, "-t", tmp_path / "calls.npz")
     assert picture.exists()
 
 
@@ -139,14 +139,14 @@ def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> No
 )
 def test_an_observation_that_does_not_fit(arrays: dict[str, Any], reason: str, pruned: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "calls.npz", **arrays)
-    arguments = ["inspect", pruned, "--plot", tmp_path / "plan.png", "-t", tmp_path / "calls.npz"]
+    arguments = ["inspect", pruned, "-o", tmp_path / "plan.png", "-t", tmp_path / "calls.npz"]
     result = CliRunner().invoke(main, [str(a) for a in arguments])
     assert result.exit_code == 2
     assert reason in result.stderr
 
 
 def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path, tmp_path: Path) -> None:
-    arguments = ["inspect", str(scheduled), "--plot", str(tmp_path / "plan.png"), "--plan", "best"]
+    arguments = ["inspect", str(scheduled), "-o", str(tmp_path / "plan.png"), "--plan", "best"]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr

@@ -28,7 +28,7 @@ COMMAND = [sys.executable, "-P", "-m", "ttscompile"]
 
 def test_a_warning_is_one_line_and_shows_no_python(tmp_path: Path, toy_compiled: Path) -> None:
     np.savez(tmp_path / "calls.npz", obs=np.zeros((4, 2), np.float32), episode_ends=[2, 3])
-    command = [*COMMAND, "inspect", str(toy_compiled), "-t", "calls.npz", "--plot", "map.png"]
+    command = [*COMMAND, "inspect", str(toy_compiled), "-t", "calls.npz", "-o", "map.png"]
     told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stderr
     assert "warning: calls.npz: 1 rows after the last end of an episode are not used.\n" in told
     assert "UserWarning" not in told and ".py" not in told

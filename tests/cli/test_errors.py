@@ -61,7 +61,9 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["convert", "policy.ckpt", "-o", "out", "--steps", "0"], "not in the range"),
         (["calibrate", "out"], "Missing option '-t' / '--trajectories'"),
         (["calibrate", "out", "--trajectories"], "Missing option '-t' / '--trajectories'"),
-        (["inspect", "out", "--plan", "dense"], "--plan is for --plot: give it too"),
+        (["inspect", "out", "--plan", "dense"], "--plan is for --output: give it too"),
+        (["inspect", "out", "-o", "page.html", "--plan", "dense"], "--plan is for a picture (.png)"),
+        (["inspect", "out", "-o", "plan.png", "--verify"], "--verify is for a page (.html)"),
         (["bench", "out", "--encoders", "."], "--encoders is for --checkpoint: give it too"),
         (["bench", "out", "--plot", "f.png"], "--plot is for --trajectories: give it too"),
         (["bench", "out", "--runtime", "tensorrt"], "'tensorrt' is not one of onnxruntime, torch"),
@@ -69,9 +71,9 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["predict", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
         (["serve", "out"], "give --control-hz HZ to drive one robot, or --copies N or --openpi to answer many"),
         (["serve", "out", "--control-hz", "10", "--ray", "local"], "--ray is for --copies: give it too"),
-        (["inspect", "out", "-o", "page.pdf"], "ends in .html"),
+        (["inspect", "out", "-o", "page.txt"], "expected a page (.html) or a picture (.png, .svg, .pdf)"),
         (["inspect", "out", "--verify"], "--verify is for --output: give it too"),
-        (["inspect", "out", "-t", "calls.npz"], "--trajectories is for --output or --plot: give one of them too"),
+        (["inspect", "out", "-t", "calls.npz"], "--trajectories is for --output: give it too"),
         (["deploy"], "No such command"),
     ],
 )
@@ -118,9 +120,10 @@ def test_what_is_not_there_is_said_before_the_compiler_is_imported(
 
 def test_pictures_that_cannot_be_drawn(toy_compiled: Path, tmp_path: Path) -> None:
     for name in ("no folder/x.png", "x.foo", "x", ".png"):
-        result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "--plot", str(tmp_path / name)])
+        result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "-o", str(tmp_path / name)])
         assert (result.exit_code, result.stdout) == (2, "")
-        assert "the picture cannot be written" in result.stderr
+        why = "the picture cannot be written" if "/" in name else "expected a page (.html) or a picture (.png"
+        assert why in " ".join(result.stderr.split())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -130,11 +133,11 @@ def test_a_picture_takes_the_place_of_files_alone(toy_compiled: Path, tmp_path: 
     folder.mkdir()
     null.symlink_to("/dev/null")
     for path in (folder, null):
-        result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "--plot", str(path)])
+        result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "-o", str(path)])
         assert result.exit_code == 2
     assert null.is_symlink()
     picture.write_text("the old one")
-    result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "--plot", str(picture)])
+    result = CliRunner().invoke(main, ["inspect", str(toy_compiled), "-o", str(picture)])
     assert result.exit_code == 0, result.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert sorted(tmp_path.iterdir()) == sorted([folder, null, picture])

@@ -49,7 +49,7 @@ NEEDED: dict[str, list[tuple[str, ...]]] = {
     "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
     "convert": [("policy.ckpt", "-o", "out")],
     "doctor": [("A",)],
-    "inspect": [("A",), ("A", "--output", "out.html"), ("A", "--plot", "plan.png")],
+    "inspect": [("A",), ("A", "--output", "out.html"), ("A", "-o", "plan.png")],
     "predict": [("A", "--state", "0.5,-1")],
     "push": [("A", "org/name", "--dry-run")],
     "serve": [("A", "--control-hz", "1", "--port", "0", "--margin-ticks", "0"), ("A", "--copies", "1", "--port", "0")],

@@ -59,7 +59,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {
     "doctor": ("doctor", "A"),
     "inspect": ("inspect", "A"),
     "inspect a zip": ("inspect", "A.zip", "--json"),
-    "inspect --plot": ("inspect", "A", "--plot", "OUT/plan.png"),
+    "inspect -o plan.png": ("inspect", "A", "-o", "OUT/plan.png"),
     "verify": ("verify", "V", "--json"),
     "predict": ("predict", "A", "--state", "0.5,-1", "--plot", "OUT/chunk.png"),
     "bench": ("bench", "A", "--calls", "1"),

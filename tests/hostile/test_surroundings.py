@@ -21,10 +21,10 @@ TRIED = {
     "output in ASCII": ("inspect", 0),
     "COLUMNS=1": ("inspect", 0),
     "all three closed": ("inspect -o", 0),
-    "standard error full": ("inspect --plot", 2),
+    "standard error full": ("inspect -o plan.png", 2),
     "in a folder that is gone": ("inspect a zip", 2),
     "in a folder whose name is no text": ("inspect", 0),
-    "files of 8 KiB": ("inspect --plot", 2),
+    "files of 8 KiB": ("inspect -o plan.png", 2),
 }
 
 

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 import ttscompile
 from tests.families.checks import kinds
 from tests.families.support import record, stored_program
+from tests.runtimes.server.serving import ServerError, connected, listening
 from ttscompile.artifact import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import Noise
@@ -24,6 +25,9 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions, find_family
 from ttscompile.policies import flax_files, octo, octo_loop
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.server.admission import ServerLimits
+from ttscompile.runtimes.server.executor_server import ExecutorServer
 
 from .octos import CHECKPOINT, MASK, TOKENS, WINDOW, actions, change, noise, shown, unpack
 
@@ -66,6 +70,12 @@ def compiled(saved: Path) -> Path:
     return saved / "compiled"
 
 
+@pytest.fixture(scope="module")
+def of_one_frame(saved: Path) -> Path:
+    ttscompile.convert(saved / "one", saved / "compiled-one")
+    return saved / "compiled-one"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_the_compiled_policy_acts_as_the_original(compiled: Path, runtime: str) -> None:
@@ -96,6 +106,28 @@ def test_a_robot_gives_the_instruction_as_text(compiled: Path, saved: Path) -> N
 
 
 @pytest.mark.slow
+def test_a_robot_in_another_process_gives_the_instruction_as_text(of_one_frame: Path, saved: Path) -> None:
+    """In a frame of the executor's server: the actions are those of the tokens, and other words have others."""
+    policy = ttscompile.load(of_one_frame, tokenizer=saved / "t5-base")
+    image, texts = shown("one", "all")["image_primary"][0, 0], ("pick up the red cup", "place it on the table")
+    tokens = policy.with_tokens({"image_primary": image, "task": texts[0]})
+    frames = [tokens, *({"image_primary": image, "task": text} for text in texts)]
+    limits, made = ServerLimits.of(policy.info.observation, 2), []
+    with (
+        AsyncExecutor(policy, 10, ExecutorSettings(max_hold=1000, refuse_infeasible=False)) as executor,
+        listening(lambda: ExecutorServer(executor, limits)) as url,
+        connected(url) as call,
+    ):
+        for frame in frames:
+            call("reset", seed=0)
+            call("observe", obs={key: value if key == "task" else value.tolist() for key, value in frame.items()})
+            made.append(call("action", timeout=10.0)["action"])
+        with pytest.raises(ServerError, match="the task of a frame is a ndarray; expected a text"):
+            call("observe", obs={"image_primary": image.tolist(), "task": 3})
+    assert made[0] == made[1] != made[2]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
 def test_one_camera_of_two_and_a_task_that_is_compiled_in(saved: Path, runtime: str, tmp_path: Path) -> None:
     out = tmp_path / "compiled"
@@ -110,10 +142,9 @@ def test_one_camera_of_two_and_a_task_that_is_compiled_in(saved: Path, runtime: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
-def test_one_frame_of_a_model_of_december(saved: Path, runtime: str, tmp_path: Path) -> None:
+def test_one_frame_of_a_model_of_december(of_one_frame: Path, runtime: str) -> None:
     """Whose first token of each group reads what the group before may read."""
-    ttscompile.convert(saved / "one", tmp_path / "compiled")
-    policy = ttscompile.load(tmp_path / "compiled", runtime=runtime)
+    policy = ttscompile.load(of_one_frame, runtime=runtime)
     seen = {key: shown("one", "all")[key] for key in ("image_primary", TOKENS, MASK)}
     made = policy.predict_action(seen, noise=noise("one", "all"), plan="dense")["action"]
     assert np.abs(made - actions("one", "all")).max() < ALLOWED

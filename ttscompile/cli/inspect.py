@@ -13,7 +13,7 @@ from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, progress, say
 from ttscompile.cli.sections import Recordings, Section, SectionedCommand, Sources, trajectories_options
 from ttscompile.cli.summary import print_artifact
-from ttscompile.cli.types import NEW_FILE, PICTURE, TEXT
+from ttscompile.cli.types import PAGE_OR_PICTURE, PAGES, TEXT
 from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
 from ttscompile.plots.figure import write_picture
@@ -30,8 +30,8 @@ SCHEDULE = "schedule"
 """Name that calibration gives to its best plan that does not depend on the observation."""
 
 SECTIONS = (
-    Section("What a page or a picture shows of an episode", ("trajectories", "sources"), ("output", "picture")),
-    Section("What a picture shows", ("name",), ("picture",)),
+    Section("What a page or a picture shows of an episode", ("trajectories", "sources"), ("output",)),
+    Section("What a picture shows", ("name",), ("output",)),
     Section("What a page shows", ("verifies",), ("output",)),
 )
 
@@ -41,11 +41,10 @@ SECTIONS = (
 @click.option(
     "-o",
     "--output",
-    type=NEW_FILE,
+    type=PAGE_OR_PICTURE,
     help="Write all about it into this page (.html), which needs no other file: its plans, its times on this machine,"
-    " its errors, its limits.",
+    " its errors, its limits. Or draw a plan into this picture (.png, .svg or .pdf).",
 )
-@click.option("--plot", "picture", type=PICTURE, help="Draw a plan into this file (.png, .svg or .pdf).")
 @trajectories_options(required=False, what="Run the first of these recorded episodes, and show what its calls execute.")
 @click.option(
     "--plan", "name", type=TEXT, help="Draw this plan. Without this option it is the default plan of the artifact."
@@ -57,7 +56,6 @@ def inspect(
     context: click.Context,
     directory: Path,
     output: Path | None,
-    picture: Path | None,
     trajectories: Recordings,
     sources: Sources,
     name: str | None,
@@ -66,10 +64,14 @@ def inspect(
 ) -> None:
     """Show what the artifact DIRECTORY holds: the policy, its blocks, what they cost, its plans and calibration.
 
-    With -o it also times calls of every plan, and writes a page. The exit status is 1 if a check of --verify failed;
-    the page is written all the same.
+    With -o FILE.html it also times calls of every plan, and writes a page. The exit status is 1 if a check of --verify
+    failed; the page is written all the same.
     """
-    if output is not None:
+    page = output is not None and output.suffix in PAGES
+    if output is not None and (verifies if not page else name is not None):
+        option, other = ("--plan", "picture (.png)") if page else ("--verify", "page (.html)")
+        raise click.UsageError(f"{option} is for a {other}; found --output {output}.")
+    if output is not None and page:
         require_page(output)
     console, artifact = progress(), load_artifact(directory)
     spec, episode = artifact.manifest.spec, None
@@ -77,18 +79,18 @@ def inspect(
         executed = spec.chunk.stop - spec.chunk.start
         episode = load_trajectories(trajectories, spec.observations, executed, sources, spec.instruction)[0]
     passed, section = True, NOT_RUN
-    if output is not None:
+    if output is not None and page:
         with only_results_on_stdout(), console.status("loading") as status:
             if verifies:
                 passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
             policy = open_policy(artifact, seed=0)
             told = write_page(output, artifact, policy, Given(episode, section), status.update)
         say(console, told)
-    if picture is not None:
+    elif output is not None:
         name = name or _drawn_by_default(artifact, episode)
         kinds = [block.kind for block in artifact.manifest.blocks]
-        write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
-        say(console, f"wrote {picture}")
+        write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), output)
+        say(console, f"wrote {output}")
     print_artifact(artifact, as_json)
     if not passed:
         say(console, "failed: the artifact does not hold what it promises; the page says where.")
@@ -127,8 +129,6 @@ def require_page(path: Path) -> None:
     """Raise OutputError or RuntimeUnavailableError, before minutes of work, unless a page can be made there."""
     if not path.absolute().parent.is_dir():
         raise OutputError(f"{path}: the page cannot be written: no such folder. Give one that exists.")
-    if path.suffix not in (".html", ".htm"):
-        raise OutputError(f"{path}: the page is HTML. Give a name that ends in .html.")
     require_packages()
 
 

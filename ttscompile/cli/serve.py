@@ -25,7 +25,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import options as shared
 from ttscompile.cli.output import only_results_on_stdout, progress, say
 from ttscompile.cli.sections import Section, SectionedCommand
-from ttscompile.cli.types import ADDRESS, ANY_TEXT, FILE, RATE, TEXT
+from ttscompile.cli.types import ADDRESS, ANY_TEXT, FILE, PATH, RATE, TEXT
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, OpenPiServer, Plans, ray_copies
@@ -169,7 +169,7 @@ BATCHES_WAITING = 16
 
 SECTIONS = (
     Section("One robot", shared.LOOP_OPTIONS, ("control_hz",)),
-    Section("The policy in this process", ("runtime", "device"), ("control_hz", "openpi")),
+    Section("The policy in this process", ("tokenizer", "runtime", "device"), ("control_hz", "openpi")),
     Section("Many robots", ("ray",), ("copies",)),
     Section("Who may connect", SERVER_OPTIONS),
 )
@@ -193,6 +193,12 @@ SECTIONS = (
 )
 @shared.threads_option("Threads that the policy, or each copy of it, computes with.")
 @shared.loop_options
+@click.option(
+    "--tokenizer",
+    type=PATH,
+    help="Read instructions, the text task of an observation and the prompt of openpi's clients, with this"
+    " tokenizer.json, or that of this folder.",
+)
 @shared.runtime_options
 @click.option(
     "--ray",
@@ -209,6 +215,7 @@ def serve(
     openpi: bool,
     plans: tuple[str, ...],
     threads: int,
+    tokenizer: Path | None,
     runtime: str,
     device: str | None,
     ray: str,
@@ -226,7 +233,7 @@ def serve(
         raise click.UsageError("--copies and --openpi take one --plan.")
     server = ServerOptions.taken(options, progress())
     with server.audited():
-        how = {"runtime": runtime, "threads": threads, "device": device}
+        how = {"runtime": runtime, "threads": threads, "device": device, "tokenizer": tokenizer}
         if control_hz is not None:
             _serve_robot(directory, server, control_hz, ExecutorSettings(tiers=plans or None, **options), how)
         elif copies is None:

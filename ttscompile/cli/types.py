@@ -14,7 +14,7 @@ import click
 
 from ttscompile.core.paths import on_hub
 from ttscompile.errors import OutputError
-from ttscompile.plots.figure import require_picture_name
+from ttscompile.plots.figure import FORMATS, require_picture_name
 
 
 class NumberOption(click.Option):
@@ -133,6 +133,25 @@ class PictureName(PathName):
 
 
 PICTURE = PictureName(dir_okay=False)
+
+PAGES = (".html", ".htm")
+"""How the name of a page ends."""
+
+
+class PageOrPictureName(PictureName):
+    """A file for a page, or for a picture, told by the end of its name."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """See ``click.ParamType``."""
+        path = PathName.convert(self, value, param, ctx)
+        if path.suffix in PAGES:
+            return path
+        if path.suffix.lower() not in FORMATS:
+            self.fail(f"expected a page (.html) or a picture ({', '.join(FORMATS)}); found {str(path)!r}.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PAGE_OR_PICTURE = PageOrPictureName(dir_okay=False)
 
 
 class Address(click.ParamType[str]):

@@ -254,7 +254,7 @@ def check_engaged(
     name = manifest.default_plan if manifest.default_plan in found else next(iter(found))
     figure = (found[name].executed, None, "of the cells")
     if faults:
-        remedy = "The plan is inert on this machine: calibrate again, and look at 'ttscompile inspect --plot'."
+        remedy = "The plan is inert on this machine: calibrate again, and look at 'ttscompile inspect DIR -o plan.png'."
         return Rung(ENGAGED, FAILED, "; ".join(faults), *figure, remedy, details=details)
     shown = []
     for n, one in found.items():

@@ -146,7 +146,7 @@ def test_the_prompt_is_the_task_where_the_policy_has_a_tokenizer(planned: Path) 
         connection.recv(10)
         refused = ask(connection, packed({"obs": GOOD, "prompt": "pick"}))
         assert "missing: ['mask', 'tokens']" in refused
-        assert "load with tokenizer=PATH, or compile it in: convert --task" in refused
+        assert "load with tokenizer=PATH (serve: --tokenizer), or compile it in" in refused
         policy.tokenizes = True
         assert "actions" in ask(connection, packed({"obs": GOOD, "prompt": "pick"}))
         assert policy.seen[-1]["task"] == "pick"

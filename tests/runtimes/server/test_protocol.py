@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 from ttscompile import ObservationSpec
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import FrameSpec
-from ttscompile.runtimes.server.protocol import read_arrays, read_request
+from ttscompile.runtimes.server.protocol import read_arrays, read_frame, read_request
 
 
 def test_requests_are_read_and_frames_converted() -> None:
@@ -41,6 +41,15 @@ def test_a_mask_is_of_true_and_false() -> None:
         read_arrays({"obs": [True, False]}, {"obs": ObservationSpec((2,), window=False)})
 
 
+def test_a_frame_may_have_a_task() -> None:
+    specs = {"obs": ObservationSpec((2,), window=False), "task": ObservationSpec((1,), window=False)}
+    frame = read_frame({"obs": [1, 2], "task": "pick"}, {"obs": specs["obs"]})
+    assert (np.asarray(frame["obs"]).tolist(), frame["task"]) == ([1, 2], "pick")
+    assert np.asarray(read_frame({"obs": [1, 2], "task": [3.0]}, specs)["task"]).tolist() == [3], "one may be numbers"
+    with pytest.raises(ProtocolError, match="a task has at most 4096 characters; found 4097"):
+        read_frame({"task": "a" * 4097}, {})
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
@@ -61,11 +70,11 @@ def test_anything_is_a_request_or_a_protocol_error(message: str | bytes) -> None
 @given(
     st.sampled_from(["info", "observe", "action", "reset", "statistics"]),
     st.dictionaries(st.sampled_from(["obs", "t", "timeout", "seed"]), JSON, max_size=3),
-    st.dictionaries(st.sampled_from(["obs", "image", "other"]), JSON | PACKED, max_size=3),
+    st.dictionaries(st.sampled_from(["obs", "image", "other", "task"]), JSON | PACKED, max_size=3),
 )
 def test_any_parameters_are_taken_or_a_protocol_error(method: str, params: dict, obs: dict) -> None:  # type: ignore[type-arg]
     message = json.dumps({"method": method, **params, **({"obs": obs} if "obs" in params else {})})
     with suppress(ProtocolError):
         request = read_request(message)
         if method == "observe":
-            read_arrays(request.params["obs"], FRAMES.specs)
+            read_frame(request.params["obs"], FRAMES.specs)

@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from tests.runtimes.executor.simulation import FakeClock
+from ttscompile.cli import main
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError
 from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.server.admission import ServerLimits
@@ -349,6 +351,12 @@ def test_the_server_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.raises(RuntimeUnavailableError, match=r"pip install 'ttscompile\[serve\]'"),
     ):
         asyncio.run(ExecutorServer(executor).run("127.0.0.1", 0, asyncio.Event()))
+
+
+def test_a_tokenizer_that_the_policy_has_no_use_for_is_refused(toy_compiled: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["serve", str(toy_compiled), "--openpi", "--tokenizer", str(tmp_path)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "this policy takes no text that alone would give its tokens. Leave the tokenizer out." in result.stderr
 
 
 @pytest.mark.slow
