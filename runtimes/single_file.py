@@ -10,7 +10,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.envelope import plain_cells
 from ttscompile.core.lattice import dense_plan
-from ttscompile.core.spec import ORIGINAL
+from ttscompile.core.spec import FP32, ORIGINAL
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.pieces import USE_PRUNER
 
@@ -30,7 +30,7 @@ def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArra
     Raises:
         ArtifactError: the artifact is missing, damaged or of another version.
         IllegalPlanError: there is no plan of this name; or it has weights of its own or begins with the chunk of the
-            call before, which a file cannot.
+            call before, which a file cannot; or it is in another precision than the file.
     """
     artifact = load_artifact(path)
     name = artifact.manifest.default_plan if plan is None else plan
@@ -39,6 +39,14 @@ def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArra
         if there:
             problem = f"plan {name!r} has {field}, and a single file has the original's weights and begins with noise"
             raise IllegalPlanError(f"{problem}. Give another plan, or use ttscompile.load.")
+    record = artifact.manifest.precision
+    bits, parts = (FP32, ()) if record is None else (record.name, record.kept)
+    # The file computes in the precision of ``convert``, whatever a plan says.
+    if {own.precision.get(part, FP32) for part in parts} | {*own.precision.values()} != {bits} - {FP32}:
+        there = FP32 if record is None else record.told
+        problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact computes {there}"
+        remedy = f"Give {name.partition('@')[0] + '@' + bits!r}, or use ttscompile.load."
+        raise IllegalPlanError(f"{problem}. {remedy}")
     view = view_of(artifact, own)
     cells = dense_plan(view.manifest.steps, len(view.manifest.blocks)) if own.cells is None else own.cells
     inputs: dict[str, npt.NDArray[Any]] = {"plan": cells[None], "rollout_keep": readable_rollout(view)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +19,14 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import Manifest
 from ttscompile.artifact.view import view_of
 from ttscompile.driver import transform
-from ttscompile.errors import LoweringError
+from ttscompile.errors import IllegalPlanError, LoweringError
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
 from ttscompile.lower import precision
 from ttscompile.lower.precision import parts_to_lower
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.random_calls import random_call
+from ttscompile.runtimes.single_file import inputs_of
 from ttscompile.verification.precision import CARRIED, EIGHT_BITS
 
 from . import seeing
@@ -110,6 +112,15 @@ def test_the_single_file_computes_the_same(int8: Path) -> None:
     np.testing.assert_allclose(found["action"], expected["action"], rtol=1e-4, atol=1e-4)
     exact = policy.predict_action(obs, noise=noise, plan="dense")
     assert np.abs(exact["action"] - expected["action"]).max() > 1e-3
+
+
+def test_a_plan_in_another_precision_than_the_single_file_is_refused(int8: Path) -> None:
+    """The file has the parts of ``convert`` in eight bits, and would compute it in these without a word."""
+    for name in (None, "full", "dense@int8"):
+        assert inputs_of(int8, name)["plan"].shape == (1, seeing.STEPS, 3)
+    for name in ("dense", "full@fp32", "full@int8+blocks"):
+        with pytest.raises(IllegalPlanError, match=rf"plan {re.escape(repr(name))} is .* Give '\w+@int8'"):
+            inputs_of(int8, name)
 
 
 def test_a_part_that_was_left_out_is_in_fp32_and_named(tmp_path: Path) -> None:
