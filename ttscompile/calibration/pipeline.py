@@ -139,7 +139,8 @@ def calibrate(
     At most one budget: ``target_sparsity``, ``target_flops``, ``latency_ms`` or ``max_action_error``. Beside the plan
     that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline. A strategy that fits corrections adds
     ``safe``, which computes twice as many cells, and ``fast``, which computes half as many. A calibration that learns a
-    schedule replaces all plans but ``dense`` and ``full``; another one adds to them.
+    schedule replaces all plans but ``dense`` and ``full``, one that learns loops all but ``dense``; another one adds to
+    them.
 
     Args:
         path: the artifact's directory.

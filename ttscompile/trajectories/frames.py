@@ -81,7 +81,7 @@ def observation_frames(
     found = {}
     for key, spec in observations.items():
         parts = sources.get(key, (key,))
-        arrays = [_part(path, frames, key, part) for part in parts]
+        arrays = [_part(path, frames, key, part, spec.image) for part in parts]
         if len(arrays) == 1 and ":" not in parts[0]:
             found[key] = _as_image(arrays[0], spec if spec.frames is None else spec.one_frame)
             continue
@@ -92,11 +92,15 @@ def observation_frames(
     return found
 
 
-def _part(path: Path, frames: Frames, key: str, part: str) -> Array:
+def _part(path: Path, frames: Frames, key: str, part: str, image: bool) -> Array:
     name, colon, count = part.partition(":")
     if name not in frames.names:
         words = "language" in key and TASK in frames.names
         remedy = " Of its instructions --observation task=DIR makes tokens, with DIR/tokenizer.json." if words else ""
+        if image:
+            remedy = (
+                f" A vision-language-action model can do without a camera: --without-camera {key} when it is converted."
+            )
         raise TrajectoryError(
             f"{path}: has no array {name!r} for the observation {key!r}; it has {few(frames.names)}.{remedy} Say what"
             f" the observation is made of, in order: --observation {key}=NAME,NAME:N (NAME:N are its first N), or"
