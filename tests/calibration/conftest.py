@@ -11,7 +11,7 @@ import pytest
 
 import ttscompile
 from tests.once import Once
-from ttscompile.calibration import regression, tts
+from ttscompile.calibration import regression, trials, tts
 
 from . import policies, tasks
 
@@ -20,8 +20,9 @@ EPOCHS = regression.EPOCHS
 
 @pytest.fixture(autouse=True, scope="package")
 def _short_search() -> Iterator[None]:
-    """Intervals of all phases, and few of them; networks of corrections learn for a while."""
+    """Intervals of all phases, and few of them; networks of corrections learn for a while; few draws of noise."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trials, "MOST_DRAWS", trials.DRAWS)
         patch.setattr(tts, "DISTANCES", (1,))
         patch.setattr(regression, "EPOCHS", 10)
         yield

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import budget as budgets, pipeline, schedule, trials
+from ttscompile.calibration import budget as budgets, pipeline, schedule
 from ttscompile.calibration.budget import Goal, cells_of, goal_of, measure_budget
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.pipeline import CalibrationResult, calibrate
@@ -159,7 +159,6 @@ def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recordi
 @pytest.mark.slow
 def test_the_latency_is_measured_once(artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _timed(monkeypatch, 1.0)
-    monkeypatch.setattr(trials, "MOST_DRAWS", trials.DRAWS)
     with killed(saves=5):  # of the original's answers, of the latency, and of some targets
         quick(artifact, recording, latency_ms=3.9)
     monkeypatch.setattr(schedule, "measure_budget", lambda *_: pytest.fail("measured again"))

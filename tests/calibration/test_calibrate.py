@@ -17,7 +17,7 @@ from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.calibration.state import FILE
-from ttscompile.calibration.trials import MOST_DRAWS
+from ttscompile.calibration.trials import DRAWS
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError
 from ttscompile.rivals import bac, static
@@ -134,7 +134,7 @@ def test_resuming_after_a_kill_ends_where_it_would_have_ended(
     counted = _count_targets(monkeypatch)
     result = quick(artifact, recording, max_intervals=None, resume=True)
     assert contents(artifact) == contents(calibrated[0])
-    assert counted() < result.calls["calibration"] + MOST_DRAWS * result.calls["validation"]  # some were known
+    assert counted() < result.calls["calibration"] + DRAWS * result.calls["validation"]  # some were known
 
 
 def _count_targets(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:

@@ -201,8 +201,9 @@ def test_answers_of_a_state_without_their_number_are_the_usual_ones(
 
 @pytest.mark.parametrize(("seconds", "draws"), [(1e-9, DRAWS), (1e6, MOST_DRAWS), (np.inf, DRAWS)])
 def test_a_small_network_is_asked_more_often(
-    compiled: Path, recording: Path, tmp_path: Path, seconds: float, draws: int
+    compiled: Path, recording: Path, tmp_path: Path, seconds: float, draws: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("ttscompile.calibration.trials.MOST_DRAWS", MOST_DRAWS)
     (tmp_path / "usual").mkdir()
     usual = trials_of(compiled, recording, tmp_path / "usual").held_out
     sample = trials_of(compiled, recording, tmp_path, clock=Clock(seconds)).held_out
