@@ -10,7 +10,7 @@ import pytest
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration import step_counts
+from ttscompile.calibration import step_counts, whole_steps
 from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
@@ -92,6 +92,17 @@ def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     assert record is not None
     assert record["skipped"] == dict(result.skipped)
     assert set(load_artifact(artifact).plans) == {"dense", "schedule", "uniform"}
+
+
+def test_a_search_for_safe_that_is_cut_short_is_no_finished_one(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = whole_steps.WholeSteps.comparing
+    monkeypatch.setattr(
+        whole_steps.WholeSteps, "comparing", lambda self, count: whole(self, count) if count < 8 else float("inf")
+    )
+    result = calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
+    assert (result.stopped, result.skipped["safe"]) == ("time limit", "the time limit left none for it")
 
 
 def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,10 @@ from click.testing import CliRunner
 
 from tests.families import cameras
 from tests.once import Once
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import update_plans
 from ttscompile.cli import main
+from ttscompile.core.plan import TokenReuse
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +45,15 @@ def test_bench_says_how_much_of_a_call_is_frames(seeing: Path, toy_compiled: Pat
     told = "Every call has frames of its own"
     assert told in run("bench", seeing, "--calls", 1)
     assert told not in run("bench", toy_compiled, "--calls", 1)
+
+
+def test_bench_says_that_random_pictures_leave_no_token_to_reuse(once: Once, tmp_path: Path) -> None:
+    folder = shutil.copytree(cameras.compiled_tokens(once) / "artifact", tmp_path / "own")
+    artifact = load_artifact(folder)
+    update_plans(folder, {**artifact.plans, "some": replace(artifact.default, tokens=TokenReuse(0.1, 6))}, "full")
+    told = " ".join(run("bench", folder, "--plan", "some", "--plan", "full", "--calls", 1).split())
+    assert "Every picture is another one here, so that some had to compute all tokens." in told
+    assert "had to compute all tokens" not in run("bench", folder, "--plan", "full", "--calls", 1)
 
 
 def test_the_page_has_a_row_and_a_column_for_them(seeing: Path, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from .judge import Score, other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
 from .proposer import LOOPS, Request, Row, rows_of
-from .schedule import SCHEDULE, Schedule
+from .schedule import FINISHED, SCHEDULE, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, strategy_of
@@ -288,13 +288,13 @@ def calibrate(
             episodes={"calibration": trials.split.calibration, "validation": trials.split.validation},
             calls={"calibration": trials.used, "validation": len(trials.held_out.calls)},
             intervals=schedule.intervals,
-            stopped=schedule.stopped or ("time limit" if clock.left() < 0 else "finished"),
+            stopped=schedule.stopped or (TIME_LIMIT if clock.left() < 0 else FINISHED),
             seconds=clock.elapsed(),
             budget=chosen_within if chooses else schedule.budget.record(),
             told=kept.told,
             frontier=() if frontier is None else frontier.tried,
         )
-        if result.stopped == "time limit":
+        if result.stopped == TIME_LIMIT:
             bar.warn(
                 f"the search was cut short after {result.intervals} intervals, since {max_minutes:g} minutes were over:"
                 " with more, plans may be nearer to the original."

@@ -58,7 +58,7 @@ def search_plan(
         number += 1
         longest = max(longest, clock.elapsed() - start)
         after(number, longest)
-    return search.found(), number, "time limit" if clock.cut else "finished"
+    return search.found(), number, TIME_LIMIT if clock.cut else FINISHED
 
 
 def searched(
@@ -84,6 +84,9 @@ def searched(
 
 SCHEDULE = "schedule"
 """Name in the artifact of the best plan that does not depend on the observation."""
+
+FINISHED, TIME_LIMIT = "finished", "time limit"
+"""Why a search stopped."""
 
 NO_NUMBERS = 1e9
 """A distance above this is the mean of calls of which one is ``LARGEST`` off."""
@@ -170,6 +173,7 @@ class Schedule(Proposer):
         if found.pruner is not None:
             yield self._of_pruner(plan, found)
         named, self.skipped = named_plans(crowded, task, self._strategy, budget.cells)
+        self.stopped = TIME_LIMIT if clock.cut else self.stopped
         for name, one in named.items():
             made = replace(plan, cells=one.schedule, correction=one.correction)
             proposal = Proposal(name, made, {"steps": one.notes["steps"]}, beside=True)

@@ -106,7 +106,7 @@ class SpacedSchedules:
         key = ",".join(map(str, steps))
         if key not in known:
             # All plans together are judged on fewer calls than one is compared on: that takes no longer.
-            if 2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps)) > self._clock.left():
+            if not self._clock.has(2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps))):
                 return None
             self._whole.expect(coming)
             errors = self._whole.errors(steps)
