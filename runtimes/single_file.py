@@ -43,8 +43,8 @@ def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArra
     bits, parts = (FP32, ()) if record is None else (record.name, record.kept)
     # The file computes in the precision of ``convert``, whatever a plan says.
     if {own.precision.get(part, FP32) for part in parts} | {*own.precision.values()} != {bits} - {FP32}:
-        there = FP32 if record is None else record.told
-        problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact computes {there}"
+        computed = FP32 if record is None else record.told
+        problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact computes {computed}"
         remedy = f"Give {name.partition('@')[0] + '@' + bits!r}, or use ttscompile.load."
         raise IllegalPlanError(f"{problem}. {remedy}")
     view = view_of(artifact, own)
