@@ -18,17 +18,23 @@ from tests.calibration.killed import killed
 from tests.once import Once
 from ttscompile import SamplerTable
 from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration.arguments import CallLimits
+from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.choose import choose
 from ttscompile.calibration.clock import Clock
+from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import SAFER, Proposal, near
-from ttscompile.calibration.proposers.loops import Cost, Loops
+from ttscompile.calibration.proposers import loops
+from ttscompile.calibration.proposers.loops import REACH, Cost, Loops
+from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import DENSE, ORIGINAL, Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.measure.timer import Times
+from ttscompile.pool import Pool
 from ttscompile.report import Given, build
 from ttscompile.report.facts import chosen as chosen_of
 
@@ -139,6 +145,32 @@ def test_a_plan_that_was_placed_by_rule_stays_where_a_search_finds_no_nearer_one
     )
     assert loops._scores["short.2"] is near_one
     assert loops._refusal("short.2", score_of(0.05), {"short.2": near_one}) is None
+
+
+@pytest.mark.slow
+def test_a_small_network_is_searched_with_more_calls_than_its_rules_were_tried_on(
+    directory: Path, recording: Path, timed: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned, of = list[tuple[int, bool]](), Task.of
+
+    def told(executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool, small: bool = False) -> Task:
+        learned.append((calls.count, small))
+        return of(executor, calls, budget, seed, pool, small)
+
+    monkeypatch.setattr(loops, "calls_to_learn_from", lambda *_, corrects: CallLimits(8, 16, 16))
+    monkeypatch.setattr(loops, "MOST_NEEDED", 16)
+    monkeypatch.setattr(loops, "MOST_CALLS", 40)
+    monkeypatch.setattr(Task, "of", told)
+    found = proposed(Loops(request(bound=0.4)), trials_of(directory, [recording]))
+    assert learned == [(16, False), (40, True)] * (len(learned) // 2)
+    assert near(found[next(reversed(found))][1].distance, (0.0, 0.0), 0.4)
+
+
+def test_what_is_far_beyond_reach_is_not_searched() -> None:
+    proposer = Loops(request(bound=0.1))
+    proposer._scores = {"short.1": score_of(REACH * 0.1 + 0.01), "short.2": score_of(REACH * 0.1)}
+    assert proposer._within_reach("short", [1, 2, 3], 0.1) == [2, 3], "3 was refused, or not tried"
+    assert proposer._within_reach("short", [1], 0.1) == [1], "the nearest that there is"
 
 
 def score_of(distance: float) -> Score:

@@ -28,7 +28,7 @@ from ...measure.points import TENTH
 from ...runtimes.open import open_runtime
 from ...runtimes.random_calls import Observation
 from ...runtimes.runtime import Runtime
-from ..arguments import MOST_NEEDED, CallLimits, calls_to_learn_from
+from ..arguments import MOST_CALLS, MOST_NEEDED, CallLimits, calls_to_learn_from
 from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
@@ -41,6 +41,10 @@ from ..trials import Trials
 HOPELESS = 5.0
 """A number of steps is not searched any further if the error of its crowded schedules, as a share of what other noise
 changes, is so many times what a distance may be. A search halves that error, and a distance grows less than it."""
+
+REACH = 4.0
+"""A number of steps is not searched with the many calls of a small network if its crowded schedule is so many times
+further than a distance may be. More calls and better places halve a distance, and each such search takes minutes."""
 
 CLEARLY = 1.2
 """Nothing is left out as slower that takes less than so many times as long: costs are medians of a few calls on a
@@ -132,8 +136,15 @@ class Loops(Proposer):
 
     def _of_loop(self, own: Trials, loop: str, clock: Clock, cost: Cost, wanted: float) -> Proposals:
         """Plans of more and more computed steps of a loop until one is as near as is wanted: crowded, then searched."""
-        task = replace(Task.of(own.executor, own.calls, 0, own.seed, own.pool), clock=clock)
+        calls, few = own.calls, max(own.limits.usual, MOST_NEEDED)
+        small = calls.count > few
+        # Each number of steps is fitted to all: with thousands the time would end before the steps are enough.
+        first = own.executor.select(calls, range(few)) if small else calls
+        task = replace(Task.of(own.executor, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
+        if small:
+            task = replace(Task.of(own.executor, calls, 0, own.seed, own.pool, small), clock=clock)
+            counts = self._within_reach(loop, counts, wanted)
         further = False
         for number, count in enumerate(counts):
             if number and clock.left() <= 0:
@@ -174,6 +185,11 @@ class Loops(Proposer):
                 break
         return hopeful
 
+    def _within_reach(self, loop: str, counts: list[int], wanted: float) -> list[int]:
+        """Those of these numbers of steps that a search with more calls may bring as near as is wanted."""
+        scores = ((count, self._scores.get(_name(loop, count))) for count in counts)
+        return [n for n, score in scores if score is None or score.distance <= REACH * wanted] or counts[-1:]
+
     def _proposal(self, task: Task, loop: str, count: int, found: Found) -> Proposal:
         self._tasks[_name(loop, count)] = task
         name, made = _name(loop, count), Plan(loop, found.schedule, found.correction, repair=True)
@@ -204,8 +220,7 @@ class Loops(Proposer):
         minutes = max(seconds, 1.0) / 60 if np.isfinite(seconds) else 1e3
         limits = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
         usual = own.state.progress.setdefault(f"most of {loop}", limits.usual)
-        # Each number of steps is fitted to all of them: with thousands the time ends before the steps are enough.
-        return replace(own, limits=CallLimits(limits.fewest, usual, max(usual, MOST_NEEDED)))
+        return replace(own, limits=CallLimits(limits.fewest, usual, max(usual, MOST_CALLS)))
 
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""
