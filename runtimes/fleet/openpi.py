@@ -17,7 +17,7 @@ from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.lock import Lock
-from ttscompile.runtimes.server.protocol import DTYPES, Message, Request, read_arrays
+from ttscompile.runtimes.server.protocol import DTYPES, Message, Request, read_arrays, short_enough
 
 from .server import Answered, FleetServer
 
@@ -120,7 +120,7 @@ class OpenPiServer(FleetServer):
                     value = value[None]
                 obs[key] = value[None]
             elif not isinstance(value, str) or value != self._manifest.spec.source.get("task"):
-                obs[TASK if key == "prompt" else key] = value
+                obs[TASK if key == "prompt" else key] = short_enough(value) if isinstance(value, str) else value
         return obs
 
 

@@ -123,9 +123,14 @@ def read_frame(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> 
     task = obs.get(TASK)
     if not isinstance(task, str):
         return dict(read_arrays(obs, specs))
+    return {**read_arrays({key: one for key, one in obs.items() if key != TASK}, specs), TASK: short_enough(task)}
+
+
+def short_enough(task: str) -> str:
+    """The text of a client's task. Raises ProtocolError: it would take long to make it tokens."""
     if len(task) > LONGEST_TASK:
         raise ProtocolError(f"a task has at most {LONGEST_TASK} characters; found {len(task)}.")
-    return {**read_arrays({key: one for key, one in obs.items() if key != TASK}, specs), TASK: task}
+    return task
 
 
 def _array(key: str, value: Any, dtype: str) -> Array:

@@ -142,7 +142,7 @@ def test_a_picture_of_bytes_is_refused_with_advice(planned: Path) -> None:
 
 def test_the_prompt_is_the_task_where_the_policy_has_a_tokenizer(planned: Path) -> None:
     how: dict[str, Any] = {"observations": WORDS, "instruction": Instruction("tokens", "mask", new_line=False)}
-    with checking(planned, **how) as (url, policy), client(url) as connection:
+    with checking(planned, replace(LIMITS, message_bytes=8192), **how) as (url, policy), client(url) as connection:
         connection.recv(10)
         refused = ask(connection, packed({"obs": GOOD, "prompt": "pick"}))
         assert "missing: ['mask', 'tokens']" in refused
@@ -150,6 +150,8 @@ def test_the_prompt_is_the_task_where_the_policy_has_a_tokenizer(planned: Path) 
         policy.tokenizes = True
         assert "actions" in ask(connection, packed({"obs": GOOD, "prompt": "pick"}))
         assert policy.seen[-1]["task"] == "pick"
+        long = ask(connection, packed({"obs": GOOD, "prompt": "a" * 4097}))
+        assert long == "ProtocolError: a task has at most 4096 characters; found 4097."
 
 
 def test_the_prompt_may_be_the_task_that_is_compiled_in_and_no_other(planned: Path) -> None:
