@@ -40,10 +40,9 @@ def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArra
             problem = f"plan {name!r} has {field}, and a single file has the original's weights and begins with noise"
             raise IllegalPlanError(f"{problem}. Give another plan, or use ttscompile.load.")
     record = artifact.manifest.precision
-    bits, parts = (FP32, ()) if record is None else (record.name, record.kept)
+    bits, computed = (FP32, FP32) if record is None else (record.name, record.told)
     # The file computes in the precision of ``convert``, whatever a plan says.
-    if {own.precision.get(part, FP32) for part in parts} | {*own.precision.values()} != {bits} - {FP32}:
-        computed = FP32 if record is None else record.told
+    if own.precision != ({} if record is None else dict.fromkeys(record.kept, bits)):
         problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact computes {computed}"
         remedy = f"Give {name.partition('@')[0] + '@' + bits!r}, or use ttscompile.load."
         raise IllegalPlanError(f"{problem}. {remedy}")

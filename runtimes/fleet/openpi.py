@@ -17,7 +17,7 @@ from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.lock import Lock
-from ttscompile.runtimes.server.protocol import DTYPES, Message, Request, read_arrays, short_enough
+from ttscompile.runtimes.server.protocol import DTYPES, Message, Request, read_arrays, read_task
 
 from .server import Answered, FleetServer
 
@@ -119,8 +119,10 @@ class OpenPiServer(FleetServer):
                 if spec.frames == 1 and value.ndim == len(spec.shape) - 1:
                     value = value[None]
                 obs[key] = value[None]
-            elif not isinstance(value, str) or value != self._manifest.spec.source.get("task"):
-                obs[TASK if key == "prompt" else key] = short_enough(value) if isinstance(value, str) else value
+            elif key not in ("prompt", TASK):
+                obs[key] = value
+            elif (task := read_task(value)) != self._manifest.spec.source.get("task"):
+                obs[TASK] = task
         return obs
 
 

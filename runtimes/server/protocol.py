@@ -119,15 +119,17 @@ def read_arrays(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) ->
 
 
 def read_frame(obs: Mapping[str, Any], specs: Mapping[str, ObservationSpec]) -> dict[str, Array | str]:
-    """The same with the text ``task``, if it has one. Raises ProtocolError, also for a text that is too long."""
-    task = obs.get(TASK)
-    if not isinstance(task, str):
+    """The same with the text ``task``, if it has one. Raises ProtocolError, also for what ``read_task`` refuses."""
+    if TASK in specs or TASK not in obs:
         return dict(read_arrays(obs, specs))
-    return {**read_arrays({key: one for key, one in obs.items() if key != TASK}, specs), TASK: short_enough(task)}
+    arrays = read_arrays({key: one for key, one in obs.items() if key != TASK}, specs)
+    return {**arrays, TASK: read_task(obs[TASK])}
 
 
-def short_enough(task: str) -> str:
-    """The text of a client's task. Raises ProtocolError: it would take long to make it tokens."""
+def read_task(task: Any) -> str:
+    """The text of a client's task. Raises ProtocolError: it is none, or would take long to be made tokens."""
+    if not isinstance(task, str):
+        raise ProtocolError(f"a task is a text; found {type(task).__name__}.")
     if len(task) > LONGEST_TASK:
         raise ProtocolError(f"a task has at most {LONGEST_TASK} characters; found {len(task)}.")
     return task

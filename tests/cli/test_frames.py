@@ -52,8 +52,8 @@ def test_bench_says_that_random_pictures_leave_no_token_to_reuse(once: Once, tmp
     artifact = load_artifact(folder)
     update_plans(folder, {**artifact.plans, "some": replace(artifact.default, tokens=TokenReuse(0.1, 6))}, "full")
     told = " ".join(run("bench", folder, "--plan", "some", "--plan", "full", "--calls", 1).split())
-    assert "Every picture is another one here, so that some had to compute all tokens." in told
-    assert "had to compute all tokens" not in run("bench", folder, "--plan", "full", "--calls", 1)
+    assert "computes all tokens of its frames, those of some too. Of recordings (-t)" in told
+    assert "all tokens of its frames" not in run("bench", folder, "--plan", "full", "--calls", 1)
 
 
 def test_the_page_has_a_row_and_a_column_for_them(seeing: Path, tmp_path: Path) -> None:

@@ -130,6 +130,10 @@ def test_a_part_that_was_left_out_is_in_fp32_and_named(tmp_path: Path) -> None:
     assert (record.kept, record.asked) == (("condition",), ("blocks",))
     assert set(record.models) == {"condition"}
     assert "blocks stays fp32, as was asked" in said
+    artifact = load_artifact(tmp_path / "compiled")
+    assert artifact.plan("dense@int8").precision == artifact.plan("full").precision == {"condition": "int8"}
+    assert inputs_of(tmp_path / "compiled", "dense@int8")["plan"].shape == (1, seeing.STEPS, 3)
+    assert ttscompile.load(tmp_path / "compiled", plan="dense@int8").info.default_plan == "dense@int8"
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 
+from tests.word_tokenizer import write_tokenizer
 from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import load_trajectories
@@ -34,15 +35,7 @@ def _read_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def tokenizer(tmp_path: Path) -> Path:
-    folder = tmp_path / "language"
-    folder.mkdir()
-    model = {"type": "WordLevel", "vocab": WORDS, "unk_token": "?"}
-    split = {"type": "Split", "pattern": {"String": " "}, "behavior": "Removed", "invert": False}
-    lines = {"type": "Split", "pattern": {"String": "\n"}, "behavior": "Isolated", "invert": False}
-    both = {"type": "Sequence", "pretokenizers": [split, lines]}
-    written = {"version": "1.0", "added_tokens": [], "pre_tokenizer": both, "model": model}
-    (folder / "tokenizer.json").write_text(json.dumps(written))
-    return folder
+    return write_tokenizer(tmp_path / "language", WORDS)
 
 
 def data_set(path: Path, version: int) -> Path:

@@ -163,6 +163,15 @@ def test_what_does_not_fit_is_refused(file: Path, content: dict[str, Any], messa
     assert str(file) in str(error.value)
 
 
+def test_a_camera_that_was_not_recorded_may_be_left_out(file: Path) -> None:
+    saved(file, **arrays())
+    camera = ObservationSpec((1, 3, 8, 8), bounds=(0.0, 1.0))
+    for spec, advised in ((camera, True), (ObservationSpec((1, 3)), False)):
+        with pytest.raises(TrajectoryError, match="has no array 'wrist' for the observation 'wrist'") as error:
+            load(file, {"wrist": spec})
+        assert ("--without-camera wrist" in str(error.value)) == advised
+
+
 def test_pickled_objects_are_never_loaded(file: Path, tmp_path: Path) -> None:
     target = tmp_path / "touched"
     content = {**arrays(), "obs": np.array([Runs(os.mkdir, str(target))] * 5, dtype=object)}

@@ -10,7 +10,6 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from ..core.correction import condition_flops, groups_of
@@ -181,22 +180,3 @@ def require_held(artifact: Artifact, plan: Plan) -> None:
             raise ArtifactError(
                 f"{artifact.path}: a plan wants {part!r} in {precision!r}; the artifact has {known}. {remedy}."
             )
-
-
-def require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None:
-    """Raise ArtifactError if an artifact was made from another checkpoint; says what differs."""
-    specs = artifact.manifest.spec, other.manifest.spec
-    ours, theirs = (
-        (s.whole_horizon.sample, {k: o.shape for k, o in s.observations.items()}, s.chunk.start, s.chunk.stop)
-        for s in specs
-    )
-    # Masks and position tables are shorter where fewer steps are predicted; the weights proper are not.
-    narrower = specs[0].sample != specs[1].sample
-    pairs = [(value, other.weights[key]) for key, value in artifact.weights.items() if key in other.weights]
-    same = [np.array_equal(*pair) for pair in pairs if not narrower or pair[0].shape == pair[1].shape]
-    if ours != theirs or not (same and all(same)):
-        what = f"{theirs} instead of {ours}" if ours != theirs else "other weights"
-        raise ArtifactError(
-            f"{name}: expected an artifact of the same checkpoint; found {what}. Actions of different policies cannot"
-            " be held against each other: convert the same checkpoint with another --sampler, --steps or --precision."
-        )

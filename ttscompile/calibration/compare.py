@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from ..artifact.load import Artifact, load_artifact
-from ..artifact.view import require_same_policy
 from ..core.coercion import integer
 from ..core.plan import DENSE, Plan
 from ..errors import CalibrationError
@@ -75,8 +74,9 @@ def compare(
         joining: finds further plans, given the trials of the artifact, before anything is judged.
 
     Raises:
+        CalibrationError: an artifact of another policy.
         TrajectoryError: the recordings do not fit the policy.
-        ArtifactError: an artifact cannot be opened, or is of another policy.
+        ArtifactError: an artifact cannot be opened.
         IllegalPlanError: the artifact has no plan of this name.
     """
     calls, threads = integer(calls, "calls", CalibrationError, 1), integer(threads, "threads", CalibrationError, 1)
@@ -90,7 +90,7 @@ def compare(
         if name in compared:
             raise CalibrationError(f"two artifacts are called {name!r}: points could not be told apart. Rename one.")
         compared[name] = load_artifact(other)
-        require_same_policy(artifact, compared[name], name)
+        _require_same_policy(artifact, compared[name], name)
     episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
     on = None if device is None else torch.device(device)
     state = StateFile(None, {})
@@ -162,6 +162,25 @@ def _apart(trials: Trials, score: Score) -> dict[str, Any]:
         "errors": () if score.error is None else tuple(errors.tolist()),
         "furthest": tuple(furthest),
     }
+
+
+def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None:
+    """Refuse an artifact that was made from another checkpoint; says what differs."""
+    specs = artifact.manifest.spec, other.manifest.spec
+    ours, theirs = (
+        (s.whole_horizon.sample, {k: o.shape for k, o in s.observations.items()}, s.chunk.start, s.chunk.stop)
+        for s in specs
+    )
+    # Masks and position tables are shorter where fewer steps are predicted; the weights proper are not.
+    narrower = specs[0].sample != specs[1].sample
+    pairs = [(value, other.weights[key]) for key, value in artifact.weights.items() if key in other.weights]
+    same = [np.array_equal(*pair) for pair in pairs if not narrower or pair[0].shape == pair[1].shape]
+    if ours != theirs or not (same and all(same)):
+        what = f"{theirs} instead of {ours}" if ours != theirs else "other weights"
+        raise CalibrationError(
+            f"{name}: expected an artifact of the same checkpoint; found {what}. Actions of different policies cannot"
+            " be held against each other: convert the same checkpoint with another --sampler, --steps or --precision."
+        )
 
 
 def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) -> list[str]:

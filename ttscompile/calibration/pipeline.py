@@ -296,8 +296,8 @@ def calibrate(
         )
         if result.stopped == TIME_LIMIT:
             bar.warn(
-                f"the search was cut short after {result.intervals} intervals, since {max_minutes:g} minutes were over:"
-                " with more, plans may be nearer to the original."
+                f"a search was cut short, since {max_minutes:g} minutes were over: with more, plans may be nearer to"
+                " the original."
             )
         if result.doubtful:
             bar.warn(

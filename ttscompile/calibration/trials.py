@@ -211,7 +211,7 @@ class Trials:
         """
         key = f"{name} drawn"
         if key not in self.state.progress:
-            found = QUICKLY * self.until * self.clock.limit / _seconds(self.executor.view)
+            found = QUICKLY * self.until * self.clock.limit / dense_seconds(self.executor.view)
             known = name in self.state.get("targets")
             usual, most = self.limits.usual, self.limits.most
             self.state.progress[key] = usual if known else int(np.clip(found, usual, most))
@@ -274,7 +274,7 @@ class Trials:
         key, seconds = f"{part} draws", self.clock.limit
         if key not in self.state.progress:
             few = bool(self.state.get(f"{part} answers")) or not np.isfinite(seconds)
-            found = self.draws if few else MORE_DRAWS * seconds / (calls * _seconds(view_of(self.artifact, DENSE)))
+            found = self.draws if few else MORE_DRAWS * seconds / (calls * dense_seconds(view_of(self.artifact, DENSE)))
             self.state.progress[key] = int(np.clip(found, self.draws, max(self.draws, MOST_DRAWS)))
         return int(self.state.progress[key])
 
@@ -323,7 +323,7 @@ class Trials:
         return known.reshape(len(calls), draws, *spec.sample)
 
 
-def _seconds(view: View) -> float:
+def dense_seconds(view: View) -> float:
     """About what a dense call takes, if its arithmetic is all."""
     manifest = view.manifest
     return manifest.flops.call(dense_plan(manifest.steps, len(manifest.blocks)), pruned=False) / RATE

@@ -11,7 +11,6 @@ from rich.console import Console
 from ttscompile.artifact.ceiling import BOUND, FARTHEST
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.artifact.view import require_same_policy
 from ttscompile.artifact.write import choose_default
 from ttscompile.calibration.proposer import near
 from ttscompile.cli import options
@@ -208,8 +207,8 @@ def _print_times(
     say(output, timing_remarks(measured))
     own = dict.fromkeys(one.plan for one in measured if one.plan.partition("@")[0] in artifact.plans)
     if reusing := [name for name in own if artifact.plan(name).tokens is not None]:
-        every = f"Every picture is another one here, so that {', '.join(reusing)} had to compute all tokens"
-        say(output, f"{every}. On recorded pictures, with -t, only those that changed are computed.")
+        told = f"Every call here computes all tokens of its frames, those of {', '.join(reusing)} too"
+        say(output, f"{told}. Of recordings (-t) it computes those that changed.")
     if len(by_threads) > 1:
         best = fewest_threads(by_threads)
         say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")
@@ -227,7 +226,6 @@ def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
         if (name := other.resolve().name) in found:
             raise click.UsageError(f"two artifacts are called {name!r}: they could not be told apart. Rename one.")
         found[name] = load_artifact(other)
-        require_same_policy(found[THIS], found[name], name)
     return found
 
 

@@ -67,7 +67,7 @@ def inspect(
     With -o FILE.html it also times calls of every plan, and writes a page. The exit status is 1 if a check of --verify
     failed; the page is written all the same.
     """
-    page = output is not None and output.suffix in PAGES
+    page = output is not None and output.suffix.lower() in PAGES
     if output is not None and (verifies if not page else name is not None):
         option, other = ("--plan", "picture (.png)") if page else ("--verify", "page (.html)")
         raise click.UsageError(f"{option} is for a {other}; found --output {output}.")

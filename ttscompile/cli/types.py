@@ -144,7 +144,7 @@ class PageOrPictureName(PictureName):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """See ``click.ParamType``."""
         path = PathName.convert(self, value, param, ctx)
-        if path.suffix in PAGES:
+        if path.suffix.lower() in PAGES:
             return path
         if path.suffix.lower() not in FORMATS:
             self.fail(f"expected a page (.html) or a picture ({', '.join(FORMATS)}); found {str(path)!r}.", param, ctx)

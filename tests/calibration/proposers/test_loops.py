@@ -161,9 +161,9 @@ def test_a_small_network_is_searched_with_more_calls_than_its_rules_were_tried_o
     monkeypatch.setattr(loops, "MOST_NEEDED", 16)
     monkeypatch.setattr(loops, "MOST_CALLS", 40)
     monkeypatch.setattr(Task, "of", told)
-    found = proposed(Loops(request(bound=0.4)), trials_of(directory, [recording]))
+    found = proposed(Loops(request(bound=3.0)), trials_of(directory, [recording]))
     assert learned == [(16, False), (40, True)] * (len(learned) // 2)
-    assert near(found[next(reversed(found))][1].distance, (0.0, 0.0), 0.4)
+    assert near(found[next(reversed(found))][1].distance, (0.0, 0.0), 3.0)
 
 
 def test_what_is_far_beyond_reach_is_not_searched() -> None:

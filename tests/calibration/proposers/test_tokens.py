@@ -34,9 +34,6 @@ pytestmark = pytest.mark.slow
 
 SIDE = cameras.SIDE
 
-MINUTES = 0.03
-"""Of a calibration: with more, plans are judged by more draws of noise."""
-
 
 @pytest.fixture
 def folder(once: Once, tmp_path: Path) -> Path:
@@ -89,7 +86,7 @@ def test_tokens_that_no_chosen_plan_reuses_are_said_to_be_of_no_use(
     for slower, ends in ((20.0, "are computed, and no chosen plan is faster by it"), (5.0, "are computed")):
         own = shutil.copytree(folder, tmp_path / f"{slower}")
         files = recorded(tmp_path / "calls.npz")
-        result = calibrate(own, files, learn=("loops", "tokens"), progress=False, max_minutes=MINUTES, max_distance=0.9)
+        result = calibrate(own, files, learn=("loops", "tokens"), progress=False, max_distance=0.9)
         assert result.told["tokens"].endswith(ends)
         assert any(plan.tokens for plan in load_artifact(own).plans.values()) is (slower == 5.0)
 
@@ -116,7 +113,7 @@ def test_a_plan_that_is_given_what_another_learned_is_judged_anew(folder: Path, 
     fields = {"distance": 9.0, "interval": [9.0, 9.0], "sparsity": 0.0, "flops_sparsity": 0.0}
     record = {"plans": {"other": fields}}
     update_plans(folder, {**artifact.plans, "other": replace(artifact.default, repair=True)}, FULL, record)
-    result = calibrate(folder, files, learn=("tokens",), max_minutes=MINUTES, progress=False)
+    result = calibrate(folder, files, learn=("tokens",), progress=False)
     after = load_artifact(folder)
     assert after.plans["other"].tokens is not None
     found = (after.manifest.calibration or {})["plans"]["other"]
@@ -134,7 +131,7 @@ def test_what_does_not_hold_on_other_episodes_is_told(
 
     monkeypatch.setattr(Kept, "_no_better", no_better)
     files = recorded(tmp_path / "calls.npz")
-    result = calibrate(folder, files, learn=("loops", "tokens"), max_minutes=MINUTES, max_distance=0.9)
+    result = calibrate(folder, files, learn=("loops", "tokens"), max_distance=0.9)
     assert result.told["tokens"] == "" and result.skipped["tokens"] == "is no better."
     assert "'tokens' is left out: it is no better." in " ".join(capsys.readouterr().err.split())
     assert not any(plan.tokens for plan in load_artifact(folder).plans.values())
@@ -142,7 +139,7 @@ def test_what_does_not_hold_on_other_episodes_is_told(
 
 def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
     files = recorded(tmp_path / "calls.npz")
-    result = calibrate(folder, files, learn=("tokens",), max_minutes=MINUTES, progress=False)
+    result = calibrate(folder, files, learn=("tokens",), progress=False)
     artifact = load_artifact(folder)
     plan = artifact.default
     assert result.default_plan == artifact.manifest.default_plan == FULL
@@ -157,7 +154,7 @@ def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
     before = (folder / "manifest.json").read_bytes()
     files = recorded(tmp_path / "calls.npz", shaking=0.5)
     with pytest.raises(CalibrationFailedError, match="does not pay"):
-        calibrate(folder, files, learn=("tokens",), max_minutes=MINUTES, progress=False)
+        calibrate(folder, files, learn=("tokens",), progress=False)
     assert (folder / "manifest.json").read_bytes() == before
 
 

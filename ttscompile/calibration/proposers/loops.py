@@ -36,7 +36,7 @@ from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..schedule import open_search, searched
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
-from ..trials import Trials
+from ..trials import QUICKLY, Trials, dense_seconds
 
 HOPELESS = 5.0
 """A number of steps is not searched any further if the error of its crowded schedules, as a share of what other noise
@@ -142,7 +142,7 @@ class Loops(Proposer):
         first = own.executor.select(calls, range(few)) if small else calls
         task = replace(Task.of(own.executor, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
-        if small:
+        if small and clock.left() > 0:
             task = replace(Task.of(own.executor, calls, 0, own.seed, own.pool, small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         further = False
@@ -220,7 +220,9 @@ class Loops(Proposer):
         minutes = max(seconds, 1.0) / 60 if np.isfinite(seconds) else 1e3
         limits = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
         usual = own.state.progress.setdefault(f"most of {loop}", limits.usual)
-        return replace(own, limits=CallLimits(limits.fewest, usual, max(usual, MOST_CALLS)))
+        # As many as the share is enough for by the network's FLOPs, and not by the clock, which ends them all the same.
+        answered = min(QUICKLY * ANSWERING * seconds / dense_seconds(own.executor.view), MOST_CALLS)
+        return replace(own, limits=CallLimits(limits.fewest, usual, max(usual, MOST_NEEDED, int(answered))))
 
     def _too_slow(self, least: float, fastest: float) -> str | None:
         """Why calls that take at least so many milliseconds cannot be what is looked for."""

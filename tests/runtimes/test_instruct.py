@@ -1,0 +1,78 @@
+"""The text of a task in place of its tokens, in what a robot gives."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
+from tests.word_tokenizer import write_tokenizer
+from ttscompile.core.spec import Instruction, ObservationSpec
+from ttscompile.errors import ObservationError
+from ttscompile.runtimes.executor import AsyncExecutor
+from ttscompile.runtimes.instruct import Instruct
+
+WORDS = {"?": 0, "push": 1, "left": 2, "right": 3}
+STATE = np.zeros((1, 5), np.float32)
+
+
+@pytest.fixture
+def instruct(tmp_path: Path) -> Instruct:
+    language = {"tokens": ObservationSpec((3,), dtype="int64"), "mask": ObservationSpec((3,), dtype="bool")}
+    told = Instruction("tokens", "mask", new_line=False)
+    spec: Any = SimpleNamespace(instruction=told, observations={"state": ObservationSpec((1, 5)), **language})
+    return Instruct(spec, write_tokenizer(tmp_path / "language", WORDS))
+
+
+def test_every_stream_has_the_tokens_of_its_text(instruct: Instruct) -> None:
+    states = np.zeros((2, 1, 5), np.float32)
+    for task, rows in (("push left", [[1, 2, 0]] * 2), (["push", "push right"], [[1, 0, 0], [1, 3, 0]])):
+        made = instruct({"state": states, "task": task})
+        assert made.keys() == {"state", "tokens", "mask"}
+        assert made["tokens"].tolist() == rows
+        np.testing.assert_array_equal(made["mask"], made["tokens"] > 0)
+    with pytest.raises(ObservationError, match="the task is 3; expected a text, or one for each stream"):
+        instruct({"state": states, "task": 3})
+
+
+def test_a_frame_has_no_axis_of_streams(instruct: Instruct) -> None:
+    made = instruct.of_frame({"state": STATE, "task": "push right"})
+    assert made["tokens"].tolist() == [1, 3, 0] and made["mask"].tolist() == [True, True, False]
+    assert made["state"] is STATE
+    with pytest.raises(ObservationError, match="the task of a frame is a list; expected a text"):
+        instruct.of_frame({"state": STATE, "task": ["push"]})
+
+
+def test_what_has_no_text_or_has_tokens_is_left_as_it_is(instruct: Instruct) -> None:
+    for frame in ({"state": STATE}, {"task": "push", "tokens": np.ones(3, np.int64)}):
+        assert instruct.of_frame(frame) is frame
+        assert instruct(frame) is frame
+
+
+def test_threads_get_the_tokens_of_their_own_text(instruct: Instruct) -> None:
+    texts = ["push left", "push right", "left", "right"] * 500
+    with ThreadPoolExecutor(4) as pool:
+        made = list(pool.map(lambda text: instruct.of_frame({"task": text})["tokens"].tolist(), texts))
+    assert made == [[*map(WORDS.__getitem__, text.split()), 0, 0][:3] for text in texts]
+
+
+class Told(ScriptedPolicy):
+    """A policy that makes numbers of words."""
+
+    def with_tokens(self, frame: Any) -> Any:
+        return {"obs": np.full(2, len(frame["task"]), np.float64)} if "task" in frame else frame
+
+
+def test_an_executor_has_its_policy_make_tokens() -> None:
+    clock = FakeClock()
+    with AsyncExecutor(Told(clock), 10, latencies={"dense": 0.01}) as executor:
+        executor.observe({"task": "push"})
+        executor.observe({"obs": np.zeros(2)})
+        assert executor.statistics().frames == 2
+        with pytest.raises(ObservationError, match="unexpected: .'words'"):
+            executor.observe({"words": "push"})
