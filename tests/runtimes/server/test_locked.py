@@ -25,6 +25,7 @@ from click.testing import CliRunner
 
 from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.cli import main
+from ttscompile.cli.types import PathName
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor
 from ttscompile.runtimes.server.executor_server import ExecutorServer
@@ -364,8 +365,9 @@ def test_the_command_refuses_before_anything_is_loaded(
 
 def test_no_option_takes_a_token() -> None:
     """The list of processes shows command lines to every user of the machine."""
-    names = [name for option in main.commands["serve"].params for name in option.opts if "token" in name]
-    assert names == ["--token-file"]
+    named = {name: option for option in main.commands["serve"].params for name in option.opts if "token" in name}
+    assert sorted(named) == ["--token-file", "--tokenizer"]
+    assert all(isinstance(option.type, PathName) for option in named.values())
 
 
 @pytest.mark.slow
