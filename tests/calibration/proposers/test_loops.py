@@ -232,7 +232,7 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("most", [4, pytest.param(20, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("most", [2, pytest.param(20, marks=pytest.mark.soak)])
 def test_killed_at_random_moments_and_resumed_it_ends_the_same(
     directory: Path, recording: Path, timed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
