@@ -112,7 +112,8 @@ class Trials:
         limits: of the number of calls to learn from.
         observations: that the original answers, at most, of either part.
         draws: of noise for each of them, at least.
-        until: share of the clock's limit after which no more calls to learn from are answered than there have to be.
+        begun: seconds on the clock from which on calls to learn from are answered.
+        until: share of the clock's limit after which no more of them are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
         device: where the network computes; None for the CPU.
@@ -136,6 +137,7 @@ class Trials:
     observations: int = OBSERVATIONS
     name: str = DENSE
     draws: int = DRAWS
+    begun: float = 0.0
     until: float = SHARE
     _calls: dict[int, Calls] = field(default_factory=dict)
     _loops: dict[str, tuple[Plan, Executor, dict[int, Calls]]] = field(default_factory=dict)
@@ -211,7 +213,7 @@ class Trials:
         """
         key = f"{name} drawn"
         if key not in self.state.progress:
-            found = QUICKLY * self.until * self.clock.limit / dense_seconds(self.executor.view)
+            found = QUICKLY * (self.until * self.clock.limit - self.begun) / _seconds(self.executor.view)
             known = name in self.state.get("targets")
             usual, most = self.limits.usual, self.limits.most
             self.state.progress[key] = usual if known else int(np.clip(found, usual, most))
@@ -274,7 +276,7 @@ class Trials:
         key, seconds = f"{part} draws", self.clock.limit
         if key not in self.state.progress:
             few = bool(self.state.get(f"{part} answers")) or not np.isfinite(seconds)
-            found = self.draws if few else MORE_DRAWS * seconds / (calls * dense_seconds(view_of(self.artifact, DENSE)))
+            found = self.draws if few else MORE_DRAWS * seconds / (calls * _seconds(view_of(self.artifact, DENSE)))
             self.state.progress[key] = int(np.clip(found, self.draws, max(self.draws, MOST_DRAWS)))
         return int(self.state.progress[key])
 
@@ -323,7 +325,7 @@ class Trials:
         return known.reshape(len(calls), draws, *spec.sample)
 
 
-def dense_seconds(view: View) -> float:
+def _seconds(view: View) -> float:
     """About what a dense call takes, if its arithmetic is all."""
     manifest = view.manifest
     return manifest.flops.call(dense_plan(manifest.steps, len(manifest.blocks)), pruned=False) / RATE
