@@ -185,7 +185,7 @@ def bench(
         print_json(document)
     else:
         output = results()
-        _print_times(measured, artifact, by_threads, output)
+        _print_times(measured, default, by_threads, output)
         print_verdicts(verdicts, control_hz, output)
         if compared is not None:
             print_comparison(compared, output)
@@ -201,14 +201,10 @@ def bench(
 
 
 def _print_times(
-    measured: Sequence[Measurement], artifact: Artifact, by_threads: Mapping[int, float], output: Console
+    measured: Sequence[Measurement], default: str, by_threads: Mapping[int, float], output: Console
 ) -> None:
-    print_facts(output, timing_table(measured, artifact.manifest.default_plan, ("prologue", "frames", "pruner")))
+    print_facts(output, timing_table(measured, default, ("prologue", "frames", "pruner")))
     say(output, timing_remarks(measured))
-    own = dict.fromkeys(one.plan for one in measured if one.plan.partition("@")[0] in artifact.plans)
-    if reusing := [name for name in own if artifact.plan(name).tokens is not None]:
-        told = f"Every call here computes all tokens of its frames, those of {', '.join(reusing)} too"
-        say(output, f"{told}. Of recordings (-t) it computes those that changed.")
     if len(by_threads) > 1:
         best = fewest_threads(by_threads)
         say(output, f"Load it with threads={best}: more of these save less than {WORTH:.0%} of a call.")

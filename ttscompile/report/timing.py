@@ -168,7 +168,10 @@ def timing_remarks(measured: Sequence[Measurement]) -> str:
     if _taken(measured, "pruner"):
         told.append("The pruner runs beside step 0: only the wait for it lengthens a call.")
     if _taken(measured, "frames"):
-        told.append("Every call has frames of its own; those that are known, or prepared before, would cost nothing.")
+        told.append(
+            "Every call has frames of its own, all tokens of which are computed; frames that are known, or prepared"
+            " before, and tokens that a plan reuses would cost nothing."
+        )
     return " ".join(told)
 
 
