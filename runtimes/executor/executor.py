@@ -94,7 +94,7 @@ class AsyncExecutor:
 
         Args:
             obs: by key, without the axes of batch and time: ``{"obs": float32 [Do]}``. Copied. The text ``task`` may be
-                among them if the policy was loaded with ``tokenizer=``; where it is another than before it is read.
+                among them if the policy was loaded with ``tokenizer=``; its tokens are made when it changes.
             t: when it was taken, on the executor's clock; None for now. Frames may come late and out of order.
 
         Raises:

@@ -144,7 +144,7 @@ class Artifact:
             record, plan = self.manifest.precision, self.plans[own].exact
             held = names.parts_of(self.manifest.pieces)
             if precision in (INT8, INT4):  # without any, what is missing is told when it is opened
-                held = (names.BLOCKS,) if record is None else tuple(part for part in held if part in record.kept)
+                held = (names.BLOCKS,) if record is None else record.kept
             plan = plan if precision == FP32 else replace(plan, precision=dict.fromkeys(parts or held, precision))
             first = self.plans[own].otherwise
             otherwise = None if first is None else self.plan(f"{self.name_of(first)}@{rest}")

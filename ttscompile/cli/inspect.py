@@ -67,30 +67,31 @@ def inspect(
     With -o FILE.html it also times calls of every plan, and writes a page. The exit status is 1 if a check of --verify
     failed; the page is written all the same.
     """
-    page = output is not None and output.suffix.lower() in PAGES
-    if output is not None and (verifies if not page else name is not None):
-        option, other = ("--plan", "picture (.png)") if page else ("--verify", "page (.html)")
-        raise click.UsageError(f"{option} is for a {other}; found --output {output}.")
-    if output is not None and page:
-        require_page(output)
+    page, picture = (output, None) if output is not None and output.suffix.lower() in PAGES else (None, output)
+    if page is not None and name is not None:
+        raise click.UsageError(f"--plan is for a picture (.png); found --output {page}.")
+    if picture is not None and verifies:
+        raise click.UsageError(f"--verify is for a page (.html); found --output {picture}.")
+    if page is not None:
+        require_page(page)
     console, artifact = progress(), load_artifact(directory)
     spec, episode = artifact.manifest.spec, None
     if trajectories:
         executed = spec.chunk.stop - spec.chunk.start
         episode = load_trajectories(trajectories, spec.observations, executed, sources, spec.instruction)[0]
     passed, section = True, NOT_RUN
-    if output is not None and page:
+    if page is not None:
         with only_results_on_stdout(), console.status("loading") as status:
             if verifies:
                 passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
             policy = open_policy(artifact, seed=0)
-            told = write_page(output, artifact, policy, Given(episode, section), status.update)
+            told = write_page(page, artifact, policy, Given(episode, section), status.update)
         say(console, told)
-    elif output is not None:
+    if picture is not None:
         name = name or _drawn_by_default(artifact, episode)
         kinds = [block.kind for block in artifact.manifest.blocks]
-        write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), output)
-        say(console, f"wrote {output}")
+        write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
+        say(console, f"wrote {picture}")
     print_artifact(artifact, as_json)
     if not passed:
         say(console, "failed: the artifact does not hold what it promises; the page says where.")

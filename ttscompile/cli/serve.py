@@ -196,8 +196,8 @@ SECTIONS = (
 @click.option(
     "--tokenizer",
     type=PATH,
-    help="Read instructions, the text task of an observation and the prompt of openpi's clients, with this"
-    " tokenizer.json, or that of this folder.",
+    help="Take instructions as text, the task of an observation or the prompt of openpi's clients, and read them with"
+    " this tokenizer.json, or that of this folder.",
 )
 @shared.runtime_options
 @click.option(

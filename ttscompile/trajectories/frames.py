@@ -98,9 +98,7 @@ def _part(path: Path, frames: Frames, key: str, part: str, image: bool) -> Array
         words = "language" in key and TASK in frames.names
         remedy = " Of its instructions --observation task=DIR makes tokens, with DIR/tokenizer.json." if words else ""
         if image:
-            remedy = (
-                f" A vision-language-action model can do without a camera: --without-camera {key} when it is converted."
-            )
+            remedy = f" A vision-language-action model can do without it: convert --without-camera {key}."
         raise TrajectoryError(
             f"{path}: has no array {name!r} for the observation {key!r}; it has {few(frames.names)}.{remedy} Say what"
             f" the observation is made of, in order: --observation {key}=NAME,NAME:N (NAME:N are its first N), or"
