@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/installed.stamp
 
 .DELETE_ON_ERROR:
-# pip compiles 15,000 files on one core; Python compiles the fifth that is imported, and keeps it unless this is set.
+# pip does not compile what it installs (--no-compile): Python compiles what is imported, and keeps it unless this is set.
 unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo quick test lint types pytest together alone test-avx2 test-arm test-matrix benchmark docs release containers test-lerobot test-openpi clean
 

@@ -106,8 +106,8 @@ def test_a_robot_gives_the_instruction_as_text(compiled: Path, saved: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_robot_in_another_process_gives_the_instruction_as_text(of_one_frame: Path, saved: Path) -> None:
-    """In a frame of the executor's server: the actions are those of the tokens, and other words have others."""
+def test_a_client_of_the_executors_server_gives_the_instruction_as_text(of_one_frame: Path, saved: Path) -> None:
+    """The actions are those of the tokens, and other words have others."""
     policy = ttscompile.load(of_one_frame, tokenizer=saved / "t5-base")
     image, texts = shown("one", "all")["image_primary"][0, 0], ("pick up the red cup", "place it on the table")
     tokens = policy.with_tokens({"image_primary": image, "task": texts[0]})

@@ -152,6 +152,8 @@ def test_the_prompt_is_the_task_where_the_policy_has_a_tokenizer(planned: Path) 
         assert policy.seen[-1]["task"] == "pick"
         long = ask(connection, packed({"obs": GOOD, "prompt": "a" * 4097}))
         assert long == "ProtocolError: a task has at most 4096 characters; found 4097."
+        several = ask(connection, packed({"obs": GOOD, "prompt": ["a" * 2000, "b"]}))
+        assert several == "ProtocolError: a task is a text; found list."
 
 
 def test_the_prompt_may_be_the_task_that_is_compiled_in_and_no_other(planned: Path) -> None:
