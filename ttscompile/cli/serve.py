@@ -196,7 +196,7 @@ SECTIONS = (
 @click.option(
     "--tokenizer",
     type=PATH,
-    help="Take instructions as text, the task of an observation or the prompt of openpi's clients, and read them with"
+    help="Let clients send instructions as text: the task of an observation, or the prompt of openpi's. It is read with"
     " this tokenizer.json, or that of this folder.",
 )
 @shared.runtime_options
