@@ -30,6 +30,7 @@ class LanguageConfig:
         epsilon: of the norms.
         gemma: whether it is Gemma's: norms multiply by ``1 + weight``, and the activation is GELU in place of SiLU.
         biased: whether queries, keys and values have a bias, as in Qwen2.
+        whole: whether all of a layer has one, as in the vision transformer of Qwen2.5-VL.
         normed: whether each head's queries and keys are normalised, as in Qwen3.
     """
 
@@ -42,6 +43,7 @@ class LanguageConfig:
     epsilon: float = 1e-6
     gemma: bool = False
     biased: bool = False
+    whole: bool = False
     normed: bool = False
 
 
@@ -76,7 +78,7 @@ class Attention(nn.Module):
         self.q_proj = nn.Linear(config.width, queries, bias=config.biased)
         self.k_proj = nn.Linear(source or config.width, keys, bias=config.biased)
         self.v_proj = nn.Linear(source or config.width, keys, bias=config.biased)
-        self.o_proj = nn.Linear(queries, config.width, bias=False)
+        self.o_proj = nn.Linear(queries, config.width, bias=config.whole)
         self.q_norm, self.k_norm = (Norm(config, config.channels) if config.normed else nn.Identity() for _ in range(2))
 
     def split(self, x: Tensor) -> Tensor:
@@ -98,9 +100,9 @@ class FeedForward(nn.Module):
 
     def __init__(self, config: LanguageConfig) -> None:
         super().__init__()
-        self.gate_proj = nn.Linear(config.width, config.hidden, bias=False)
-        self.up_proj = nn.Linear(config.width, config.hidden, bias=False)
-        self.down_proj = nn.Linear(config.hidden, config.width, bias=False)
+        self.gate_proj = nn.Linear(config.width, config.hidden, bias=config.whole)
+        self.up_proj = nn.Linear(config.width, config.hidden, bias=config.whole)
+        self.down_proj = nn.Linear(config.hidden, config.width, bias=config.whole)
         self.gemma = config.gemma
 
     def forward(self, x: Tensor) -> Tensor:
@@ -118,14 +120,23 @@ class Layer(nn.Module):
         self.input_layernorm, self.post_attention_layernorm = Norm(config), Norm(config)
         self.self_attn, self.mlp = Attention(config), FeedForward(config)
 
-    def forward(self, x: Tensor, turns: Rotation, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``."""
+    def forward(
+        self, x: Tensor, turns: Rotation, mask: Tensor, before: Seen | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``.
+
+        Args:
+            before: those of tokens before these, which these see, too.
+        """
         attention = self.self_attn
         normed = self.input_layernorm(x)
         keys = rotate(attention.k_norm(attention.split(attention.k_proj(normed))), turns)
         values = attention.split(attention.v_proj(normed))
         queries = rotate(attention.q_norm(attention.split(attention.q_proj(normed))), turns)
         seen = Seen(attention.for_all_heads(keys), attention.for_all_heads(values))
+        if before is not None:  # written out by themselves, so that it is done once a call
+            earlier = map(attention.for_all_heads, before)
+            seen = Seen(*(torch.cat(pair, 2) for pair in zip(earlier, seen, strict=True)))
         x = x + attention.attend(queries, seen, mask)
         return x + self.mlp(self.post_attention_layernorm(x)), keys, values
 

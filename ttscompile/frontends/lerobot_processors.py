@@ -36,7 +36,12 @@ IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
 GROOT = ("groot_n1_7_pack_inputs_v1", "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1")
 PREPARE, CLIP = "vla_jepa_image_prep", "vla_jepa_clip_actions"
 SNAP, BINARIZE = "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
-OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN), "vla_jepa": (PREPARE,)}
+CONVERSATION, READ = "eo1_conversation_template_processor", "eo1_qwen_processor"
+OWN_STEPS: Mapping[str, tuple[str, ...]] = {
+    "xvla": ("xvla_image_to_float", IMAGENET, DOMAIN),
+    "vla_jepa": (PREPARE,),
+    "eo1": (CONVERSATION, READ),
+}
 """By type of policy, steps before it that no other has, in the order that lerobot saves."""
 _OWN_LATER: Mapping[str, tuple[str, ...]] = {"vla_jepa": (CLIP, SNAP, _UNNORMALIZE, BINARIZE)}
 """By type of policy, steps after it of which no other has all, in the only order that is known."""

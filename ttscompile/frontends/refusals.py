@@ -98,14 +98,14 @@ DIRECTORIES = (
 ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
-LEROBOT_TYPES = "act, diffusion, evo1, groot, multi_task_dit, smolvla, pi0, pi05, vla_jepa or xvla"
+LEROBOT_TYPES = "act, diffusion, eo1, evo1, groot, multi_task_dit, smolvla, pi0, pi05, vla_jepa or xvla"
 
 LEROBOT = (
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
     Refusal(
-        r"^(wall_x|eo1)$",
+        r"^wall_x$",
         "a policy that denoises inside its language model, Qwen2.5-VL, which is not rebuilt here",
         f"{_BUILD}: one step of the model over a cached prefix is the module.",
     ),

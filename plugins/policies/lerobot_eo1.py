@@ -1,0 +1,126 @@
+"""LeRobot's ``eo1``: its directory to module and ``PolicySpec``; cameras, instruction and state to robot actions.
+
+Neither lerobot nor transformers is needed. Source: ``EO1Policy.predict_action_chunk`` of huggingface/lerobot 0.6.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+
+from ttscompile.core.spec import Instruction, PolicySpec, SamplerTable
+from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends import lerobot_vla as vla
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens
+from ttscompile.frontends.lerobot_config import MOST_LAYERS, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
+from ttscompile.frontends.lerobot_policy import MASK, TOKENS, integration_steps, read_weights
+from ttscompile.frontends.lerobot_processors import CONVERSATION, READ, Processors
+from ttscompile.frontends.lerobot_qwen3_vl import END, IMAGE, TURN, Resizing
+from ttscompile.frontends.saved_weights import filled
+from ttscompile.frontends.settings import Settings
+
+from .eo1 import ACTIVATIONS, EO1, Denoiser, EO1Config, Prefix
+from .lerobot_qwen25_vl import DEVIATION, KIND, MEAN, of_backbone, pieces, read_qwen25, require_pictures
+from .qwen25_vl import Piece, Qwen25VLConfig
+from .resized_bytes import Filter, Shown
+
+_MODEL = "Qwen/Qwen2.5-VL-3B-Instruct"
+_LENGTH = 64
+"""Tokens of an instruction, of a policy that none is compiled into; lerobot has no limit."""
+_PIXELS, _MOST_PIXELS = {"min": 64 * 28 * 28, "max": 128 * 28 * 28}, 2**24
+_INNER = "vlm_backbone."
+_SYSTEM = "<|im_start|>system\nYou are a helpful physical assistant.<|im_end|>\n"
+_STATE = ("<|state_start|>", "<|state_pad|>", "<|state_end|>")
+_ACTIONS, _TASK = ("<|action_start|>", "<|action_pad|>", "<|action_end|>"), "<|vla|>"
+
+
+class _Reader(NamedTuple):
+    """How the backbone's processor reads images.
+
+    Attributes:
+        name: of the backbone.
+        pixels: of a resized image, the fewest and the most.
+        filter: what resizes it.
+    """
+
+    name: str
+    pixels: tuple[int, int]
+    filter: Filter
+
+
+def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
+    shared = vla.read_vla_config(directory, {"chunk_size": 8, "n_action_steps": 8, **entries}, options)
+    shared, processors = vla.read_vla_processors(shared)
+    settings, reader = shared.settings, _read_reader(shared, processors)
+    model, folders = vla.part_of(settings, "vlm_config"), encoder_folders(options.encoders, directory)
+    folder = language_model_folder(reader.name, folders, KIND)
+    language = read_qwen25(model)
+    require_pictures(folder, language)
+    sizes = [(shape[1], shape[2]) for shape in shared.cameras.values()]
+    shown = [Resizing(language.patch * language.merge, *reader.pixels)(*each) for each in sizes]
+    language = language.of_images(shown)
+    prompt, config = _prompt(folder, language, model), read_config(shared, language)
+    numbers, task = {"actions": config.actions, "tokens": _LENGTH, "vocabulary": language.vocabulary}, None
+    if options.task is not None:
+        task = torch.tensor([task_tokens(options.task, reader.name, folder, None, language.vocabulary)])
+    weights = {name.removeprefix("model."): value for name, value in read_weights(shared, options).items()}
+    network = filled(lambda: EO1(config, prompt), of_backbone(weights, _INNER), "config.json", directory)
+    seen = Shown(list(zip(sizes, shown, strict=True)), reader.filter, MEAN, DEVIATION)
+    encoder = vla.Gathered(shared, processors, Prefix(network, seen), config.state, task)
+    # What is around an instruction here makes that one which is too long is refused: lerobot reads it to its end.
+    told, table = Instruction(TOKENS, MASK, False, around=("", "")), partial(_sampler, settings)
+    spec = vla.vla_spec(shared, processors, None, "stretch", numbers, options, table, told)
+    return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
+
+
+def read_config(shared: LeRobotConfig, language: Qwen25VLConfig) -> EO1Config:
+    """Sizes and variant."""
+    settings = shared.settings
+    if language.text.width % 2:
+        raise settings.error("the width of the language model is odd; expected an even one")
+    return EO1Config(
+        language=language,
+        state=vla.padded_size(settings, "max_state_dim", shared.state_dim),
+        actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
+        layers=settings.number("num_action_layers", 2, MOST_LAYERS),
+        activation=settings.choice("action_act", *ACTIVATIONS),
+        periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
+    )
+
+
+def _read_reader(shared: LeRobotConfig, processors: Processors) -> _Reader:
+    missing = [name for name in (CONVERSATION, READ) if name not in processors.own]
+    if missing:
+        raise CheckpointError(f"{shared.directory}: its preprocessor has no {' and no '.join(missing)}. Save it again.")
+    told, own = (Settings(processors.own[name], f"{shared.directory}: {name}.") for name in (CONVERSATION, READ))
+    told.require(chunk_size=shared.horizon)
+    least, most = (own.number(f"image_{name}_pixels", count, _MOST_PIXELS) for name, count in _PIXELS.items())
+    fast = own.flag("use_fast_processor", False)
+    return _Reader(own.text("processor_name", _MODEL, MOST_LETTERS), (least, most), "torchvision" if fast else "pillow")
+
+
+def _prompt(folder: Path, language: Qwen25VLConfig, model: Settings) -> list[Piece]:
+    """What is around an instruction. LeRobot adds its own words to the tokenizer's."""
+    tokenizer, image = Tokenizer(folder, CheckpointError), model.number("image_token_id", 151655, MOST_VOCABULARY)
+    _, state, *_ = tokenizer.with_words([*_ACTIONS, *_STATE, _TASK])[3:]
+    cameras = len(language.grids)
+    before = tokenizer(f"{_SYSTEM}{TURN}\n{IMAGE * cameras}{''.join(_STATE)}")
+    later = tokenizer(f"{_TASK}{END}\n<|im_start|>assistant\n{_ACTIONS[0]}")
+    if before.count(image) != cameras or max(*before, *later) >= language.vocabulary:
+        raise CheckpointError(
+            f"{folder}: its tokenizer makes {before.count(image)} tokens {image} (image_token_id) of {cameras} images,"
+            f" and tokens up to {max(*before, *later)} of {language.vocabulary}. It is of another model."
+        )
+    return [*pieces(before, image, state), "task", tuple(later)]
+
+
+def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
+    steps = integration_steps(settings, options, "num_denoise_steps", 10)
+    return vla.flow_matching(steps, options, start=1.0, end=0.0)

@@ -1,0 +1,113 @@
+"""Resizing images of bytes with a cubic filter as Pillow and torchvision do, bit for bit, as matrix products.
+
+Both multiply by whole numbers, and round after the rows and again after the columns. Sources: ``Resample.c`` of Pillow,
+and ``UpSampleKernelAVXAntialias.h`` of PyTorch, which torchvision calls for images of bytes on a processor.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from ttscompile.frontends.internvl import Colours
+
+Filter = Literal["pillow", "torchvision"]
+_BEND, _REACH = -0.5, 2
+"""Of the cubic filter."""
+_MOST_BITS, _LONGEST = 22, 2**15
+"""Bits after the point of a weight; torchvision takes as many as leave its largest one below 2 ** 15."""
+_HIGH = 2**12
+"""A weight is split in two at this fraction, so that sums of both parts are exact in float32."""
+
+
+class ResizedBytes(nn.Module):
+    """Images ``[..., H, W]`` of whole numbers in 0..255, as float32, to another height and width.
+
+    Args:
+        before: height and width.
+        after: likewise.
+    """
+
+    def __init__(self, before: tuple[int, int], after: tuple[int, int], own: Filter) -> None:
+        super().__init__()
+        for axis, old, new in zip(("rows", "columns"), before, after, strict=True):
+            weights = _weights(old, new, own)
+            high = np.rint(weights * _HIGH) / _HIGH
+            for part, value in (("high", high), ("low", weights - high)):
+                turned = value if axis == "rows" else value.T
+                made = torch.tensor(np.ascontiguousarray(turned), dtype=torch.float32, device="cpu")
+                self.register_buffer(f"{axis}_{part}", made, persistent=False)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """See the class."""
+        pixels = _rounded(pixels @ self.columns_high, pixels @ self.columns_low)
+        return _rounded(self.rows_high @ pixels, self.rows_low @ pixels)
+
+
+class Shown(nn.Module):
+    """Images of each camera in -1..1 as a vision transformer sees them: resized as bytes, and normalised.
+
+    Args:
+        sizes: of each camera height and width, and then those of all that it is resized to in turn.
+        lower: whether what is between two bytes becomes the lower one; else it becomes the nearest.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[Sequence[tuple[int, int]]],
+        own: Filter,
+        mean: tuple[float, ...],
+        deviation: tuple[float, ...],
+        lower: bool = False,
+    ) -> None:
+        super().__init__()
+        pairs = ([pair for pair in pairwise(each) if pair[0] != pair[1]] for each in sizes)
+        self.zooms = nn.ModuleList(nn.Sequential(*(ResizedBytes(*pair, own) for pair in each)) for each in pairs)
+        self.colours, self.lower = Colours(mean, deviation), lower
+
+    def forward(self, images: list[Tensor]) -> list[Tensor]:
+        """See the class."""
+        shown = []
+        for image, zoom in zip(images, self.zooms, strict=True):
+            pixels = (image + 1) * 127.5
+            # A byte that came as a fraction of 255 may be a little below itself.
+            pixels = ((pixels + 1e-3).floor() if self.lower else pixels.round()).clamp(0, 255)
+            shown.append(self.colours(zoom(pixels) / 127.5 - 1))
+        return shown
+
+
+def _rounded(high: Tensor, low: Tensor) -> Tensor:
+    """The sum of both to the nearest byte, halves up."""
+    moved = high + 0.5
+    whole = moved.floor()
+    return (whole + (moved - whole + low).floor()).clamp(0, 255)
+
+
+def _weights(before: int, after: int, own: Filter) -> npt.NDArray[np.float64]:
+    """``[after, before]``: the share that each old entry has in each new one, in steps of a power of two."""
+    scale = before / after
+    wide = max(scale, 1.0)
+    middle = (np.arange(after)[:, None] + 0.5) * scale
+    old = np.arange(before)
+    first = np.maximum((middle - _REACH * wide + 0.5).astype(np.int64), 0)
+    stop = np.minimum((middle + _REACH * wide + 0.5).astype(np.int64), before)
+    found = _cubic((old - middle + 0.5) / wide) * ((old >= first) & (old < stop))
+    found /= found.sum(1, keepdims=True)
+    bits = _MOST_BITS
+    if own == "torchvision":
+        bits = next(
+            n for n in range(_MOST_BITS) if n == _MOST_BITS - 1 or int(0.5 + found.max() * 2 ** (n + 1)) >= _LONGEST
+        )
+    return np.trunc(found * 2**bits + np.copysign(0.5, found)) / 2**bits
+
+
+def _cubic(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Keys' cubic convolution."""
+    x = np.abs(x)
+    near = ((_BEND + 2) * x - (_BEND + 3)) * x * x + 1
+    far = (((x - 5) * x + 8) * x - 4) * _BEND
+    return np.where(x < 1, near, np.where(x < _REACH, far, 0.0))
