@@ -7,6 +7,7 @@ under way together, and copies answer those of one plan in batches (``copies``).
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -18,11 +19,12 @@ from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
 from ttscompile.runtimes.executor.window import Array
+from ttscompile.runtimes.instruct import Instruct
 from ttscompile.runtimes.liveness import reads_earlier_calls
 from ttscompile.runtimes.server.admission import ServerLimits
 from ttscompile.runtimes.server.listener import Listener
 from ttscompile.runtimes.server.lock import Lock
-from ttscompile.runtimes.server.protocol import Metric, Request, read_arrays
+from ttscompile.runtimes.server.protocol import Metric, Request, read_frame
 
 METHODS = {"info": frozenset[str](), "predict": frozenset({"obs", "plan"})}
 
@@ -82,9 +84,11 @@ class FleetServer(Listener):
         waiting: requests that may be under way; further ones are refused.
         limits: what clients may do; None for the defaults.
         lock: who may come in; None lets every program of this machine in, and nobody else.
+        tokenizer: of a policy that reads an instruction, so that robots may send it as text; see ``Instruct``.
 
     Raises:
         IllegalPlanError: see ``Plans.of``.
+        ObservationError: see ``Instruct``.
     """
 
     methods = METHODS
@@ -97,11 +101,13 @@ class FleetServer(Listener):
         waiting: int = 256,
         limits: ServerLimits | None = None,
         lock: Lock | None = None,
+        tokenizer: str | os.PathLike[str] | None = None,
     ) -> None:
         super().__init__(limits, lock)
         self._manifest, self._copies, self._most = artifact.manifest, copies, waiting
         self._plans = Plans.of(artifact, plan)
         self._specs = artifact.manifest.spec.observations
+        self._instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
         self._waiting = 0
         self._seconds: Counter[float] = Counter()
         self._took = 0.0
@@ -148,7 +154,8 @@ class FleetServer(Listener):
 
     def _checked(self, given: Mapping[str, Any]) -> dict[str, Array]:
         """The arrays of an observation: one that does not fit must not fail the others of its batch."""
-        obs = read_arrays(given, self._specs)
+        frame: Mapping[str, Any] = read_frame(given, self._specs)
+        obs = dict(frame if self._instruct is None else self._instruct.of_frame(frame))
         if obs.keys() != self._specs.keys():
             raise ObservationError(f"expected an observation of {sorted(self._specs)}; found {sorted(obs)[:20]}.")
         for key, one in self._specs.items():

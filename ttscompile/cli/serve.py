@@ -169,7 +169,7 @@ BATCHES_WAITING = 16
 
 SECTIONS = (
     Section("One robot", shared.LOOP_OPTIONS, ("control_hz",)),
-    Section("The policy in this process", ("tokenizer", "runtime", "device"), ("control_hz", "openpi")),
+    Section("The policy in this process", ("runtime", "device"), ("control_hz", "openpi")),
     Section("Many robots", ("ray",), ("copies",)),
     Section("Who may connect", SERVER_OPTIONS),
 )
@@ -239,7 +239,7 @@ def serve(
         elif copies is None:
             _serve_openpi(directory, server, how, *plans)
         else:
-            _serve_fleet(directory, server, ray, FleetSettings(copies, threads), *plans)
+            _serve_fleet(directory, server, ray, FleetSettings(copies, threads), tokenizer, *plans)
 
 
 def _serve_robot(
@@ -266,7 +266,12 @@ def _serve_openpi(directory: Path, server: ServerOptions, how: dict[str, Any], p
 
 
 def _serve_fleet(
-    directory: Path, server: ServerOptions, ray: str, settings: FleetSettings, plan: str | None = None
+    directory: Path,
+    server: ServerOptions,
+    ray: str,
+    settings: FleetSettings,
+    tokenizer: Path | None,
+    plan: str | None = None,
 ) -> None:
     console, artifact = progress(), load_artifact(directory)
     Plans.of(artifact, plan)  # before copies are started, which takes a while
@@ -278,7 +283,7 @@ def _serve_fleet(
         ray_copies(ray, directory, identity, settings) as copies,
     ):
         waiting = BATCHES_WAITING * settings.copies * settings.batch
-        fleet = FleetServer(artifact, copies, plan, waiting, limits, server.lock)
+        fleet = FleetServer(artifact, copies, plan, waiting, limits, server.lock, tokenizer)
         status.stop()
         server.warn(console)
         asyncio.run(server.serve(fleet, identity, output))

@@ -16,9 +16,11 @@ from tests.plans import store_schedules
 from tests.runtimes.server.serving import LIMITS, Client, ServerError, connected, listening, vanish
 from tests.runtimes.server.watching import figures, get
 from tests.runtimes.toys import toy_program, written_artifact
+from tests.word_tokenizer import write_tokenizer
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import uniform_plan
-from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
+from ttscompile.core.spec import Instruction, ObservationSpec
+from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError, ObservationError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.fleet.server import Answered, FleetServer, Plans
 from ttscompile.runtimes.server.lock import Lock, hashed
@@ -34,12 +36,14 @@ class Scripted:
 
     def __init__(self) -> None:
         self.asked: list[str] = []
+        self.given: list[Mapping[str, Array]] = []
         self.may = threading.Event()
         self.may.set()
         self.state = ""
 
     async def predict(self, plan: str, obs: Mapping[str, Array]) -> Answered:
         self.asked.append(plan)
+        self.given.append(obs)
         while not self.may.is_set():
             await asyncio.sleep(0.001)
         if obs["obs"][0] < -1:
@@ -97,6 +101,35 @@ def test_what_is_wrong_is_told_and_the_next_request_is_answered(
         with pytest.raises(ServerError, match=f"(?s){kind}: .*{message}"):
             call("predict", **params)
         assert len(call("predict", obs=GOOD)["action"]) == 2
+
+
+def test_robots_send_their_instruction_as_text_where_the_fleet_has_a_tokenizer(
+    planned: Path, copies: Scripted, tmp_path: Path
+) -> None:
+    """The server makes the tokens, so that copies get them whoever asks."""
+    artifact, told = load_artifact(planned), Instruction("tokens", "mask", new_line=False)
+    words = {"tokens": ObservationSpec((3,), dtype="int64", window=False)}
+    words["mask"] = ObservationSpec((3,), dtype="bool", window=False)
+    spec = replace(artifact.manifest.spec, observations={**artifact.manifest.spec.observations, **words})
+    read = replace(artifact, manifest=replace(artifact.manifest, spec=replace(spec, instruction=told)))
+    tokenizer = write_tokenizer(tmp_path / "language", {"?": 0, "push": 1, "left": 2})
+
+    def served(**options: Any) -> Any:
+        return listening(lambda: FleetServer(read, copies, limits=replace(LIMITS, message_bytes=8192), **options))
+
+    with served(tokenizer=tokenizer) as url, connected(url) as call:
+        assert call("predict", obs={**GOOD, "task": "push left"})["action"]
+        assert copies.given[-1]["tokens"].tolist() == [1, 2, 0]
+        assert copies.given[-1]["mask"].tolist() == [True, True, False]
+        call("predict", obs={**GOOD, "tokens": [2, 0, 0], "mask": [True, False, False]})
+        assert copies.given[-1]["tokens"].tolist() == [2, 0, 0]
+        for task, why in (("a" * 4097, "at most 4096 characters"), (["push"], "a task is a text; found list")):
+            with pytest.raises(ServerError, match=f"ProtocolError: .*{why}"):
+                call("predict", obs={**GOOD, "task": task})
+    with served() as url, connected(url) as call, pytest.raises(ServerError, match=r"found \['obs', 'task'\]"):
+        call("predict", obs={**GOOD, "task": "push left"})
+    with pytest.raises(ObservationError, match="this policy takes no text"):
+        FleetServer(artifact, copies, tokenizer=tokenizer)
 
 
 def test_more_requests_than_may_be_under_way_are_refused_at_once(planned: Path, copies: Scripted) -> None:
