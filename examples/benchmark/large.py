@@ -8,6 +8,7 @@
     python examples/benchmark/large.py --pi0 --precision int4                   # LeRobot's pi0, whole; or --pi05
     python examples/benchmark/large.py --groot --precision int4                 # LeRobot's GR00T N1.7, whole
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
+    python examples/benchmark/large.py --eo1                                    # LeRobot's eo1, whole
     python examples/benchmark/large.py --vla-jepa                               # LeRobot's vla_jepa, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
@@ -40,8 +41,19 @@ if TYPE_CHECKING:
 
 STEPS = 4
 
-WHOLE = ("smolvla", "pi0", "pi05", "groot", "evo1", "vla_jepa", "xvla", "rdt", "octo")
-"""Policies that are compiled from what is saved of them; LeRobot's are whole."""
+WHOLE = {
+    "smolvla": "LeRobot's SmolVLA",
+    "pi0": "LeRobot's pi0",
+    "pi05": "LeRobot's pi05",
+    "groot": "LeRobot's groot, GR00T N1.7",
+    "evo1": "LeRobot's evo1",
+    "eo1": "LeRobot's eo1",
+    "vla_jepa": "LeRobot's vla_jepa",
+    "xvla": "LeRobot's xvla",
+    "rdt": "RDT-170M",
+    "octo": "Octo-small 1.5",
+}
+"""Policies that are compiled from what is saved of them, in place of the transformer; LeRobot's are whole."""
 
 MOST_FILES = 3
 """Whose sizes are printed by name."""
@@ -136,6 +148,7 @@ def tell_sizes(directory: Path) -> None:
 
 def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     """Where a whole policy is saved, which is written unless it is there; and the instruction that is compiled in."""
+    import large_eo1
     import large_evo1
     import large_groot
     import large_octo
@@ -148,10 +161,10 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     directory = folder / name
     if not directory.exists():
         pi05 = partial(large_pi0.save, adaptive=True)
-        others = (large_groot, large_evo1, large_vla_jepa, large_xvla, large_rdt, large_octo)
+        others = (large_groot, large_evo1, large_eo1, large_vla_jepa, large_xvla, large_rdt, large_octo)
         saves = [large_smolvla.save, large_pi0.save, pi05, *(each.save for each in others)]
         dict(zip(WHOLE, saves, strict=True))[name](directory)
-    return directory, large_evo1.TASK if name in ("evo1", "groot", "vla_jepa") else None
+    return directory, large_evo1.TASK if name in ("evo1", "eo1", "groot", "vla_jepa") else None
 
 
 def convert_clip(folder: Path) -> None:
@@ -169,7 +182,7 @@ def convert_clip(folder: Path) -> None:
 
 
 def run_whole(folder: Path, rounds: int, name: str) -> None:
-    """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of xvla, Octo and RDT."""
+    """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of eo1, xvla, Octo and RDT."""
     import large_calls
     import large_smolvla
 
@@ -181,7 +194,7 @@ def run_whole(folder: Path, rounds: int, name: str) -> None:
     original = large_smolvla.eager(module, _vision(module), spec)
     first = "words" if name == "octo" else "vision"
     large_calls.compare(folder, f"{first}, prefix, loop", original, spec, 2, rounds)
-    if name not in ("xvla", "rdt", "octo"):
+    if name not in ("eo1", "xvla", "rdt", "octo"):
         large_calls.reusing(folder, spec, 2, rounds + 2)
 
 
@@ -242,16 +255,9 @@ def main() -> None:
     parser.add_argument("--layers", type=int, default=16)
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--unet", help="channels of the levels of a U-Net, in place of the transformer")
-    parser.add_argument("--smolvla", action="store_true", help="LeRobot's SmolVLA, in place of the transformer")
-    parser.add_argument("--pi0", action="store_true", help="LeRobot's pi0, likewise")
-    parser.add_argument("--pi05", action="store_true", help="LeRobot's pi05, likewise")
-    parser.add_argument("--groot", action="store_true", help="LeRobot's groot, GR00T N1.7, likewise")
-    parser.add_argument("--evo1", action="store_true", help="LeRobot's evo1, likewise")
-    parser.add_argument("--vla-jepa", action="store_true", help="LeRobot's vla_jepa, likewise")
-    parser.add_argument("--xvla", action="store_true", help="LeRobot's xvla, likewise")
-    parser.add_argument("--rdt", action="store_true", help="RDT-170M, likewise")
-    parser.add_argument("--octo", action="store_true", help="Octo-small 1.5, likewise")
-    parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, likewise")
+    for name, title in WHOLE.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", action="store_true", help=f"{title}, in place of it")
+    parser.add_argument("--clip", action="store_true", help="LeRobot's multi_task_dit with CLIP B/16, in place of it")
     parser.add_argument("--horizon", type=int, default=32, help="actions of a chunk")
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")

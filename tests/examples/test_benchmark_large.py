@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import large
+import large_eo1
 import large_octo
 import large_pi0
 import large_qwen3_vl
@@ -33,6 +34,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = {"WORDS": 24, "_SEEN": 2, "_IMAGES": 16, "_MERGED": 64}
     for name, size in sizes.items():
         monkeypatch.setattr(large_qwen3_vl, name, size)
+    inside: dict[str, Any] = large_eo1.MODEL
+    rope = {"rope_type": "default", "mrope_section": [2, 2, 2]}
+    monkeypatch.setitem(inside, "text_config", {**inside["text_config"], **text, "rope_parameters": rope})
+    monkeypatch.setitem(inside, "vision_config", vision)
     both: dict[str, Any] = {"layers": 2, "heads": 2, "channels": 8, "hidden": 24}
     monkeypatch.setattr(large_pi0, "GEMMA", replace(large_pi0.GEMMA, width=24, **both))
     monkeypatch.setattr(large_pi0, "EXPERT", replace(large_pi0.EXPERT, width=16, **both))
@@ -51,7 +56,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("vla_jepa", (1, 7, 6)), ("pi0", (1, 50, 32)), ("pi05", (1, 50, 32)), ("octo", (1, 4, 7))]
+    ("name", "shape"),
+    [("vla_jepa", (1, 7, 6)), ("eo1", (1, 8, 32)), ("pi0", (1, 50, 32)), ("pi05", (1, 50, 32)), ("octo", (1, 4, 7))],
 )
 def test_what_is_written_is_read(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
     directory, task = large.saved(tmp_path, name)

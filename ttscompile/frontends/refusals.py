@@ -87,6 +87,7 @@ DIRECTORIES = (
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
     Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT.format("xvla")),
     Refusal(r"^config\.json: paligemma_|(^|/)metadata\.pt$", "a pi0 or pi0.5 of openpi", _PUT.format("pi0 or pi05")),
+    Refusal(r"^config\.json: model_type=eo1$", "an EO-1 as its authors save it", _TRAIN.format("eo1")),
     Refusal(r"^config\.json: vlm_name=", "an Evo-1 as its authors save it", _TRAIN.format("evo1")),
     Refusal(r"^config\.json: policy_head_type=unet", "a DexVLA or DiVLA whose head is a U-Net", _HEAD),
     Refusal(r"^(checkpoint-|step_)\w+/config\.json$", "a directory around checkpoints", "Give one of those in it."),
@@ -106,7 +107,7 @@ LEROBOT = (
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
     Refusal(
         r"^wall_x$",
-        "a policy that denoises inside its language model, Qwen2.5-VL, which is not rebuilt here",
+        "a policy that denoises inside a language model with experts, which are not rebuilt here",
         f"{_BUILD}: one step of the model over a cached prefix is the module.",
     ),
     Refusal(r"^molmoact2$", "a policy whose backbone, Molmo, is not rebuilt here", _HEAD),
