@@ -172,6 +172,8 @@ class _Changed:
             sizes = self.types[argument.name].shape
             if elementwise and len(sizes) >= behind and sizes[-behind] == self.stream.tokens:
                 return self._gather(argument.name, len(sizes) - behind)
+            if node.op == ATTENTION and sizes[-2] == self.stream.tokens:  # a mask, of which tokens see which
+                return self._gather(argument.name, len(sizes) - 2)
             return argument
 
         args = tuple(operand(place, argument) for place, argument in enumerate(node.args))

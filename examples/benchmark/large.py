@@ -182,7 +182,7 @@ def convert_clip(folder: Path) -> None:
 
 
 def run_whole(folder: Path, rounds: int, name: str) -> None:
-    """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of eo1, xvla, Octo and RDT."""
+    """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of xvla, Octo and RDT."""
     import large_calls
     import large_smolvla
 
@@ -194,7 +194,7 @@ def run_whole(folder: Path, rounds: int, name: str) -> None:
     original = large_smolvla.eager(module, _vision(module), spec)
     first = "words" if name == "octo" else "vision"
     large_calls.compare(folder, f"{first}, prefix, loop", original, spec, 2, rounds)
-    if name not in ("eo1", "xvla", "rdt", "octo"):
+    if name not in ("xvla", "rdt", "octo"):
         large_calls.reusing(folder, spec, 2, rounds + 2)
 
 

@@ -16,9 +16,10 @@ from ttscompile.core.plan import Plan
 from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.internvl import Prompt
-from ttscompile.frontends.language_layers import LanguageConfig
+from ttscompile.frontends.language_layers import LanguageConfig, Norm
 from ttscompile.frontends.qwen3_vl import Qwen3VL, Qwen3VLConfig, QwenVisionConfig
 from ttscompile.frontends.siglip import Siglip, SiglipConfig
+from ttscompile.policies.qwen25_vl import Qwen25VL, Qwen25VLConfig
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.flow import flow_matching_table
 
@@ -26,7 +27,7 @@ Array = npt.NDArray[Any]
 TO, SIDE, PATCH, WORDS = 2, 24, 4, 8
 CAMERAS = ("left", "right")
 STEPS, HORIZON, ACTIONS = 3, 6, 3
-SEEING = ("clip", "siglip", "qwen")
+SEEING = ("clip", "siglip", "qwen", "windows")
 """Towers that are vision transformers."""
 
 
@@ -47,7 +48,8 @@ class Tower(nn.Module):
 class Patches(nn.Module):
     """``[N, 3, 24, 24]`` -> ``[N, 8]`` by a vision transformer of 36 patches; ``clip`` has a class token, too.
 
-    ``qwen`` turns queries and keys by rows and columns, and gives squares of patches from two of its layers.
+    ``qwen`` turns queries and keys by rows and columns, and gives squares of patches from two of its layers; of
+    ``windows``, which is Qwen2.5-VL's, all but the second look at nine parts of the picture, each at itself.
     """
 
     def __init__(self, kind: str) -> None:
@@ -61,12 +63,20 @@ class Patches(nn.Module):
             grids = ((SIDE // PATCH, SIDE // PATCH),)
             whole = Qwen3VL(Qwen3VLConfig(vision, text, 1, (5, 5), 1e4, grids), Prompt((), 0))
             self.tower: nn.Module = whole.visual
+        elif kind == "windows":
+            layers = LanguageConfig(64, 256, layers=3, heads=2, groups=2, channels=32, biased=True, whole=True)
+            text = LanguageConfig(width=64, hidden=32, layers=0, heads=1, groups=1, channels=32)
+            own = Qwen25VLConfig(layers, PATCH, 2, 1, frozenset({1}), text, 1, (6, 5, 5), 1e4)
+            self.tower = Qwen25VL(own.of_images([(SIDE, SIDE)]), ()).visual
         else:
             self.tower = ClipVision(clip) if kind == "clip" else Siglip(siglip, (SIDE, SIDE))
         self.out = nn.Linear(64, 8)
         self.pooled = kind == "clip"
         with torch.no_grad():
-            self.tower.embeddings.patch_embedding.weight *= 10  # else what is seen is little beside positions
+            patches: Any = self.tower.patch_embed if kind == "windows" else self.tower.embeddings.patch_embedding
+            for norm in (each for each in self.tower.modules() if isinstance(each, Norm)):
+                norm.weight += 1  # they wait for weights, and would give nothing
+            patches.weight *= 10  # else what is seen is little beside positions
 
     def forward(self, x: Tensor) -> Tensor:
         seen = self.tower(2 * x - 1)
@@ -78,7 +88,7 @@ class Eyes(nn.Module):
 
     ``each``: a tower for each camera; ``shared``: one looks at all of them in turn; ``stacked``: at all at once;
     ``mixed``: at the mean of the window's frames; ``channels``: at the window as one picture with more colours;
-    ``clip``, ``siglip``, ``qwen``: one that is a vision transformer looks at all at once.
+    ``clip``, ``siglip``, ``qwen``, ``windows``: one that is a vision transformer looks at all at once.
     """
 
     def __init__(self, kind: str) -> None:

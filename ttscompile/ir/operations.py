@@ -108,7 +108,9 @@ def axis_after(node: Node, axis: int, types: Types) -> int | None:
         mixed = row.mixes(node, types)
         return None if mixed is None or axis >= len(before) - mixed else axis
     if row.along is not None and axis not in (along := axes_along(node, len(before))):
-        return axis - (len(after) < len(before) and min(along) < axis)  # select and unbind take their axis away
+        return axis - (
+            len(after) < len(before) and sum(a < axis for a in along)
+        )  # select and mean may take theirs away
     return axis if node.op == GETITEM else None
 
 
@@ -260,7 +262,8 @@ _GROUPS: tuple[tuple[str, Operation], ...] = (
     # Nothing that a pass asks about.
     (f"{GETITEM} cat concat stack tril triu", Operation()),
     ("arange linspace logspace eye empty empty_like new_empty scalar_tensor type_as copy meshgrid", Operation()),
-    ("sum mean prod amax amin max min argmax argmin any all std var std_mean var_mean logsumexp", Operation()),
+    ("sum mean amax amin", Operation(along=1)),
+    ("prod max min argmax argmin any all std var std_mean var_mean logsumexp", Operation()),
     ("norm linalg_vector_norm linalg_norm sort argsort topk diff trapezoid", Operation()),
     ("index index_select gather take_along_dim embedding one_hot isin bucketize searchsorted", Operation()),
     ("index_put index_add index_copy index_fill scatter scatter_add select_scatter slice_scatter", Operation()),

@@ -97,7 +97,7 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
     """The layout that an operation gives to an axis ``m * B`` of its result; None if it cannot be seen."""
     size, (copies, rows) = node.type.shape[axis], layouts[0]
     assert isinstance(size, Batch)
-    row = operation(node.op)
+    row, rank = operation(node.op), len(node.type.shape)
     if row.name in ("repeat", "tile"):
         copies = size.multiple // rows
     elif row.name == "repeat_interleave":
@@ -112,7 +112,10 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
         copies = size.multiple // rows
     elif row.name == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
         copies = sum(layout.copies for layout in layouts)
-    elif len(set(layouts)) > 1 or (row.movement is None and axis in axes_along(node, len(node.type.shape))):
+    # A mean that takes an axis away leaves the others in their order.
+    elif len(set(layouts)) > 1 or (
+        row.movement is None and rank == len(read[0].shape) and axis in axes_along(node, rank)
+    ):
         return None  # rows of several kinds, or rows that change places
     return _Layout(copies, rows) if copies * rows == size.multiple else None
 

@@ -98,7 +98,12 @@ def _entry(tower: Graph, patches: str) -> str | None:
         joins = row.name in ("pad", "constant_pad_nd", "cat", "stack")
         if read and read <= free and len(node.types) == 1 and (row.movement or row.elementwise or joins):
             free.add(node.name)
-    left = [name for name in free if any(user.name not in free for user in tower.users()[name])]
+    users = tower.users()
+    left = [name for name in free if any(user.name not in free for user in users[name])]
+    if len(left) > 1:  # it is read both as it is and squared, say: what has one reader leads to where they part
+        left = [patches]
+        while len(users[left[0]]) == 1 and users[left[0]][0].name in free:
+            left = [users[left[0]][0].name]
     return left[0] if len(left) == 1 and not free & set(tower.outputs) else None
 
 
@@ -152,7 +157,8 @@ def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Map
     """The axis of tokens in what a node gives; None if it brings tokens together, or nobody knows."""
     result = node.type.shape
     if node.op == ATTENTION:
-        plain = len(read) == 3 and all(value in (None, 0.0, False) for value in node.args[3:])
+        # A mask is the same for every picture: nothing that it is made of is read.
+        plain = len(read) == 3 and all(value in (None, 0.0, False) for value in node.args[4:])
         inner = all(axes[name] == len(types[name].shape) - 2 for name in read)
         known = {name for name, _ in node.kwargs} <= {"scale"}
         return len(result) - 2 if plain and inner and known else None
