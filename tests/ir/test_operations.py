@@ -23,7 +23,7 @@ from ttscompile.errors import CaptureError, LoweringError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, TensorType
-from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, operation, permutation
+from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, axis_after, operation, permutation
 from ttscompile.lower.program import lower_graph
 
 
@@ -236,7 +236,8 @@ def test_what_lies_across_is_treated_alike(fact: str) -> None:
         mixes = operation(node.op).mixes
         mixed = axes_along(node, rank) if mixes is None else range(rank - (mixes(node, graph.types()) or rank), rank)
         for axis in set(range(rank)) - set(mixed):
-            after = axis - (y.dim() < rank and min(mixed) < axis)
+            after = axis_after(node, axis, graph.types())
+            assert after is not None, node
             turned = _first(graph, {**inputs, name: inputs[name].flip(axis)})
             torch.testing.assert_close(turned, y.flip(after), msg=of(node))
 

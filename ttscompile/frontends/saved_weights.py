@@ -1,7 +1,11 @@
 """Saved weights: reading them, and whether they are those of a network; said in the same words, whoever saved them."""
 
 import math
+import mmap
+import os
 import re
+import shutil
+import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +21,8 @@ from ..measure.machine import memory_bytes
 BYTES_A_WEIGHT, BYTES_A_COPY = 2, 4
 """That compiling takes at most, beside the mapped file; copies are of weights that were not saved in float32. Source:
 ``docs/decisions.md``."""
+_LEAST_MAPPED = 2**28
+"""Bytes of copies; fewer are held in memory."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -57,14 +63,15 @@ def require_memory(path: Path, without: tuple[str, ...] = ()) -> None:
 def require_memory_for(path: Path, sizes: Iterable[tuple[int, bool]]) -> None:
     """The same of tensors that the file at ``path`` has: how many numbers each has, and whether it is float32."""
     sizes = list(sizes)
-    numbers, copied = sum(count for count, _ in sizes), sum(count for count, single in sizes if not single)
-    need, there = BYTES_A_WEIGHT * numbers + BYTES_A_COPY * copied, memory_bytes()
+    numbers, copied = sum(count for count, _ in sizes), BYTES_A_COPY * sum(n for n, single in sizes if not single)
+    room, there = shutil.disk_usage(_on_disk()).free, memory_bytes()
+    need = BYTES_A_WEIGHT * numbers + copied * (not _LEAST_MAPPED <= copied <= room)
     if need > there:
-        told = f", of which {copied / 1e6:,.0f} million are not in float32, and are copied" if copied else ""
+        wanting = f"; {copied / 2**30:.1f} are copies, which {_on_disk()} (TMPDIR) has no room for" * (copied > room)
         raise CheckpointError(
-            f"{path}: {numbers / 1e6:,.0f} million weights{told}. Compiling them takes about {need / 2**30:.1f} GiB of"
-            f" memory beside the file; this machine has {there / 2**30:.1f} GiB. Convert on a larger one: in precision"
-            " 'int4' the artifact takes about a byte a weight to run."
+            f"{path}: {numbers / 1e6:,.0f} million weights. Compiling them takes about {need / 2**30:.1f} GiB of memory"
+            f" beside the file{wanting}; this machine has {there / 2**30:.1f} GiB. Convert on a larger one: in"
+            " precision 'int4' the artifact takes about a byte a weight to run."
         )
 
 
@@ -101,7 +108,32 @@ def as_float32(weights: Mapping[str, Any], where: str = "") -> dict[str, torch.T
             raise CheckpointError(f"{where}weight {name} is a {what}; expected a dense floating-point tensor.")
     # Without the levels that torch.compile and DistributedDataParallel put around a network.
     parts = {name: [part for part in str(name).split(".") if part not in ("_orig_mod", "module")] for name in weights}
-    return {".".join(parts[name]): value.detach().to(torch.float32) for name, value in weights.items()}
+    copies = _copies({name: value for name, value in weights.items() if value.dtype != torch.float32})
+    return {".".join(parts[name]): copies.get(name, value.detach()) for name, value in weights.items()}
+
+
+def _copies(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The weights in float32. Many are in a file without a name: the system takes their pages back as it needs room."""
+    size = BYTES_A_COPY * sum(value.numel() for value in weights.values())
+    if size < _LEAST_MAPPED:
+        return {name: value.detach().to(torch.float32) for name, value in weights.items()}
+    try:
+        with tempfile.TemporaryFile(dir=_on_disk()) as file:
+            os.posix_fallocate(file.fileno(), 0, size)  # a disk that is full later would end the process
+            numbers = torch.frombuffer(mmap.mmap(file.fileno(), size), dtype=torch.float32)
+    except (OSError, AttributeError):  # macOS does not reserve
+        numbers = torch.empty(size // BYTES_A_COPY)
+    found, end = dict[str, torch.Tensor](), 0
+    for name, value in weights.items():
+        start, end = end, end + value.numel()
+        found[name] = numbers[start:end].view(value.shape).copy_(value.detach())
+    return found
+
+
+def _on_disk() -> str:
+    """Where large files for a while are put; the folder for small ones is memory on many machines."""
+    large = Path("/var/tmp")  # noqa: S108 - what tempfile makes there has no name
+    return os.environ.get("TMPDIR") or (str(large) if large.is_dir() else tempfile.gettempdir())
 
 
 def filled(make: Callable[[], Network], weights: Mapping[str, torch.Tensor], source: str, where: Path) -> Network:
