@@ -26,7 +26,7 @@ from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings
 
 from .eo1 import ACTIVATIONS, EO1, Denoiser, EO1Config, Prefix
-from .lerobot_qwen25_vl import DEVIATION, KIND, MEAN, of_backbone, pieces, read_qwen25, require_pictures
+from .lerobot_qwen25_vl import DEVIATION, KIND, MEAN, of_backbone, pieces, read_pictures, read_qwen25
 from .qwen25_vl import Piece, Qwen25VLConfig
 from .resized_bytes import Filter, Shown
 
@@ -62,7 +62,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     model, folders = vla.part_of(settings, "vlm_config"), encoder_folders(options.encoders, directory)
     folder = language_model_folder(reader.name, folders, KIND)
     language = read_qwen25(model)
-    require_pictures(folder, language)
+    read_pictures(folder, language).require(image_mean=list(MEAN), image_std=list(DEVIATION))
     sizes = [(shape[1], shape[2]) for shape in shared.cameras.values()]
     shown = [Resizing(language.patch * language.merge, *reader.pixels)(*each) for each in sizes]
     language = language.of_images(shown)

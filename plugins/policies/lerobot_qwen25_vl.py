@@ -60,15 +60,16 @@ def read_qwen25(model: Settings) -> Qwen25VLConfig:
     )
 
 
-def require_pictures(folder: Path, config: Qwen25VLConfig) -> None:
-    """Raise unless the processor in this folder hands images to the vision transformer as is rebuilt here."""
+def read_pictures(folder: Path, config: Qwen25VLConfig) -> Settings:
+    """How the processor in this folder reads images. Raises unless they reach the vision transformer as it expects."""
     name, both = "preprocessor_config.json", folder / "processor_config.json"
     found = read_json(both).get("image_processor") if both.is_file() else None  # which transformers prefers
     if not isinstance(found, dict):
         found, both = read_json(folder / name), folder / name
-    own = Settings(found, f"{both}: ")
-    own.require(patch_size=config.patch, merge_size=config.merge, image_mean=list(MEAN), image_std=list(DEVIATION))
+    own = Settings({"patch_size": 14, "merge_size": 2, **found}, f"{both}: ")
+    own.require(patch_size=config.patch, merge_size=config.merge, rescale_factor=1 / 255)
     own.require(do_resize=True, do_rescale=True, do_normalize=True, resample=3)
+    return own
 
 
 def of_backbone(saved: Mapping[str, Tensor], inner: str) -> dict[str, Tensor]:

@@ -5,12 +5,13 @@ An attribute's name is that of transformers' weights, but for what ``rebuilt_wei
 Source: Bai et al., Qwen2.5-VL (arXiv 2502.13923).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from ttscompile.frontends import language_layers as layers
 from ttscompile.frontends.saved_weights import renamed, separated
@@ -42,6 +43,8 @@ class Qwen25VLConfig:
         sections: pairs of channels whose angle is of the time, the row and the column.
         base: of the rotary embedding.
         grids: rows and columns of patches of each camera's images.
+        rounded: whether frequencies of rotary positions are rounded to bfloat16, as a model has them that was cast to
+            it as a whole; and with them cosines and sines of places in an image, which are computed in it.
     """
 
     vision: layers.LanguageConfig
@@ -54,6 +57,7 @@ class Qwen25VLConfig:
     sections: tuple[int, int, int]
     base: float
     grids: tuple[tuple[int, int], ...] = ()
+    rounded: bool = False
 
     def of_images(self, sizes: Sequence[tuple[int, int]]) -> "Qwen25VLConfig":
         """The same for cameras whose images have these heights and widths, as the vision transformer sees them."""
@@ -87,14 +91,43 @@ class _Merger(nn.Module):
         return self.mlp(squares(self.ln_q(patches), rows, self.merge))  # type: ignore[no-any-return]
 
 
+def _frequencies(channels: int, base: float, rounded: bool) -> Tensor:
+    """Angles of position 1, ``[channels / 2]``; made of numbers, so that a network on the meta device has them, too."""
+    made = 1.0 / base ** (torch.arange(0, channels, 2, dtype=torch.float32, device="cpu") / channels)
+    # Nobody saves them, and yet a cast of the model rounds them: what was trained so knows no others. At position 300
+    # that turns a channel by up to a third of a radian, which no rounding of activations does.
+    return made.to(torch.bfloat16) if rounded else made
+
+
+class _Block(layers.Layer):
+    """A layer of the vision transformer."""
+
+    def forward(self, x: Tensor, turns: layers.Rotation, mask: Tensor | None) -> Tensor:  # type: ignore[override]
+        attention, normed = self.self_attn, self.input_layernorm(x)
+        projections = attention.q_proj, attention.k_proj, attention.v_proj
+        queries, keys, values = (attention.split(project(normed)) for project in projections)
+        queries, keys = layers.rotate(queries, turns), layers.rotate(keys, turns)
+        mixed = functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+        x = x + attention.o_proj(mixed.transpose(1, 2).flatten(2))
+        return x + self.mlp(self.post_attention_layernorm(x))  # type: ignore[no-any-return]
+
+
 class _Vision(nn.Module):
     """Normalised pixels ``[N, 3, H, W]`` to tokens ``[N, tokens, width]``."""
+
+    cosines: Tensor
+    sines: Tensor
 
     def __init__(self, config: Qwen25VLConfig) -> None:
         super().__init__()
         self.config = config
+        frequencies = _frequencies(config.vision.channels // 2, 1e4, config.rounded)
+        longest = max((side for grid in config.grids for side in grid), default=1)
+        angles = torch.arange(longest, device="cpu").to(frequencies)[:, None] * frequencies
+        self.register_buffer("cosines", angles.cos().to(torch.float32), persistent=False)
+        self.register_buffer("sines", angles.sin().to(torch.float32), persistent=False)
         self.patch_embed = nn.Conv2d(3, config.vision.width, config.patch, stride=config.patch, bias=False)
-        self.blocks = nn.ModuleList(layers.Layer(config.vision) for _ in range(config.vision.layers))
+        self.blocks = nn.ModuleList(_Block(config.vision) for _ in range(config.vision.layers))
         self.merger = _Merger(config)
 
     def forward(self, pixels: Tensor) -> Tensor:
@@ -103,13 +136,12 @@ class _Vision(nn.Module):
         places = torch.cartesian_prod(
             torch.arange(rows, device=pixels.device), torch.arange(columns, device=pixels.device)
         )
-        both = (layers.rotation(axis[None], config.vision.channels // 2) for axis in places.unbind(-1))
-        turns = layers.Rotation(*(torch.cat(pair, -1) for pair in zip(*both, strict=True)))
+        turns = layers.Rotation(*(table[places].flatten(1)[None, None] for table in (self.cosines, self.sines)))
         window = places // (config.window * config.merge)
         confined = layers.added((window[:, None] == window[None]).all(-1))[None, None]
-        x, free = patches.flatten(2).transpose(1, 2), torch.zeros_like(confined)
-        for number, layer in enumerate(self.blocks):
-            x = layer(x, turns, free if number in config.whole else confined)[0]
+        x = patches.flatten(2).transpose(1, 2)
+        for number, block in enumerate(self.blocks):
+            x = block(x, turns, None if number in config.whole else confined)
         return self.merger(x, rows)  # type: ignore[no-any-return]
 
 
@@ -122,10 +154,14 @@ class _Language(layers.Words):
 class Qwen25VL(nn.Module):
     """Both transformers. ``read`` is the prompt, and ``answered`` what comes of tokens after it."""
 
+    frequencies: Tensor
+
     def __init__(self, config: Qwen25VLConfig, prompt: Sequence[Piece]) -> None:
         super().__init__()
         self.config, self.prompt = config, tuple(prompt)
         self.visual, self.language_model = _Vision(config), _Language(config)
+        frequencies = _frequencies(config.text.channels, config.base, config.rounded).to(torch.float32)
+        self.register_buffer("frequencies", frequencies, persistent=False)
 
     def read(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor | None) -> Read:
         """The prompt.
@@ -139,8 +175,9 @@ class Qwen25VL(nn.Module):
         language, batch, device = self.language_model, len(mask), mask.device
         pictures, grids = iter(self._seen(images)), iter(self.config.grids)
         parts, places, valid = [], list[Tensor](), list[Tensor]()
-        # A number until the instruction, of which nobody knows before the call how long it is.
+        # Numbers until the instruction, of which nobody knows before the call how long it is.
         at: Any = 0
+        count: Any
         for piece in self.prompt:
             if piece == "image":
                 parts.append(next(pictures))
@@ -161,30 +198,35 @@ class Qwen25VL(nn.Module):
         seen = torch.cat(valid, 1)
         causal = torch.ones(seen.shape[1], seen.shape[1], dtype=torch.bool, device=device).tril()
         axis = [number for number, section in enumerate(self.config.sections) for _ in range(section)]
-        turns = layers.rotation(torch.cat(places, 1)[..., axis], self.config.text.channels, self.config.base)
+        turns = self._turned(torch.cat(places, 1)[..., axis])
         hidden = layers.added(seen[:, None, None, :] & causal)
         cache = layers.read_prefix(language.layers, torch.cat(parts, 1), turns, hidden)
         return Read(seen, at[:, 0], tuple(cache))
 
-    def answered(self, x: Tensor, read: Read, mask: Tensor) -> Tensor:
+    def answered(self, x: Tensor, read: Read, mask: Tensor, own: Iterable[nn.Module] | None = None) -> Tensor:
         """What the language model makes of tokens ``[B, T, width]`` after the prompt, normalised.
 
         Args:
             mask: whether a token sees another of these, bool ``[T, T]``.
+            own: layers for these tokens, where they are not those that read the prompt.
         """
         turns, hidden = self.after(x, read, mask)
-        for number, layer in enumerate(self.language_model.layers):
+        for number, layer in enumerate(own or self.language_model.layers):
             x = layer(x, turns, hidden, layers.Seen(*read.cache[2 * number : 2 * number + 2]))[0]
         return self.language_model.norm(x)  # type: ignore[no-any-return]
 
     def after(self, x: Tensor, read: Read, mask: Tensor) -> tuple[layers.Rotation, Tensor]:
         """The rotation of tokens after the prompt, and what is added to their scores ``[B, 1, T, P + T]``."""
         count = x.shape[1]
-        places = read.after + torch.arange(count, device=x.device)
-        turns = layers.rotation(places, self.config.text.channels, self.config.base)
+        turns = self._turned((read.after + torch.arange(count, device=x.device))[..., None])
         seen = read.valid[:, None, None].expand(-1, -1, count, -1)
         own = mask[None, None].expand(len(seen), -1, -1, -1)
         return turns, layers.added(torch.cat([seen, own], -1))
+
+    def _turned(self, places: Tensor) -> layers.Rotation:
+        """The rotation of positions ``[B, T, channels / 2]``, or ``[B, T, 1]``."""
+        angles = (places.to(torch.float32) * self.frequencies)[:, None]
+        return layers.Rotation(angles.cos(), angles.sin())
 
     def _seen(self, images: list[Tensor]) -> list[Tensor]:
         """Tokens of each image; those of one size go through their transformer together."""

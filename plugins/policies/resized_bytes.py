@@ -2,6 +2,10 @@
 
 Both multiply by whole numbers, and round after the rows and again after the columns. Sources: ``Resample.c`` of Pillow,
 and ``UpSampleKernelAVXAntialias.h`` of PyTorch, which torchvision calls for images of bytes on a processor.
+
+On a graphics card torchvision makes them floats, and rounds once, at the end. In float32 a sum depends on its order, so
+there it is chance which byte one of 100,000 becomes, and every half. Here weights are those of float32, but sums are in
+float64, and halves go up: so all runtimes come to the same bytes.
 """
 
 from collections.abc import Sequence
@@ -13,9 +17,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.internvl import Colours
 
-Filter = Literal["pillow", "torchvision"]
+Filter = Literal["pillow", "torchvision", "card"]
+"""The last is torchvision on a graphics card."""
 _BEND, _REACH = -0.5, 2
 """Of the cubic filter."""
 _MOST_BITS, _LONGEST = 22, 2**15
@@ -23,14 +29,36 @@ _MOST_BITS, _LONGEST = 22, 2**15
 _HIGH = 2**12
 """A weight is split in two at this fraction, so that sums of both parts are exact in float32."""
 
+_NEARLY = 1e-6
+"""What is so little below a half is one: no order of the sums in float64 makes as much of a difference."""
 
-class ResizedBytes(nn.Module):
-    """Images ``[..., H, W]`` of whole numbers in 0..255, as float32, to another height and width.
+
+def resized(before: tuple[int, int], after: tuple[int, int], own: Filter) -> nn.Module:
+    """What makes of images ``[..., H, W]`` of whole numbers in 0..255, as float32, others of another height and width.
 
     Args:
         before: height and width.
         after: likewise.
     """
+    return _OnceRounded(before, after) if own == "card" else _TwiceRounded(before, after, own)
+
+
+class _OnceRounded(nn.Module):
+    def __init__(self, before: tuple[int, int], after: tuple[int, int]) -> None:
+        super().__init__()
+        self.zoom = ResizeCrop(*before, after, mode="bicubic")
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        rows, columns = (each.to(torch.float64) for each in (self.zoom.rows, self.zoom.columns))
+        whole = (rows @ pixels.to(torch.float64) @ columns + (0.5 + _NEARLY)).floor()
+        return whole.clamp(0, 255).to(torch.float32)
+
+
+class _TwiceRounded(nn.Module):
+    rows_high: Tensor
+    rows_low: Tensor
+    columns_high: Tensor
+    columns_low: Tensor
 
     def __init__(self, before: tuple[int, int], after: tuple[int, int], own: Filter) -> None:
         super().__init__()
@@ -43,7 +71,6 @@ class ResizedBytes(nn.Module):
                 self.register_buffer(f"{axis}_{part}", made, persistent=False)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """See the class."""
         pixels = _rounded(pixels @ self.columns_high, pixels @ self.columns_low)
         return _rounded(self.rows_high @ pixels, self.rows_low @ pixels)
 
@@ -66,7 +93,7 @@ class Shown(nn.Module):
     ) -> None:
         super().__init__()
         pairs = ([pair for pair in pairwise(each) if pair[0] != pair[1]] for each in sizes)
-        self.zooms = nn.ModuleList(nn.Sequential(*(ResizedBytes(*pair, own) for pair in each)) for each in pairs)
+        self.zooms = nn.ModuleList(nn.Sequential(*(resized(*pair, own) for pair in each)) for each in pairs)
         self.colours, self.lower = Colours(mean, deviation), lower
 
     def forward(self, images: list[Tensor]) -> list[Tensor]:
@@ -74,8 +101,8 @@ class Shown(nn.Module):
         shown = []
         for image, zoom in zip(images, self.zooms, strict=True):
             pixels = (image + 1) * 127.5
-            # A byte that came as a fraction of 255 may be a little below itself.
-            pixels = ((pixels + 1e-3).floor() if self.lower else pixels.round()).clamp(0, 255)
+            # A byte that came as a fraction of 255, and was moved to -1..1 and back, may be a little below itself.
+            pixels = ((pixels + 2e-5).floor() if self.lower else pixels.round()).clamp(0, 255)
             shown.append(self.colours(zoom(pixels) / 127.5 - 1))
         return shown
 
@@ -102,7 +129,7 @@ def _weights(before: int, after: int, own: Filter) -> npt.NDArray[np.float64]:
         bits = next(
             n for n in range(_MOST_BITS) if n == _MOST_BITS - 1 or int(0.5 + found.max() * 2 ** (n + 1)) >= _LONGEST
         )
-    return np.trunc(found * 2**bits + np.copysign(0.5, found)) / 2**bits
+    return np.asarray(np.trunc(found * 2**bits + np.copysign(0.5, found)) / 2**bits)
 
 
 def _cubic(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -20,7 +20,7 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.passes.split_frames import SplitFrames
-from ttscompile.policies.resized_bytes import Filter, ResizedBytes
+from ttscompile.policies.resized_bytes import Filter, resized
 
 from ..families.support import record
 from . import eo1s, originals
@@ -90,7 +90,7 @@ def test_bytes_are_resized_as_the_originals_do_it(own: Filter, sizes: tuple[tupl
     else:
         settings: dict[str, Any] = {"mode": "bicubic", "antialias": True, "align_corners": False}
         expected = torch.nn.functional.interpolate(torch.from_numpy(pixels)[None], after, **settings)[0].numpy()
-    found = ResizedBytes(before, after, own)(torch.from_numpy(pixels.astype(np.float32)))
+    found = resized(before, after, own)(torch.from_numpy(pixels.astype(np.float32)))
     np.testing.assert_array_equal(found.numpy(), expected)
 
 

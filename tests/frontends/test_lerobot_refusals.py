@@ -264,7 +264,7 @@ def test_the_action_is_normalised_whatever_the_features_say(tmp_path: Path) -> N
     assert found.scale.tolist() == expected.scale.tolist()
 
 
-@pytest.mark.parametrize("kind", ["vqbet", "wall_x", "molmoact2", "pi0_fast", "something_new"])
+@pytest.mark.parametrize("kind", ["vqbet", "molmoact2", "pi0_fast", "something_new"])
 def test_other_policies_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     """Each with what can be done instead."""
     directory = save_policy(tmp_path)

@@ -111,7 +111,7 @@ def test_other_policies(payload: Callable[..., Any], save: Callable[..., Path], 
         load_checkpoint_policy(save(built))
 
 
-LEROBOT_TYPES = ["vqbet", "pi0_fast", "tdmpc", "sac", "wall_x"]
+LEROBOT_TYPES = ["vqbet", "pi0_fast", "tdmpc", "sac"]
 LEROBOT_TYPES += ["molmoact2", "fastwam", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
@@ -133,6 +133,7 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["config.json=paligemma_variant=gemma_2b", "model.safetensors"], "openpi .*beside .* LeRobot policy pi0 or pi05,"),
     (["30000/model.safetensors", "30000/metadata.pt"], r"openpi .told by 30000/metadata\.pt"),
     (["config.json=model_type=eo1", "model.safetensors"], "an EO-1 .*No tool makes LeRobot's eo1"),
+    (["config.json=dof_config=7", "model.safetensors"], "a Wall-X .*No tool makes LeRobot's wall_x"),
     (["config.json=vlm_name=InternVL3", "mp_rank_00_model_states.pt"], "an Evo-1 .*No tool makes LeRobot's evo1"),
     (["checkpoint-1000/config.json", "checkpoint-1000/model.safetensors"], "around checkpoints .*Give one of those in"),
     (["step_final/config.json", "step_final/checkpoint.pt"], "around checkpoints .*Give one of those in it"),

@@ -1,7 +1,7 @@
 """What holds of every vision-language-action model that is compiled whole from what lerobot saved."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +47,11 @@ def assert_agreement_on_random_plans(compiled: Path, runtime: str) -> None:
     assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=2) < bound(call_terms(artifact))
 
 
-def assert_a_task_alone_makes_files_of_lerobot(directory: Path) -> None:
+def assert_a_task_alone_makes_files_of_lerobot(directory: Path, cameras: Sequence[str] = CAMERAS) -> None:
     """None of lerobot's steps writes what is around the instruction."""
     assert not lerobot_files(directory, load_checkpoint_policy(directory)[1])
     beside = lerobot_files(directory, load_checkpoint_policy(directory, options=LoadOptions(task="go"))[1])
-    assert set(json.loads(beside["config.json"])["input_features"]) == {STATE, *CAMERAS}
+    assert set(json.loads(beside["config.json"])["input_features"]) == {STATE, *cameras}
 
 
 def rename_weight(directory: Path, before: str, after: str) -> None:

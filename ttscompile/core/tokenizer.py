@@ -34,9 +34,11 @@ class Instruction:
         before: lines before the text, of a policy that has some. The text is then stripped, unless it is in a line with
             others.
         skipped: the first so many tokens of all together are no part of the observation.
-        around: what is in the same line before and after the text, of a policy that has such.
+        around: what is directly before and after the text, of a policy that has such.
         plain: whether the text is in lower case, and of its signs only letters, digits, spaces and ``_`` are left.
         otherwise: stands for an empty text.
+        end: of every text, which is added where a text has another.
+        never: what no text may hold, since the original takes it for something else than text.
     """
 
     tokens: str
@@ -47,12 +49,15 @@ class Instruction:
     around: tuple[str, ...] = field(default=(), metadata=OMITTED)
     plain: bool = field(default=False, metadata=OMITTED)
     otherwise: str = field(default="", metadata=OMITTED)
+    end: str = field(default="", metadata=OMITTED)
+    never: tuple[str, ...] = field(default=(), metadata=OMITTED)
 
     def line(self, text: str) -> str:
         """What is tokenized."""
         text = text or self.otherwise
         if self.plain:
             text = "".join(c for c in text.lower() if c.isalnum() or c.isspace() or c == "_") or self.otherwise
+        text = text.removesuffix(self.end) + self.end
         if self.around:
             text = text.join(self.around)
         elif self.before:
@@ -121,6 +126,8 @@ class Tokenizer:
 
     def of_task(self, text: str, told: Instruction, length: int) -> list[int]:
         """The tokens that a policy observes of a task; too many are refused where words after the text would be cut."""
+        if held := [word for word in told.never if word in text]:
+            raise self._error(f"the task {text!r:.100} holds {held[0]}, no text to this policy. Leave it out.")
         most = None if told.around else told.skipped + length
         tokens = self(told.line(text), most)[told.skipped :]
         if told.around and len(tokens) > length:

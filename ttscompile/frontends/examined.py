@@ -21,6 +21,7 @@ from .saved_weights import read_tensors
 from .settings import read_json
 
 PART = "checkpoint"
+_MODELS = ("vlm_model_name", "qwen_model_name", "vlm_base", "pretrained_name_or_path")
 _LEAST = 1e-6
 """A range or deviation below this share of its place is none: of a joint that never moved."""
 _REPEAT = "Compute the statistics again on the data that the policy was trained with, and save it with them."
@@ -105,7 +106,7 @@ def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[s
         told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
         remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
         doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
-    model = next((entries[key] for key in ("vlm_model_name", "qwen_model_name", "vlm_base") if key in entries), "none")
+    model = next((entries[key] for key in _MODELS if key in entries), "none")
     name = str(found.tokenizer.get("tokenizer_name", model))[:200]
     return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, name, found, spec, encoders)]
 

@@ -17,7 +17,7 @@ from .settings import read_json
 
 TYPES = {name: f"lerobot_{name}" for name in "diffusion evo1 groot multi_task_dit smolvla vla_jepa".split()}
 TYPES |= {"pi0": "lerobot_pi", "pi05": "lerobot_pi"}
-TYPES |= {name: f".policies.lerobot_{name}" for name in ("act", "eo1", "xvla")}
+TYPES |= {name: f".policies.lerobot_{name}" for name in ("act", "eo1", "wall_x", "xvla")}
 """The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 
 

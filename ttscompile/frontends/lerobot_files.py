@@ -31,7 +31,7 @@ def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
 
     None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
     normalises with, and without that step tokens would be wrong. None of one that has words before the instruction
-    (evo1, groot, vla_jepa), which no step writes, unless that is compiled in.
+    (eo1, evo1, groot, vla_jepa, wall_x), which no step writes, unless that is compiled in.
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]

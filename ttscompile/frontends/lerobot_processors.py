@@ -37,10 +37,12 @@ GROOT = ("groot_n1_7_pack_inputs_v1", "groot_action_unpack_unnormalize_v2", "gro
 PREPARE, CLIP = "vla_jepa_image_prep", "vla_jepa_clip_actions"
 SNAP, BINARIZE = "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
 CONVERSATION, READ = "eo1_conversation_template_processor", "eo1_qwen_processor"
+SENTENCE = "wall_x_task_processor"
 OWN_STEPS: Mapping[str, tuple[str, ...]] = {
     "xvla": ("xvla_image_to_float", IMAGENET, DOMAIN),
     "vla_jepa": (PREPARE,),
     "eo1": (CONVERSATION, READ),
+    "wall_x": (SENTENCE,),
 }
 """By type of policy, steps before it that no other has, in the order that lerobot saves."""
 _OWN_LATER: Mapping[str, tuple[str, ...]] = {"vla_jepa": (CLIP, SNAP, _UNNORMALIZE, BINARIZE)}
@@ -67,7 +69,7 @@ _NEUTRAL = {"mean": 0.0, "std": 1.0, **dict.fromkeys(("min", "q01", "q10"), -1.0
 
 STATE = "observation.state"
 
-_PADS_STATE = ("pi0", "pi05", "smolvla", "xvla")
+_PADS_STATE = ("pi0", "pi05", "smolvla", "wall_x", "xvla")
 """Types whose network takes states of several widths. A policy that was fine-tuned from a base keeps the base's width
 in its configuration, and only the statistics say how many numbers the state of its robot has."""
 

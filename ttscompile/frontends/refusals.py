@@ -88,6 +88,7 @@ DIRECTORIES = (
     Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT.format("xvla")),
     Refusal(r"^config\.json: paligemma_|(^|/)metadata\.pt$", "a pi0 or pi0.5 of openpi", _PUT.format("pi0 or pi05")),
     Refusal(r"^config\.json: model_type=eo1$", "an EO-1 as its authors save it", _TRAIN.format("eo1")),
+    Refusal(r"^config\.json: dof_config=", "a Wall-X as its authors save it", _TRAIN.format("wall_x")),
     Refusal(r"^config\.json: vlm_name=", "an Evo-1 as its authors save it", _TRAIN.format("evo1")),
     Refusal(r"^config\.json: policy_head_type=unet", "a DexVLA or DiVLA whose head is a U-Net", _HEAD),
     Refusal(r"^(checkpoint-|step_)\w+/config\.json$", "a directory around checkpoints", "Give one of those in it."),
@@ -99,17 +100,12 @@ DIRECTORIES = (
 ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
 """By an entry of a torch checkpoint."""
 
-LEROBOT_TYPES = "act, diffusion, eo1, evo1, groot, multi_task_dit, smolvla, pi0, pi05, vla_jepa or xvla"
+LEROBOT_TYPES = "act, diffusion, eo1, evo1, groot, multi_task_dit, smolvla, pi0, pi05, vla_jepa, wall_x or xvla"
 
 LEROBOT = (
     Refusal(r"^(vqbet|pi0_fast)$", "autoregressive over codes of actions", _NO_LOOP),
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
-    Refusal(
-        r"^wall_x$",
-        "a policy that denoises inside a language model with experts, which are not rebuilt here",
-        f"{_BUILD}: one step of the model over a cached prefix is the module.",
-    ),
     Refusal(r"^molmoact2$", "a policy whose backbone, Molmo, is not rebuilt here", _HEAD),
     Refusal(
         r"^(fastwam|lingbot_va)$",
