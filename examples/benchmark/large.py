@@ -37,7 +37,12 @@ from typing import TYPE_CHECKING
 from memory import watched
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import nn
+
+    from ttscompile import PolicySpec
+
+    Eager = Callable[[], tuple[np.ndarray, list[float]]]
 
 STEPS = 4
 
@@ -54,6 +59,9 @@ WHOLE = {
     "octo": "Octo-small 1.5",
 }
 """Policies that are compiled from what is saved of them, in place of the transformer; LeRobot's are whole."""
+
+ALONE = ("eo1",)
+"""Of these the original is timed before, in a process of its own: 24 GiB do not hold it and the artifact in fp32."""
 
 MOST_FILES = 3
 """Whose sizes are printed by name."""
@@ -184,6 +192,37 @@ def convert_clip(folder: Path) -> None:
 def run_whole(folder: Path, rounds: int, name: str) -> None:
     """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of xvla, Octo and RDT."""
     import large_calls
+
+    original, spec = _timed(folder) if name in ALONE else _original(folder, name)
+    first = "words" if name == "octo" else "vision"
+    large_calls.compare(folder, f"{first}, prefix, loop", original, spec, 2, rounds, name not in ALONE)
+    if name not in ("xvla", "rdt", "octo"):
+        large_calls.reusing(folder, spec, 2, rounds + 2)
+
+
+def time_original(folder: Path, rounds: int, name: str) -> None:
+    """Calls of the original alone, after one that does not count; ``run_whole`` reads what they took."""
+    import numpy as np
+    import torch
+
+    torch.set_num_threads(1)
+    original, _ = _original(folder, name)
+    calls = [original() for _ in range(rounds + 1)]
+    seconds = [statistics.median(part) for part in zip(*(split for _, split in calls[1:]), strict=True)]
+    np.savez(folder / "eager.npz", actions=calls[0][0], seconds=seconds)
+
+
+def _timed(folder: Path) -> tuple[Eager, PolicySpec]:
+    """A call that ``time_original`` made."""
+    import numpy as np
+
+    from ttscompile.artifact.load import load_artifact
+
+    kept = dict(np.load(folder / "eager.npz"))
+    return lambda: (kept["actions"], kept["seconds"].tolist()), load_artifact(folder / "compiled").manifest.spec
+
+
+def _original(folder: Path, name: str) -> tuple[Eager, PolicySpec]:
     import large_smolvla
 
     from ttscompile.frontends import load_checkpoint_policy
@@ -191,11 +230,7 @@ def run_whole(folder: Path, rounds: int, name: str) -> None:
 
     directory, task = saved(folder, name)
     module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
-    original = large_smolvla.eager(module, _vision(module), spec)
-    first = "words" if name == "octo" else "vision"
-    large_calls.compare(folder, f"{first}, prefix, loop", original, spec, 2, rounds)
-    if name not in ("xvla", "rdt", "octo"):
-        large_calls.reusing(folder, spec, 2, rounds + 2)
+    return large_smolvla.eager(module, _vision(module), spec), spec
 
 
 def _vision(module: nn.Module) -> nn.Module:
@@ -262,14 +297,16 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--precision", default="int8", choices=["int8", "int4"], help="of a whole policy")
-    parser.add_argument("--only", choices=["convert", "run"], help="one of the two processes")
+    parser.add_argument("--only", choices=["convert", "eager", "run"], help="one of the processes")
     options = parser.parse_args()
     convert_to = partial(convert_whole, precision=options.precision)
     policies = {name: (partial(convert_to, name=name), partial(run_whole, name=name)) for name in WHOLE}
     policies["clip"] = partial(convert_clip), partial(run_clip)
-    asked = next((own for name, own in policies.items() if getattr(options, name)), None)
+    name, asked = next(((name, own) for name, own in policies.items() if getattr(options, name)), ("", None))
     if asked is not None and options.only == "convert":
         asked[0](options.output)
+    elif options.only == "eager":
+        time_original(options.output, options.rounds, name)
     elif asked is not None and options.only == "run":
         asked[1](options.output, options.rounds)
     elif options.only == "convert":
@@ -284,7 +321,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as temporary:
             folder = options.output or Path(temporary)
             folder.mkdir(parents=True, exist_ok=True)
-            for part in ("convert", "run"):
+            for part in ("convert", *["eager"] * (name in ALONE), "run"):
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
                 own += [f"--{name.replace('_', '-')}" for name in policies if getattr(options, name)]
                 own += [f"--rounds={options.rounds}", f"--precision={options.precision}"]

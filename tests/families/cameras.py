@@ -73,9 +73,9 @@ class Patches(nn.Module):
         self.out = nn.Linear(64, 8)
         self.pooled = kind == "clip"
         with torch.no_grad():
-            patches: Any = self.tower.patch_embed if kind == "windows" else self.tower.embeddings.patch_embedding
             for norm in (each for each in self.tower.modules() if isinstance(each, Norm)):
-                norm.weight += 1  # they wait for weights, and would give nothing
+                norm.weight.fill_(1)  # they wait for weights, and would give nothing
+            (patches,) = (each for each in self.tower.modules() if isinstance(each, nn.Conv2d))
             patches.weight *= 10  # else what is seen is little beside positions
 
     def forward(self, x: Tensor) -> Tensor:
