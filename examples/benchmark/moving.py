@@ -21,14 +21,15 @@ def picture(size: int, rng: np.random.Generator) -> Array:
 
 
 def backgrounds(obs: Mapping[str, np.ndarray], rng: np.random.Generator) -> dict[str, Array]:
-    """A picture for each camera of an observation, whose values are ``[1, frames, 3, S, S]``."""
-    return {key: picture(value.shape[-1], rng) for key, value in obs.items() if value.ndim == 5}
+    """A picture for each camera of an observation, whose values are ``[1, frames, 3, H, W]``."""
+    sizes = {key: value.shape[-2:] for key, value in obs.items() if value.ndim == 5}
+    return {key: picture(max(size), rng)[:, : size[0], : size[1]] for key, size in sizes.items()}
 
 
 def arm(still: Array, angle: float) -> Array:
     """The picture with an arm of two links in front of it, a tenth of it wide."""
-    size = still.shape[-1]
-    y, x = np.mgrid[:size, :size] / size
+    height, width = still.shape[-2:]
+    y, x = np.mgrid[:height, :width] / np.array([[[height]], [[width]]])
     image, foot, turn = still.copy(), np.array([0.95, 0.5]), -np.pi / 2 + angle
     for length in (0.4, 0.35):
         way = length * np.array([np.sin(turn), np.cos(turn)])

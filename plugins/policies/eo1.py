@@ -70,7 +70,7 @@ class Prefix(nn.Module):
         super().__init__()
         self.seen, self.backbone, self.state_proj = seen, network.vlm_backbone, network.state_proj
 
-    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
         """What ``Denoiser`` takes; ``state`` is padded, ``[B, Ds]``, and the others are those of ``Qwen25VL.read``."""
         valid, after, cache = self.backbone.read(self.seen(images), tokens, mask, self.state_proj(state))
         return valid, after, *cache

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ttscompile.core.spec import Instruction, PolicySpec, SamplerTable
 from ttscompile.core.tokenizer import Tokenizer
@@ -17,25 +17,27 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import lerobot_vla as vla
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens
-from ttscompile.frontends.lerobot_config import MOST_LAYERS, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
+from ttscompile.frontends.instruction import encoder_folders, language_model_folder
+from ttscompile.frontends.lerobot_config import CONFIG, MOST_LAYERS, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
 from ttscompile.frontends.lerobot_policy import MASK, TOKENS, integration_steps, read_weights
 from ttscompile.frontends.lerobot_processors import CONVERSATION, READ, Processors
-from ttscompile.frontends.lerobot_qwen3_vl import END, IMAGE, TURN, Resizing
+from ttscompile.frontends.lerobot_qwen3_vl import END, IMAGE, TURN, Resizing, require_template
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings
 
 from .eo1 import ACTIVATIONS, EO1, Denoiser, EO1Config, Prefix
-from .lerobot_qwen25_vl import DEVIATION, KIND, MEAN, of_backbone, pieces, read_pictures, read_qwen25
-from .qwen25_vl import Piece, Qwen25VLConfig
+from .lerobot_qwen25_vl import DEVIATION, KIND, MEAN, pieces, read_pictures, read_qwen25
+from .qwen25_vl import Piece, Qwen25VLConfig, rebuilt_weights
 from .resized_bytes import Filter, Shown
 
 _MODEL = "Qwen/Qwen2.5-VL-3B-Instruct"
 _LENGTH = 64
 """Tokens of an instruction, of a policy that none is compiled into; lerobot has no limit."""
 _PIXELS, _MOST_PIXELS = {"min": 64 * 28 * 28, "max": 128 * 28 * 28}, 2**24
-_INNER = "vlm_backbone."
+_INNER, _HEAD = "vlm_backbone.", "lm_head.weight"
 _SYSTEM = "<|im_start|>system\nYou are a helpful physical assistant.<|im_end|>\n"
+_TOLD = Instruction(TOKENS, MASK, False, around=("", ""), never=("<|",))
+"""With something around it, if only nothing, one that is too long is refused: lerobot reads it to its end."""
 _STATE = ("<|state_start|>", "<|state_pad|>", "<|state_end|>")
 _ACTIONS, _TASK = ("<|action_start|>", "<|action_pad|>", "<|action_end|>"), "<|vla|>"
 
@@ -62,21 +64,26 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     model, folders = vla.part_of(settings, "vlm_config"), encoder_folders(options.encoders, directory)
     folder = language_model_folder(reader.name, folders, KIND)
     language = read_qwen25(model)
-    read_pictures(folder, language).require(image_mean=list(MEAN), image_std=list(DEVIATION))
+    read_pictures(folder, language, model).require(image_mean=list(MEAN), image_std=list(DEVIATION))
+    require_template(folder, "")  # its own words are left out where the first message is the system's
     sizes = [(shape[1], shape[2]) for shape in shared.cameras.values()]
     shown = [Resizing(language.patch * language.merge, *reader.pixels)(*each) for each in sizes]
     language = language.of_images(shown)
     prompt, config = _prompt(folder, language, model), read_config(shared, language)
     numbers, task = {"actions": config.actions, "tokens": _LENGTH, "vocabulary": language.vocabulary}, None
     if options.task is not None:
-        task = torch.tensor([task_tokens(options.task, reader.name, folder, None, language.vocabulary)])
-    weights = {name.removeprefix("model."): value for name, value in read_weights(shared, options).items()}
-    network = filled(lambda: EO1(config, prompt), of_backbone(weights, _INNER), "config.json", directory)
+        made = Tokenizer(folder, CheckpointError).of_task(options.task, _TOLD, MOST_VOCABULARY)
+        if not made or max(made) >= language.vocabulary:
+            found = (
+                f"has the tokens {made!s:.80} of {language.vocabulary} that the backbone knows; expected some of them"
+            )
+            raise CheckpointError(f"{folder}: the task {options.task!r:.100} {found}.")
+        task = torch.tensor([made])
+    network = filled(lambda: EO1(config, prompt), _read_weights(shared, options, model), CONFIG, directory)
     seen = Shown(list(zip(sizes, shown, strict=True)), reader.filter, MEAN, DEVIATION)
     encoder = vla.Gathered(shared, processors, Prefix(network, seen), config.state, task)
-    # What is around an instruction here makes that one which is too long is refused: lerobot reads it to its end.
-    told, table = Instruction(TOKENS, MASK, False, around=("", "")), partial(_sampler, settings)
-    spec = vla.vla_spec(shared, processors, None, "stretch", numbers, options, table, told)
+    table = partial(_sampler, settings)
+    spec = vla.vla_spec(shared, processors, None, "stretch", numbers, options, table, _TOLD)
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
 
@@ -101,9 +108,19 @@ def _read_reader(shared: LeRobotConfig, processors: Processors) -> _Reader:
         raise CheckpointError(f"{shared.directory}: its preprocessor has no {' and no '.join(missing)}. Save it again.")
     told, own = (Settings(processors.own[name], f"{shared.directory}: {name}.") for name in (CONVERSATION, READ))
     told.require(chunk_size=shared.horizon)
+    shown, known = _cameras(told), _cameras(shared.settings)
+    if shown != known:
+        expected = f"those of {CONFIG}, {', '.join(known)}, in their order. Save the policy again"
+        raise told.error(f"input_features has the cameras {', '.join(shown) or 'none'}; expected {expected}")
     least, most = (own.number(f"image_{name}_pixels", count, _MOST_PIXELS) for name, count in _PIXELS.items())
     fast = own.flag("use_fast_processor", False)
     return _Reader(own.text("processor_name", _MODEL, MOST_LETTERS), (least, most), "torchvision" if fast else "pillow")
+
+
+def _cameras(settings: Settings) -> list[str]:
+    """Names of the cameras among the input features, in their order."""
+    features = settings.part("input_features").values
+    return [key for key, one in features.items() if isinstance(one, dict) and one.get("type") == "VISUAL"]
 
 
 def _prompt(folder: Path, language: Qwen25VLConfig, model: Settings) -> list[Piece]:
@@ -119,6 +136,20 @@ def _prompt(folder: Path, language: Qwen25VLConfig, model: Settings) -> list[Pie
             f" and tokens up to {max(*before, *later)} of {language.vocabulary}. It is of another model."
         )
     return [*pieces(before, image, state), "task", tuple(later)]
+
+
+def _read_weights(shared: LeRobotConfig, options: LoadOptions, model: Settings) -> dict[str, Tensor]:
+    """The weights under the names of ``EO1``."""
+    either = {**vla.part_of(model, "text_config").values, **model.values}
+    tied = Settings(either, model.where).flag("tie_word_embeddings", False)
+    saved = read_weights(shared, options, *([] if tied else [_HEAD]))
+    weights = {name.removeprefix("model."): value for name, value in saved.items()}
+    found = {name: value for name, value in weights.items() if not name.startswith(_INNER)}
+    own = {name.removeprefix(f"{_INNER}model."): value for name, value in weights.items() if name not in found}
+    head = own.pop(f"{_INNER}{_HEAD}", None)  # the numbers of the embedding, of which a file may have either
+    if head is not None:
+        own.setdefault("language_model.embed_tokens.weight", head)
+    return found | {f"{_INNER}{name}": value for name, value in rebuilt_weights(own).items()}
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:

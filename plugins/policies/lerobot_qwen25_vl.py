@@ -1,18 +1,16 @@
 """Qwen2.5-VL inside a LeRobot policy: its sizes, its weights, and how images come to it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-
-from torch import Tensor
 
 from ttscompile.frontends import lerobot_vla as vla
 from ttscompile.frontends.language_layers import LanguageConfig
 from ttscompile.frontends.lerobot_config import MOST, MOST_LAYERS, MOST_VOCABULARY
 from ttscompile.frontends.settings import Settings, read_json
 
-from .qwen25_vl import Piece, Qwen25VLConfig, rebuilt_weights
+from .qwen25_vl import Piece, Qwen25VLConfig
 
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Of the colours that the vision transformer was trained on, in 0..1."""
@@ -29,8 +27,9 @@ def read_qwen25(model: Settings) -> Qwen25VLConfig:
     rope.choice("rope_type" if "rope_type" in rope.values else "type", "default", "mrope")
     depth, sections = image.number("depth", 32, MOST_LAYERS), rope.values.get("mrope_section")
     whole = image.values.get("fullatt_block_indexes", [7, 15, 23, 31])
-    if not isinstance(whole, list) or not all(type(one) is int for one in whole):
-        raise image.refusal("fullatt_block_indexes", "numbers of layers")
+    given = "fullatt_block_indexes" in image.values
+    if not isinstance(whole, list) or (given and not set(map(repr, whole)) <= set(map(repr, range(depth)))):
+        raise image.refusal("fullatt_block_indexes", f"numbers of layers, from 0 to {depth - 1}")
     if not isinstance(sections, list) or [type(one) for one in sections] != [int] * 3 or min(sections) < 0:
         raise rope.refusal("mrope_section", "three whole numbers")
     width, heads = image.number("hidden_size", 3584, MOST), image.number("num_heads", 16, MOST)
@@ -60,30 +59,21 @@ def read_qwen25(model: Settings) -> Qwen25VLConfig:
     )
 
 
-def read_pictures(folder: Path, config: Qwen25VLConfig) -> Settings:
-    """How the processor in this folder reads images. Raises unless they reach the vision transformer as it expects."""
+def read_pictures(folder: Path, config: Qwen25VLConfig, model: Settings) -> Settings:
+    """How the processor in this folder reads images. Raises unless they reach the vision transformer as it expects.
+
+    Args:
+        model: entries of the backbone's ``config.json``.
+    """
     name, both = "preprocessor_config.json", folder / "processor_config.json"
     found = read_json(both).get("image_processor") if both.is_file() else None  # which transformers prefers
     if not isinstance(found, dict):
         found, both = read_json(folder / name), folder / name
     own = Settings({"patch_size": 14, "merge_size": 2, **found}, f"{both}: ")
-    own.require(patch_size=config.patch, merge_size=config.merge, rescale_factor=1 / 255)
+    frames = vla.part_of(model, "vision_config").number("temporal_patch_size", 2, MOST)
+    own.require(patch_size=config.patch, merge_size=config.merge, temporal_patch_size=frames, rescale_factor=1 / 255)
     own.require(do_resize=True, do_rescale=True, do_normalize=True, resample=3)
     return own
-
-
-def of_backbone(saved: Mapping[str, Tensor], inner: str) -> dict[str, Tensor]:
-    """The weights, the backbone's under those names that ``Qwen25VL`` has for them.
-
-    Args:
-        inner: how the names of the backbone's begin.
-    """
-    found = {name: value for name, value in saved.items() if not name.startswith(inner)}
-    own = {name.removeprefix(f"{inner}model."): value for name, value in saved.items() if name not in found}
-    tied = own.pop(f"{inner}lm_head.weight", None)  # the numbers of the embedding, of which a file may have either
-    if tied is not None:
-        own.setdefault(_EMBEDDING, tied)
-    return found | {f"{inner}{name}": value for name, value in rebuilt_weights(own).items()}
 
 
 def pieces(tokens: Sequence[int], image: int, state: int) -> list[Piece]:

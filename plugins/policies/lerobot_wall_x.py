@@ -93,8 +93,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     base = _read_base(language_model_folder(name, encoder_folders(options.encoders, directory), KIND))
     language = replace(read_qwen25(base.model), rounded=True)
     text, expert = _read_experts(vla.part_of(base.model, "text_config"), language.text)
-    pictures = read_pictures(base.folder, language)
-    pictures.require(temporal_patch_size=vla.part_of(base.model, "vision_config").number("temporal_patch_size", 2))
+    pictures = read_pictures(base.folder, language, base.model)
     sizes = _read_sizes(shared, pictures, language)
     language = replace(language, text=text).of_images([each[-1] for each in sizes])
     prompt, config = _read_prompt(shared, base, language, options.task), _read_config(shared, language, expert)
@@ -173,7 +172,8 @@ def _read_sizes(
         wide = width > height
         other = int(_LONGER_SIDE * height / width) if wide else int(_LONGER_SIDE * width / height)
         if _MOST_RATIO * other < _LONGER_SIDE:
-            told = f"images of {key} have {height} x {width} pixels; expected sides of a ratio of {_MOST_RATIO} at most"
+            told = f"images of {key} have {height} x {width} pixels, of which lerobot makes {other} x {_LONGER_SIDE}"
+            told += f"; expected sides of a ratio of {_MOST_RATIO} at most"
             raise shared.settings.error(told)
         first = (other, _LONGER_SIDE) if wide else (_LONGER_SIDE, other)
         rows, columns = (max(_MULTIPLE, round(side / _MULTIPLE) * _MULTIPLE) for side in first)

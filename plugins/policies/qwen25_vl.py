@@ -163,14 +163,14 @@ class Qwen25VL(nn.Module):
         frequencies = _frequencies(config.text.channels, config.base, config.rounded).to(torch.float32)
         self.register_buffer("frequencies", frequencies, persistent=False)
 
-    def read(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor | None) -> Read:
+    def read(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> Read:
         """The prompt.
 
         Args:
             images: of each camera ``[B, 3, H, W]``, normalised.
             tokens: of the instruction, int64 ``[B, L]``.
             mask: bool ``[B, L]``; padding is at the end.
-            state: as a token, ``[B, width]``; None where the prompt has none.
+            state: as a token, ``[B, width]``.
         """
         language, batch, device = self.language_model, len(mask), mask.device
         pictures, grids = iter(self._seen(images)), iter(self.config.grids)
@@ -184,7 +184,7 @@ class Qwen25VL(nn.Module):
                 rows, columns = (side // self.config.merge for side in next(grids))
                 sides = (torch.arange(side, device=device) for side in (1, rows, columns))
                 own, count = torch.cartesian_prod(*sides), max(rows, columns)
-            elif piece == "state" and state is not None:
+            elif piece == "state":
                 parts.append(state[:, None])
                 own, count = torch.zeros(1, 3, dtype=torch.int64, device=device), 1
             else:

@@ -26,8 +26,6 @@ _BEND, _REACH = -0.5, 2
 """Of the cubic filter."""
 _MOST_BITS, _LONGEST = 22, 2**15
 """Bits after the point of a weight; torchvision takes as many as leave its largest one below 2 ** 15."""
-_HIGH = 2**12
-"""A weight is split in two at this fraction, so that sums of both parts are exact in float32."""
 
 _NEARLY = 1e-6
 """What is so little below a half is one: no order of the sums in float64 makes as much of a difference."""
@@ -50,29 +48,24 @@ class _OnceRounded(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         rows, columns = (each.to(torch.float64) for each in (self.zoom.rows, self.zoom.columns))
-        whole = (rows @ pixels.to(torch.float64) @ columns + (0.5 + _NEARLY)).floor()
-        return whole.clamp(0, 255).to(torch.float32)
+        return _rounded(rows @ pixels.to(torch.float64) @ columns + _NEARLY).to(torch.float32)
 
 
 class _TwiceRounded(nn.Module):
-    rows_high: Tensor
-    rows_low: Tensor
-    columns_high: Tensor
-    columns_low: Tensor
+    rows: Tensor
+    columns: Tensor
 
     def __init__(self, before: tuple[int, int], after: tuple[int, int], own: Filter) -> None:
         super().__init__()
-        for axis, old, new in zip(("rows", "columns"), before, after, strict=True):
-            weights = _weights(old, new, own)
-            high = np.rint(weights * _HIGH) / _HIGH
-            for part, value in (("high", high), ("low", weights - high)):
-                turned = value if axis == "rows" else value.T
-                made = torch.tensor(np.ascontiguousarray(turned), dtype=torch.float32, device="cpu")
-                self.register_buffer(f"{axis}_{part}", made, persistent=False)
+        rows, columns = (_weights(old, new, own) for old, new in zip(before, after, strict=True))
+        for name, value in (("rows", rows), ("columns", columns.T)):
+            made = torch.tensor(np.ascontiguousarray(value), dtype=torch.float32, device="cpu")
+            self.register_buffer(name, made, persistent=False)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        pixels = _rounded(pixels @ self.columns_high, pixels @ self.columns_low)
-        return _rounded(self.rows_high @ pixels, self.rows_low @ pixels)
+        # Sums are exact in float64; and such products are made in eight bits by no precision of an artifact.
+        pixels = _rounded(pixels.to(torch.float64) @ self.columns.to(torch.float64))
+        return _rounded(self.rows.to(torch.float64) @ pixels).to(torch.float32)
 
 
 class Shown(nn.Module):
@@ -107,11 +100,9 @@ class Shown(nn.Module):
         return shown
 
 
-def _rounded(high: Tensor, low: Tensor) -> Tensor:
-    """The sum of both to the nearest byte, halves up."""
-    moved = high + 0.5
-    whole = moved.floor()
-    return (whole + (moved - whole + low).floor()).clamp(0, 255)
+def _rounded(sums: Tensor) -> Tensor:
+    """To the nearest byte, halves up."""
+    return (sums + 0.5).floor().clamp(0, 255)
 
 
 def _weights(before: int, after: int, own: Filter) -> npt.NDArray[np.float64]:

@@ -7,7 +7,6 @@ under way together, and copies answer those of one plan in batches (``copies``).
 from __future__ import annotations
 
 import asyncio
-import os
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ import numpy as np
 
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
+from ttscompile.core.tokenizer import TASK
 from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.instruct import Instruct
@@ -84,11 +84,10 @@ class FleetServer(Listener):
         waiting: requests that may be under way; further ones are refused.
         limits: what clients may do; None for the defaults.
         lock: who may come in; None lets every program of this machine in, and nobody else.
-        tokenizer: of a policy that reads an instruction, so that robots may send it as text; see ``Instruct``.
+        instruct: of a policy that reads an instruction, so that robots may send it as text.
 
     Raises:
         IllegalPlanError: see ``Plans.of``.
-        ObservationError: see ``Instruct``.
     """
 
     methods = METHODS
@@ -101,13 +100,13 @@ class FleetServer(Listener):
         waiting: int = 256,
         limits: ServerLimits | None = None,
         lock: Lock | None = None,
-        tokenizer: str | os.PathLike[str] | None = None,
+        instruct: Instruct | None = None,
     ) -> None:
         super().__init__(limits, lock)
         self._manifest, self._copies, self._most = artifact.manifest, copies, waiting
         self._plans = Plans.of(artifact, plan)
         self._specs = artifact.manifest.spec.observations
-        self._instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
+        self._instruct = instruct
         self._waiting = 0
         self._seconds: Counter[float] = Counter()
         self._took = 0.0
@@ -157,7 +156,8 @@ class FleetServer(Listener):
         frame: Mapping[str, Any] = read_frame(given, self._specs)
         obs = dict(frame if self._instruct is None else self._instruct.of_frame(frame))
         if obs.keys() != self._specs.keys():
-            raise ObservationError(f"expected an observation of {sorted(self._specs)}; found {sorted(obs)[:20]}.")
+            text = " Text needs a server with a tokenizer (serve: --tokenizer)." * (TASK in obs)
+            raise ObservationError(f"expected an observation of {sorted(self._specs)}; found {sorted(obs)[:20]}.{text}")
         for key, one in self._specs.items():
             array = obs[key]
             if (array.shape, str(array.dtype)) != (one.shape, one.dtype) or not np.isfinite(array).all():

@@ -23,7 +23,7 @@ SAVED = Path(__file__).parent / "golden" / "lerobot_eo1"
 BACKBONE = "Qwen2.5-VL-tiny"
 STATE_DIM, ACTION_DIM, HORIZON = 4, 5, 6
 STATE_PADDED, PADDED = 7, 9
-SIZES = {"plain": (((24, 32), (24, 32)), ((30, 21), (64, 40))), "deep": (((33, 48), (20, 36)), ((41, 24), (16, 50)))}
+SIZES = {"plain": (((24, 32), (30, 27)), ((30, 21), (64, 40))), "deep": (((33, 48), (20, 36)), ((41, 24), (16, 50)))}
 """Height and width of each camera's images, in each call."""
 
 

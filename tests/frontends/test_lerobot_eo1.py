@@ -15,8 +15,10 @@ import ttscompile
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise
+from ttscompile.core.tokenizer import Tokenizer, padded
 from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.passes.split_frames import SplitFrames
@@ -134,6 +136,34 @@ def test_in_eight_bits_its_actions_are_near(tmp_path: Path, golden: Mapping[str,
     found = policy.predict_action_chunk(given | {"task": eo1s.TASKS[0]}, noise=Noise(eo1s.noise()))
     assert 1e-5 < np.abs(found - golden["plain.0"][:, :4]).max() < 0.3
     assert ttscompile.verify(tmp_path / "compiled", calls=1).passed
+    lowered = [name for name in load_artifact(tmp_path / "compiled").weights if name.endswith(".int8")]
+    assert not [name for name in lowered if "zooms" in name], "images are resized as they are in float32"
+
+
+def test_instructions_of_one_batch_may_differ_in_length(tmp_path: Path) -> None:
+    """Padding is in the middle of the prompt: what comes after it has the positions that it has without."""
+    module, spec = load_checkpoint_policy(eo1s.save("deep", tmp_path))
+    given, told = eo1s.observation("deep", 0), [[5, 6, 7, 8, 9], [11]]
+    tokens, mask = padded(told, spec.observations[TOKENS].shape[0])
+    both: dict[str, Any] = {key: np.stack([value[None]] * 2) for key, value in given.items()} | {
+        TOKENS: tokens,
+        MASK: mask,
+    }
+    noise = Noise(np.concatenate([eo1s.noise()] * 2))
+    run = eager_policy(module, spec)
+    together = run({key: torch.from_numpy(value) for key, value in both.items()}, noise)
+    for row in (0, 1):
+        own = {key: torch.from_numpy(value[row : row + 1]) for key, value in both.items()}
+        alone = run(own, Noise(eo1s.noise()))[0]
+        torch.testing.assert_close(together[row], alone, rtol=0, atol=2e-6)
+    assert (together[0] - together[1]).abs().max() > 0.01
+
+
+def test_the_statistics_say_how_wide_the_state_is(directory: Path, golden: Mapping[str, Array]) -> None:
+    """A policy that was fine-tuned from a base has the base's width in its configuration."""
+    config = json.loads((directory / "config.json").read_text())["input_features"]
+    change_json(directory / "config.json", input_features=config | {STATE: {"type": "STATE", "shape": [6]}})
+    assert np.abs(eager(directory, "plain", 0) - golden["plain.0"]).max() < 2e-5
 
 
 @pytest.mark.slow
@@ -202,7 +232,11 @@ def test_what_is_not_rebuilt_is_named(directory: Path, changes: dict[str, Any], 
         ("text_config", {"use_sliding_window": True}, "use_sliding_window is True; expected false"),
         ("text_config", {"hidden_act": "gelu"}, "hidden_act is 'gelu'; expected silu"),
         ("text_config", {"num_hidden_layers": 2}, "language_model.layers.2"),
-        ("vision_config", {"fullatt_block_indexes": "1"}, "fullatt_block_indexes is '1'; expected numbers of layers"),
+        (
+            "vision_config",
+            {"fullatt_block_indexes": "1"},
+            "fullatt_block_indexes is '1'; expected numbers of layers, from 0 to 2",
+        ),
         ("vision_config", {"window_size": 4}, "window_size 4; expected .* windows of a token at least"),
         ("vision_config", {"num_heads": 3}, "num_heads 3 .*expected heads of a multiple of 4"),
         ("vision_config", {"in_channels": 1}, "in_channels is 1; expected 3"),
@@ -250,13 +284,16 @@ def test_images_that_reach_the_backbone_otherwise(directory: Path, changes: dict
         ),
         ({"image_min_pixels": None}, "image_min_pixels is None; expected a positive whole number"),
         ({"registry_name": "mine"}, "the step 'mine' is not known here"),
+        ({"input_features": {}}, r"has the cameras none; expected those of config\.json, observation\.images\.front, "),
+        ({"chunk_size": 9}, "chunk_size is 9; expected 6"),
         ({"registry_name": "to_batch_processor"}, "has no eo1_qwen_processor. Save it again"),
     ],
 )
 def test_a_preprocessor_that_is_not_rebuilt_is_named(directory: Path, changes: dict[str, Any], message: str) -> None:
     path = directory / "policy_preprocessor.json"
     steps = json.loads(path.read_text())["steps"]
-    (own,) = [step for step in steps if step["registry_name"] == "eo1_qwen_processor"]
+    name = "conversation_template" if set(changes) & {"input_features", "chunk_size"} else "qwen"
+    (own,) = [step for step in steps if step["registry_name"] == f"eo1_{name}_processor"]
     own["registry_name"] = changes.pop("registry_name", own["registry_name"])
     own["config"] |= changes
     if "processor_name" in changes:
@@ -264,6 +301,22 @@ def test_a_preprocessor_that_is_not_rebuilt_is_named(directory: Path, changes: d
     change_json(path, steps=steps)
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint_policy(directory)
+
+
+def test_a_chat_template_of_another_model_is_named(directory: Path) -> None:
+    (directory.parent / eo1s.BACKBONE / "chat_template.jinja").write_text("{{ messages }}")
+    with pytest.raises(CheckpointError, match="its chat template is another one than is rebuilt here; expected Qwen's"):
+        load_checkpoint_policy(directory)
+
+
+@pytest.mark.parametrize("task", ["<|image_pad|>", "push <|state_pad|>"])
+def test_what_is_no_text_to_lerobot_is_refused(directory: Path, task: str) -> None:
+    with pytest.raises(CheckpointError, match=r"holds <\|, no text to this policy"):
+        load_checkpoint_policy(directory, options=LoadOptions(task=task))
+    told = load_checkpoint_policy(directory)[1].instruction
+    assert told is not None
+    with pytest.raises(ObservationError, match="no text to this policy"):
+        Tokenizer(TOKENIZER, ObservationError).of_task(task, told, 64)
 
 
 def test_a_tokenizer_of_another_model_is_named(directory: Path) -> None:

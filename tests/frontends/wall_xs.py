@@ -58,7 +58,7 @@ def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
 
 
 def observation(kind: str, call: int) -> dict[str, Array]:
-    """One frame, of bytes as a camera has them; of the second call's images the sizes are others, and so is the state."""
+    """One frame, of bytes as cameras have them; in the second call sizes of images and the state are others."""
     rng = np.random.RandomState(call + 3)
     found: dict[str, Array] = {STATE: rng.standard_normal(STATE_DIM[kind]).astype(np.float32)}
     pairs = zip(CAMERAS[kind], SIZES[kind][call], strict=True)

@@ -100,6 +100,8 @@ class Small(nn.Module):
             x = x + image.mean((1, 2, 3))[:, None, None]
         q, k, v = self.qkv(functional.layer_norm(x, (8,))).unflatten(-1, (3, 8)).unbind(2)
         mask = torch.ones(16, 16).tril() if self.change == "masked" else None
+        if self.change == "masked by the picture":
+            mask = seen.mean((1, 2, 3))[:, None, None, None] + torch.ones(16, 16)
         mixed = functional.scaled_dot_product_attention(
             q[:, None], k[:, None], v[:, None], attn_mask=mask, is_causal=self.change == "causal"
         )
@@ -133,6 +135,7 @@ def found(change: str) -> object:
         ("overlap", "kernel [4, 4], stride (2, 2)"),
         ("transposed", "has not a row for each patch, in their order"),
         ("smeared", "depends on more than the patches"),
+        ("masked by the picture", "depends on more than %add"),
         ("causal", "tokens come together otherwise than by attention"),
         ("written out", "tokens come together otherwise than by attention"),
         ("beside", "tokens come together otherwise than by attention"),

@@ -29,6 +29,7 @@ from ttscompile.cli.types import ADDRESS, ANY_TEXT, FILE, PATH, RATE, TEXT
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, OpenPiServer, Plans, ray_copies
+from ttscompile.runtimes.instruct import Instruct
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.server.admission import AUDIT, ServerLimits
 from ttscompile.runtimes.server.executor_server import ExecutorServer
@@ -275,6 +276,7 @@ def _serve_fleet(
 ) -> None:
     console, artifact = progress(), load_artifact(directory)
     Plans.of(artifact, plan)  # before copies are started, which takes a while
+    instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
     output, identity = sys.stdout, artifact.manifest.identity
     limits = ServerLimits.of(artifact.manifest.spec.observations, FLEET_CLIENTS)
     with (
@@ -283,7 +285,7 @@ def _serve_fleet(
         ray_copies(ray, directory, identity, settings) as copies,
     ):
         waiting = BATCHES_WAITING * settings.copies * settings.batch
-        fleet = FleetServer(artifact, copies, plan, waiting, limits, server.lock, tokenizer)
+        fleet = FleetServer(artifact, copies, plan, waiting, limits, server.lock, instruct)
         status.stop()
         server.warn(console)
         asyncio.run(server.serve(fleet, identity, output))

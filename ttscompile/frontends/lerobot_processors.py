@@ -69,7 +69,7 @@ _NEUTRAL = {"mean": 0.0, "std": 1.0, **dict.fromkeys(("min", "q01", "q10"), -1.0
 
 STATE = "observation.state"
 
-_PADS_STATE = ("pi0", "pi05", "smolvla", "wall_x", "xvla")
+_PADS_STATE = ("eo1", "pi0", "pi05", "smolvla", "wall_x", "xvla")
 """Types whose network takes states of several widths. A policy that was fine-tuned from a base keeps the base's width
 in its configuration, and only the statistics say how many numbers the state of its robot has."""
 

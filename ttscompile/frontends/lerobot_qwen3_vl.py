@@ -81,14 +81,20 @@ def read_resizing(backbone: Backbone) -> Resizing:
     own = Settings({"patch_size": None, "merge_size": None, **found}, f"{whole}: ")
     own.require(patch_size=patch, merge_size=merge, image_mean=half, image_std=half, do_normalize=True, do_rescale=True)
     own.require(do_resize=True, resample=3, min_pixels=None, max_pixels=None)
-    path, entry = folder / "chat_template.jinja", read_json(folder / "tokenizer_config.json").get("chat_template")
-    template = path.read_text("utf-8", "replace")[:MOST_VOCABULARY] if path.is_file() else entry
-    wanted, told = ("<|im_start|>", IMAGE, END), str(template)
-    if template is not None and (not all(word in told for word in wanted) or "helpful assist" in told):
-        expected = f"Qwen3-VL's: {' '.join(wanted)}, and no words of its own"
-        raise CheckpointError(f"{folder}: its chat template is another one than is rebuilt here; expected {expected}.")
+    require_template(folder, "helpful assist")
     size = vla.part_of(own, "size")
     return Resizing(patch * merge, *(size.number(f"{entry}_edge", most=2**31) for entry in ("shortest", "longest")))
+
+
+def require_template(folder: Path, own: str) -> None:
+    """Raise unless the folder's chat template, if it has one, writes prompts as is rebuilt here, without ``own``."""
+    path, beside = folder / "chat_template.jinja", folder / "tokenizer_config.json"
+    entry = read_json(beside).get("chat_template") if beside.is_file() else None
+    template = path.read_text("utf-8", "replace")[:MOST_VOCABULARY] if path.is_file() else entry
+    wanted, told = ("<|im_start|>", IMAGE, END), str(template)
+    if template is not None and (not all(word in told for word in wanted) or (own and own in told)):
+        expected = f"Qwen's: {' '.join(wanted)}{own and ', and no words of its own'}"
+        raise CheckpointError(f"{folder}: its chat template is another one than is rebuilt here; expected {expected}.")
 
 
 def read_language(model: Settings, layers: int, images: list[tuple[int, int]]) -> Qwen3VLConfig:

@@ -64,14 +64,15 @@ def require_memory_for(path: Path, sizes: Iterable[tuple[int, bool]]) -> None:
     """The same of tensors that the file at ``path`` has: how many numbers each has, and whether it is float32."""
     sizes = list(sizes)
     numbers, copied = sum(count for count, _ in sizes), BYTES_A_COPY * sum(n for n, single in sizes if not single)
-    room, there = shutil.disk_usage(_on_disk()).free, memory_bytes()
+    (folder, room), there = _room(), memory_bytes()
     need = BYTES_A_WEIGHT * numbers + copied * (not _LEAST_MAPPED <= copied <= room)
     if need > there:
-        wanting = f"; {copied / 2**30:.1f} are copies, which {_on_disk()} (TMPDIR) has no room for" * (copied > room)
+        larger = "onvert on a larger one: in precision 'int4' the artifact takes about a byte a weight to run."
+        disk = f"Set TMPDIR to a folder with {copied / 2**30:.1f} GiB for copies, which {folder} has not; or c{larger}"
+        remedy = disk if copied > max(room, _LEAST_MAPPED) else f"C{larger}"
         raise CheckpointError(
             f"{path}: {numbers / 1e6:,.0f} million weights. Compiling them takes about {need / 2**30:.1f} GiB of memory"
-            f" beside the file{wanting}; this machine has {there / 2**30:.1f} GiB. Convert on a larger one: in"
-            " precision 'int4' the artifact takes about a byte a weight to run."
+            f" beside the file; this machine has {there / 2**30:.1f} GiB. {remedy}"
         )
 
 
@@ -118,7 +119,7 @@ def _copies(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     if size < _LEAST_MAPPED:
         return {name: value.detach().to(torch.float32) for name, value in weights.items()}
     try:
-        with tempfile.TemporaryFile(dir=_on_disk()) as file:
+        with tempfile.TemporaryFile(dir=_room()[0]) as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a disk that is full later would end the process
             numbers = torch.frombuffer(mmap.mmap(file.fileno(), size), dtype=torch.float32)
     except (OSError, AttributeError):  # macOS does not reserve
@@ -130,10 +131,12 @@ def _copies(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return found
 
 
-def _on_disk() -> str:
-    """Where large files for a while are put; the folder for small ones is memory on many machines."""
+def _room() -> tuple[str, int]:
+    """Where large files for a while are put, and the bytes there; ``/tmp`` is memory on many machines."""
     large = Path("/var/tmp")  # noqa: S108 - what tempfile makes there has no name
-    return os.environ.get("TMPDIR") or (str(large) if large.is_dir() else tempfile.gettempdir())
+    folder = os.environ.get("TMPDIR") or (str(large) if large.is_dir() else tempfile.gettempdir())
+    usable = hasattr(os, "posix_fallocate") and os.access(folder, os.W_OK | os.X_OK)
+    return folder, shutil.disk_usage(folder).free if usable else 0
 
 
 def filled(make: Callable[[], Network], weights: Mapping[str, torch.Tensor], source: str, where: Path) -> Network:

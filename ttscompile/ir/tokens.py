@@ -59,6 +59,8 @@ def find_tokens(tower: Graph, weights: Weights) -> TokenStream | str:
     entry = _entry(tower, first.name)
     if entry is None:
         return f"no value holds what the patches of %{first.name} give, and all that follows from them"
+    if set(backward_slice(tower, tower.outputs, {entry: types[entry]}).inputs) != {entry}:
+        return f"what it gives depends on more than %{entry}"
     placed = _patches_of(tower, pixels, entry, weights)
     shape = types[first.name].shape
     fixed = len(placed) - shape[2] * shape[3] if isinstance(shape[2], int) and isinstance(shape[3], int) else 0

@@ -354,9 +354,11 @@ def test_the_server_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_tokenizer_that_the_policy_has_no_use_for_is_refused(toy_compiled: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(main, ["serve", str(toy_compiled), "--openpi", "--tokenizer", str(tmp_path)])
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "this policy takes no text that alone would give its tokens. Leave the tokenizer out." in result.stderr
+    """With copies before they are started."""
+    for mode in (["--openpi"], ["--copies", "2"]):
+        result = CliRunner().invoke(main, ["serve", str(toy_compiled), *mode, "--tokenizer", str(tmp_path)])
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert "this policy takes no text that alone would give its tokens. Leave the tokenizer out." in result.stderr
 
 
 @pytest.mark.slow
