@@ -1,5 +1,6 @@
 """Work that depends on one frame alone: one image of one camera, or the instruction."""
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
@@ -148,14 +149,16 @@ def _rows(types: Mapping[str, TensorType], name: str) -> int:
 def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, TensorType]) -> bool:
     """Whether a tower may begin with a value.
 
-    It may with an observation itself, if it is among those ``alone``, which are single frames; and with what first has
-    the rows of several frames in one axis.
+    It may with an observation itself, if it is among those ``alone``, which are single frames; with such a picture
+    without its axis of frames; and with what first has the rows of several frames in one axis.
     """
     size = node.type.shape[0] if len(node.types) == 1 and node.type.shape else None
     if not isinstance(size, Batch) or any(isinstance(n, Batch) for n in node.type.shape[1:]):
         return False
     if size.multiple == 1:
-        return [alone.get(name) for name in node.refs()] == [node.type]
+        read, moves = [alone.get(name) for name in node.refs()], operation(node.op).movement
+        picture = moves is not None and node.type.dtype.startswith("float") and len(read) == 1 and read[0] is not None
+        return read == [node.type] or (picture and math.prod(read[0].at(1)) == math.prod(node.type.at(1)))
     mixed = any(n.multiple % size.multiple for name in node.refs() for n in types[name].shape if isinstance(n, Batch))
     return mixed and operation(node.op).movement is Movement.RESHAPE
 

@@ -110,7 +110,8 @@ def compare(
         spec: of the policy.
         computed: how many steps the sparse plan computes.
         rounds: that are counted.
-        exact: whether there is memory for calls in fp32, too.
+        exact: whether there is memory for calls in fp32, too. If not, ``eager`` tells what the original took in another
+            process, before, and nothing is told of precisions.
     """
     torch.set_num_threads(1)
     artifact = load_artifact(folder / "compiled")

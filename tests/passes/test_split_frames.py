@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from tests.families import cameras
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.driver import transform
 from ttscompile.errors import PassError
 from ttscompile.ir.evaluate import evaluate
@@ -17,6 +19,7 @@ from ttscompile.ir.graph import Node, Ref
 from ttscompile.ir.program import Program, frame_values
 from ttscompile.ir.verify import verify
 from ttscompile.passes.split_frames import SplitFrames, _require_apart
+from ttscompile.samplers.flow import flow_matching_table
 
 
 @cache
@@ -60,6 +63,32 @@ def test_what_needs_the_whole_window_stays(kind: str) -> None:
     assert program.pieces.towers == ()
     assert program.pieces.frames is None
     assert convolutions(program) > 0
+
+
+class OneCamera(nn.Module):
+    """A camera, of which a call sees one frame, and a state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tower, self.read = cameras.Patches("siglip"), nn.Linear(8 + 4, cameras.ACTIONS)
+
+    def forward(self, sample: Tensor, timestep: Tensor, image: Tensor, state: Tensor) -> Tensor:
+        read = self.read(torch.cat([self.tower(image[:, -1]), state], -1))
+        return sample + torch.relu(sample + read[:, None])
+
+
+@pytest.mark.slow
+def test_a_picture_alone_is_a_row_of_its_own() -> None:
+    """One camera and one frame, as most vision-language-action models have them: the axis of frames has size 1."""
+    torch.manual_seed(0)
+    frame = ObservationSpec((1, 3, cameras.SIDE, cameras.SIDE), bounds=(0.0, 1.0))
+    observations = {"image": frame, "state": ObservationSpec((4,), window=False)}
+    shape, steps = (cameras.HORIZON, cameras.ACTIONS), flow_matching_table(cameras.STEPS)
+    program = transform(OneCamera().eval(), PolicySpec(shape, observations, steps, ChunkSpec(cameras.ACTIONS, 0, 2)))
+    pieces = program.pieces
+    assert (pieces.rows, convolutions(program)) == ((1,), 0)
+    assert list(pieces.tokens) == ["pixels_00", "tokens_00"]
+    assert graph_flops(pieces.condition) < 0.01 * frames_flops(pieces)
 
 
 @pytest.mark.slow
