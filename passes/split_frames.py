@@ -156,9 +156,10 @@ def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, Ten
     if not isinstance(size, Batch) or any(isinstance(n, Batch) for n in node.type.shape[1:]):
         return False
     if size.multiple == 1:
-        read, moves = [alone.get(name) for name in node.refs()], operation(node.op).movement
-        picture = moves is not None and node.type.dtype.startswith("float") and len(read) == 1 and read[0] is not None
-        return read == [node.type] or (picture and math.prod(read[0].at(1)) == math.prod(node.type.at(1)))
+        read = [alone.get(name) for name in node.refs()]
+        numbers = [None if one is None else math.prod(one.at(1)) for one in read]
+        moves = operation(node.op).movement is not None and node.type.dtype.startswith("float")
+        return read == [node.type] or (moves and numbers == [math.prod(node.type.at(1))])
     mixed = any(n.multiple % size.multiple for name in node.refs() for n in types[name].shape if isinstance(n, Batch))
     return mixed and operation(node.op).movement is Movement.RESHAPE
 

@@ -16,8 +16,8 @@
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
-four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1, whose original is
-timed before, they are three.
+four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1, whose
+original is timed before, they are three.
 """
 
 from __future__ import annotations
