@@ -34,6 +34,7 @@ _MODEL = "Qwen/Qwen2.5-VL-3B-Instruct"
 _LENGTH = 64
 """Tokens of an instruction, of a policy that none is compiled into; lerobot has no limit."""
 _PIXELS, _MOST_PIXELS = {"min": 64 * 28 * 28, "max": 128 * 28 * 28}, 2**24
+_MOST_RATIO = 200
 _INNER, _HEAD = "vlm_backbone.", "lm_head.weight"
 _SYSTEM = "<|im_start|>system\nYou are a helpful physical assistant.<|im_end|>\n"
 _TOLD = Instruction(TOKENS, MASK, False, around=("", ""), never=("<|",))
@@ -67,6 +68,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     read_pictures(folder, language, model).require(image_mean=list(MEAN), image_std=list(DEVIATION))
     require_template(folder, "")  # its own words are left out where the first message is the system's
     sizes = [(shape[1], shape[2]) for shape in shared.cameras.values()]
+    if wrong := [each for each in sizes if max(each) > _MOST_RATIO * min(each)]:
+        told = f"a camera has images of {wrong[0][0]} x {wrong[0][1]} pixels, which its processor does not take"
+        raise settings.error(f"{told}; expected sides of a ratio of {_MOST_RATIO} at most")
     shown = [Resizing(language.patch * language.merge, *reader.pixels)(*each) for each in sizes]
     language = language.of_images(shown)
     prompt, config = _prompt(folder, language, model), read_config(shared, language)

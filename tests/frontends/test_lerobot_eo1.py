@@ -303,6 +303,14 @@ def test_a_preprocessor_that_is_not_rebuilt_is_named(directory: Path, changes: d
         load_checkpoint_policy(directory)
 
 
+def test_images_that_the_processor_does_not_take_are_named(directory: Path) -> None:
+    features = json.loads((directory / "config.json").read_text())["input_features"]
+    features[CAMERAS[1]]["shape"] = [3, 4, 804]
+    change_json(directory / "config.json", input_features=features)
+    with pytest.raises(CheckpointError, match="images of 4 x 804 pixels, .*; expected sides of a ratio of 200 at most"):
+        load_checkpoint_policy(directory)
+
+
 def test_a_chat_template_of_another_model_is_named(directory: Path) -> None:
     (directory.parent / eo1s.BACKBONE / "chat_template.jinja").write_text("{{ messages }}")
     with pytest.raises(CheckpointError, match="its chat template is another one than is rebuilt here; expected Qwen's"):
