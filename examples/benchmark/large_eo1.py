@@ -70,5 +70,5 @@ def save(directory: Path) -> None:
     shared = read_vla_config(directory, entries, AS_SAVED)
     with torch.device("meta"):
         weights = EO1(read_config(shared, read_qwen25(Settings(MODEL, ""))), ()).state_dict()
-    shapes = {f"model.{name}".replace(".vlm_backbone.", ".vlm_backbone.model."): w.shape for name, w in weights.items()}
+    shapes = {f"model.{name}".replace(".backbone.", ".vlm_backbone.model."): w.shape for name, w in weights.items()}
     save_drawn(directory / "model.safetensors", shapes, halved="model.vlm_backbone.")

@@ -54,7 +54,7 @@ class EO1(nn.Module):
     def __init__(self, config: EO1Config, prompt: Sequence[Piece]) -> None:
         super().__init__()
         self.config, width = config, config.language.text.width
-        self.vlm_backbone = Qwen25VL(config.language, prompt)
+        self.backbone = Qwen25VL(config.language, prompt)
         self.state_proj, self.action_in_proj = nn.Linear(config.state, width), nn.Linear(config.actions, width)
         self.action_time_mlp_in, self.action_time_mlp_out = nn.Linear(2 * width, width), nn.Linear(width, width)
         out = list[nn.Module]()
@@ -68,7 +68,7 @@ class Prefix(nn.Module):
 
     def __init__(self, network: EO1, seen: nn.Module) -> None:
         super().__init__()
-        self.seen, self.backbone, self.state_proj = seen, network.vlm_backbone, network.state_proj
+        self.seen, self.backbone, self.state_proj = seen, network.backbone, network.state_proj
 
     def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
         """What ``Denoiser`` takes; ``state`` is padded, ``[B, Ds]``, and the others are those of ``Qwen25VL.read``."""
@@ -81,7 +81,7 @@ class Denoiser(nn.Module):
 
     def __init__(self, network: EO1) -> None:
         super().__init__()
-        self.backbone, self.config = network.vlm_backbone, network.config
+        self.backbone, self.config = network.backbone, network.config
         self.action_in_proj, self.action_out_proj = network.action_in_proj, network.action_out_proj
         self.mlp_in, self.mlp_out = network.action_time_mlp_in, network.action_time_mlp_out
 

@@ -21,7 +21,7 @@ from ttscompile.frontends.instruction import encoder_folders, language_model_fol
 from ttscompile.frontends.lerobot_config import CONFIG, MOST_LAYERS, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
 from ttscompile.frontends.lerobot_policy import MASK, TOKENS, integration_steps, read_weights
 from ttscompile.frontends.lerobot_processors import CONVERSATION, READ, Processors
-from ttscompile.frontends.lerobot_qwen3_vl import END, IMAGE, TURN, Resizing, require_template
+from ttscompile.frontends.lerobot_qwen3_vl import END, IMAGE, TURN, Resizing, of_backbone, require_template
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings
 
@@ -148,12 +148,8 @@ def _read_weights(shared: LeRobotConfig, options: LoadOptions, model: Settings) 
     tied = Settings(either, model.where).flag("tie_word_embeddings", False)
     saved = read_weights(shared, options, *([] if tied else [_HEAD]))
     weights = {name.removeprefix("model."): value for name, value in saved.items()}
-    found = {name: value for name, value in weights.items() if not name.startswith(_INNER)}
-    own = {name.removeprefix(f"{_INNER}model."): value for name, value in weights.items() if name not in found}
-    head = own.pop(f"{_INNER}{_HEAD}", None)  # the numbers of the embedding, of which a file may have either
-    if head is not None:
-        own.setdefault("language_model.embed_tokens.weight", head)
-    return found | {f"{_INNER}{name}": value for name, value in rebuilt_weights(own).items()}
+    others, backbone = of_backbone(weights, _INNER, rebuilt_weights)
+    return others | backbone
 
 
 def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:

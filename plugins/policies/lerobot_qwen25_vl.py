@@ -8,14 +8,14 @@ from pathlib import Path
 from ttscompile.frontends import lerobot_vla as vla
 from ttscompile.frontends.language_layers import LanguageConfig
 from ttscompile.frontends.lerobot_config import MOST, MOST_LAYERS, MOST_VOCABULARY
-from ttscompile.frontends.settings import Settings, read_json
+from ttscompile.frontends.lerobot_qwen3_vl import image_processor
+from ttscompile.frontends.settings import Settings
 
 from .qwen25_vl import Piece, Qwen25VLConfig
 
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Of the colours that the vision transformer was trained on, in 0..1."""
 KIND = "qwen2_5_vl"
-_EMBEDDING = "language_model.embed_tokens.weight"
 
 
 def read_qwen25(model: Settings) -> Qwen25VLConfig:
@@ -65,11 +65,7 @@ def read_pictures(folder: Path, config: Qwen25VLConfig, model: Settings) -> Sett
     Args:
         model: entries of the backbone's ``config.json``.
     """
-    name, both = "preprocessor_config.json", folder / "processor_config.json"
-    found = read_json(both).get("image_processor") if both.is_file() else None  # which transformers prefers
-    if not isinstance(found, dict):
-        found, both = read_json(folder / name), folder / name
-    own = Settings({"patch_size": 14, "merge_size": 2, **found}, f"{both}: ")
+    own = image_processor(folder, {"patch_size": 14, "merge_size": 2})
     frames = vla.part_of(model, "vision_config").number("temporal_patch_size", 2, MOST)
     own.require(patch_size=config.patch, merge_size=config.merge, temporal_patch_size=frames, rescale_factor=1 / 255)
     own.require(do_resize=True, do_rescale=True, do_normalize=True, resample=3)

@@ -43,7 +43,7 @@ _LONGER_SIDE, _MOST_RATIO, _MULTIPLE = 256, 200, 28
 _PIXELS, _MOST_PIXELS = {"shortest_edge": 56 * 56, "longest_edge": 28 * 28 * 1280}, 2**31
 """Least and most, where the base does not say; older files have other names for them, in the order of these."""
 _OLDER = ("min_pixels", "max_pixels")
-_STATE, _ACTION, _START = "<|propri|>", "<|action|>", "<|vision_start|>"
+_STATE, _ACTION = "<|propri|>", "<|action|>"
 _SYSTEM = f"<|im_start|>system\nYou are a helpful assistant.{END}\n{TURN}\nObservation:"
 _LATER = f"Predict the next action in robot action.\nProprioception: {_STATE}\n{END}\n<|im_start|>assistant\n"
 _NEVER = ("<point>", "<|")

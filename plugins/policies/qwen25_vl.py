@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ttscompile.frontends import language_layers as layers
+from ttscompile.frontends.qwen3_vl import seen_by
 from ttscompile.frontends.saved_weights import renamed, separated
 from ttscompile.frontends.siglip import squares
 
@@ -173,7 +174,8 @@ class Qwen25VL(nn.Module):
             state: as a token, ``[B, width]``.
         """
         language, batch, device = self.language_model, len(mask), mask.device
-        pictures, grids = iter(self._seen(images)), iter(self.config.grids)
+        grids = iter(self.config.grids)
+        pictures = iter(seen_by(self.visual, images, self.config.grids))
         parts, places, valid = [], list[Tensor](), list[Tensor]()
         # Numbers until the instruction, of which nobody knows before the call how long it is.
         at: Any = 0
@@ -210,12 +212,12 @@ class Qwen25VL(nn.Module):
             mask: whether a token sees another of these, bool ``[T, T]``.
             own: layers for these tokens, where they are not those that read the prompt.
         """
-        turns, hidden = self.after(x, read, mask)
+        turns, hidden = self._after(x, read, mask)
         for number, layer in enumerate(own or self.language_model.layers):
             x = layer(x, turns, hidden, layers.Seen(*read.cache[2 * number : 2 * number + 2]))[0]
         return self.language_model.norm(x)  # type: ignore[no-any-return]
 
-    def after(self, x: Tensor, read: Read, mask: Tensor) -> tuple[layers.Rotation, Tensor]:
+    def _after(self, x: Tensor, read: Read, mask: Tensor) -> tuple[layers.Rotation, Tensor]:
         """The rotation of tokens after the prompt, and what is added to their scores ``[B, 1, T, P + T]``."""
         count = x.shape[1]
         turns = self._turned((read.after + torch.arange(count, device=x.device))[..., None])
@@ -227,15 +229,6 @@ class Qwen25VL(nn.Module):
         """The rotation of positions ``[B, T, channels / 2]``, or ``[B, T, 1]``."""
         angles = (places.to(torch.float32) * self.frequencies)[:, None]
         return layers.Rotation(angles.cos(), angles.sin())
-
-    def _seen(self, images: list[Tensor]) -> list[Tensor]:
-        """Tokens of each image; those of one size go through their transformer together."""
-        seen, grids = dict[int, Tensor](), self.config.grids
-        for grid in dict.fromkeys(grids):
-            own = [camera for camera, each in enumerate(grids) if each == grid]
-            made = self.visual(torch.stack([images[camera] for camera in own], 1).flatten(0, 1))
-            seen |= dict(zip(own, made.unflatten(0, (-1, len(own))).unbind(1), strict=True))
-        return [seen[camera] for camera in range(len(grids))]
 
 
 def rebuilt_weights(saved: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -17,13 +17,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from ttscompile.frontends.image_geometry import ResizeCrop
+from ttscompile.frontends.image_geometry import ResizeCrop, resize_matrix
 from ttscompile.frontends.internvl import Colours
 
 Filter = Literal["pillow", "torchvision", "card"]
 """The last is torchvision on a graphics card."""
-_BEND, _REACH = -0.5, 2
-"""Of the cubic filter."""
 _MOST_BITS, _LONGEST = 22, 2**15
 """Bits after the point of a weight; torchvision takes as many as leave its largest one below 2 ** 15."""
 
@@ -107,25 +105,10 @@ def _rounded(sums: Tensor) -> Tensor:
 
 def _weights(before: int, after: int, own: Filter) -> npt.NDArray[np.float64]:
     """``[after, before]``: the share that each old entry has in each new one, in steps of a power of two."""
-    scale = before / after
-    wide = max(scale, 1.0)
-    middle = (np.arange(after)[:, None] + 0.5) * scale
-    old = np.arange(before)
-    first = np.maximum((middle - _REACH * wide + 0.5).astype(np.int64), 0)
-    stop = np.minimum((middle + _REACH * wide + 0.5).astype(np.int64), before)
-    found = _cubic((old - middle + 0.5) / wide) * ((old >= first) & (old < stop))
-    found /= found.sum(1, keepdims=True)
+    found = resize_matrix(before, after, True, "bicubic", torch.float64).numpy()
     bits = _MOST_BITS
     if own == "torchvision":
         bits = next(
             n for n in range(_MOST_BITS) if n == _MOST_BITS - 1 or int(0.5 + found.max() * 2 ** (n + 1)) >= _LONGEST
         )
     return np.asarray(np.trunc(found * 2**bits + np.copysign(0.5, found)) / 2**bits)
-
-
-def _cubic(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Keys' cubic convolution."""
-    x = np.abs(x)
-    near = ((_BEND + 2) * x - (_BEND + 3)) * x * x + 1
-    far = (((x - 5) * x + 8) * x - 4) * _BEND
-    return np.where(x < 1, near, np.where(x < _REACH, far, 0.0))

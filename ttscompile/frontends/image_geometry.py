@@ -44,7 +44,8 @@ class ResizeCrop(nn.Module):
         self.resized = resize is not None and resize != (height, width)
         if self.resized:
             rows, columns = (
-                _resize_matrix(*each, antialias, mode) for each in zip((height, width), whole, strict=True)
+                resize_matrix(*each, antialias, mode, torch.float32)
+                for each in zip((height, width), whole, strict=True)
             )
             self.register_buffer("rows", rows[self.top : self.top + self.size[0]].clone(), persistent=False)
             columns = columns[self.left : self.left + self.size[1]]
@@ -58,8 +59,8 @@ class ResizeCrop(nn.Module):
         return images[:, :, self.top : self.top + height, self.left : self.left + width]
 
 
-def _resize_matrix(before: int, after: int, antialias: bool, mode: str) -> torch.Tensor:
-    """``[after, before]``: what resizing along one axis does."""
-    unit = torch.eye(before)[None, None]
+def resize_matrix(before: int, after: int, antialias: bool, mode: str, dtype: torch.dtype) -> torch.Tensor:
+    """``[after, before]``: what resizing along one axis does; see ``ResizeCrop``."""
+    unit = torch.eye(before, dtype=dtype)[None, None]
     rows = functional.interpolate(unit, (after, before), mode=mode, antialias=antialias, align_corners=False)
     return rows[0, 0]

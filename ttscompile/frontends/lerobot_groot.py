@@ -26,6 +26,7 @@ from .internvl import Prompt
 from .lerobot_config import ACTION, CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, STATE, LeRobotConfig
 from .lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
 from .lerobot_policy import MASK, TOKENS, read_weights
+from .qwen3_vl import rebuilt_weights
 from .saved_weights import filled, renamed
 from .settings import Settings, read_json
 
@@ -179,7 +180,7 @@ def _weights(shared: LeRobotConfig, options: LoadOptions, config: GrootConfig, k
     """The weights under the names of ``Groot``; of those that each embodiment has, those of its own."""
     found = dict[str, Tensor]()
     saved = read_weights(shared, options, ".language_model.norm.weight")
-    others, backbone = qwen.of_backbone(saved, _INNER, config.language)
+    others, backbone = qwen.of_backbone(saved, _INNER, partial(rebuilt_weights, config=config.language))
     for own, value in others.items():
         name = renamed(own, _RENAMED)
         if name.endswith((".W", ".b")):

@@ -1,7 +1,7 @@
 """Qwen3-VL inside a LeRobot policy: its folder, which lerobot needs, too, and its weights."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,13 +13,14 @@ from . import lerobot_vla as vla
 from .clip import ACTIVATIONS
 from .instruction import language_model_folder
 from .lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_VOCABULARY
-from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig, rebuilt_weights
+from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig
 from .settings import Settings, read_json
 
 _MOST_PATCHES = 2**22
 TURN, IMAGE, END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""
 _EMBEDDING = "language_model.embed_tokens.weight"
+Rebuilt = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
 DIT_LAYERS = (
     (r"\.timestep_embedder\.", "."),
     (r"\.attn1\.to_([qkv])\.", r".attn1.\1_proj."),
@@ -74,16 +75,22 @@ def read_resizing(backbone: Backbone) -> Resizing:
     folder, model = backbone
     vision, half = vla.part_of(model, "vision_config"), [0.5] * 3
     patch, merge = vision.number("patch_size", 16, MOST), vision.number("spatial_merge_size", 2, MOST)
-    name, whole = "preprocessor_config.json", folder / "processor_config.json"
-    found = read_json(whole).get("image_processor") if whole.is_file() else None  # which transformers prefers
-    if not isinstance(found, dict):
-        found, whole = read_json(folder / name), folder / name
-    own = Settings({"patch_size": None, "merge_size": None, **found}, f"{whole}: ")
+    own = image_processor(folder, {"patch_size": None, "merge_size": None})
     own.require(patch_size=patch, merge_size=merge, image_mean=half, image_std=half, do_normalize=True, do_rescale=True)
     own.require(do_resize=True, resample=3, min_pixels=None, max_pixels=None)
     require_template(folder, "helpful assist")
     size = vla.part_of(own, "size")
     return Resizing(patch * merge, *(size.number(f"{entry}_edge", most=2**31) for entry in ("shortest", "longest")))
+
+
+def image_processor(folder: Path, defaults: Mapping[str, int | None]) -> Settings:
+    """Entries of the image processor in a folder; transformers prefers the file of the whole processor."""
+    path = folder / "processor_config.json"
+    found = read_json(path).get("image_processor") if path.is_file() else None
+    if not isinstance(found, dict):
+        path = folder / "preprocessor_config.json"
+        found = read_json(path)
+    return Settings({**defaults, **found}, f"{path}: ")
 
 
 def require_template(folder: Path, own: str) -> None:
@@ -142,17 +149,16 @@ def read_language(model: Settings, layers: int, images: list[tuple[int, int]]) -
     )
 
 
-def of_backbone(
-    weights: Mapping[str, Tensor], inner: str, config: Qwen3VLConfig
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The weights that are not the backbone's, under their names; and the backbone's under those of ``Qwen3VL``.
+def of_backbone(weights: Mapping[str, Tensor], inner: str, rebuilt: Rebuilt) -> tuple[dict[str, Tensor], ...]:
+    """The weights that are not the backbone's, under their names; and the backbone's under those that it has here.
 
     Args:
         inner: how the names of the backbone's begin.
+        rebuilt: makes these of those of transformers' model without its head.
     """
     others = {name: value for name, value in weights.items() if not name.startswith(inner)}
     own = {name.removeprefix(f"{inner}model."): value for name, value in weights.items() if name not in others}
     tied = own.pop(f"{inner}lm_head.weight", None)  # the numbers of the embedding, of which a file may have either
     if tied is not None:
         own.setdefault(_EMBEDDING, tied)
-    return others, {f"backbone.{name}": value for name, value in rebuilt_weights(own, config).items()}
+    return others, {f"backbone.{name}": value for name, value in rebuilt(own).items()}

@@ -29,7 +29,7 @@ from .internvl import Prompt
 from .lerobot_config import MOST, MOST_LAYERS, MOST_PIXELS, STATE, LeRobotConfig
 from .lerobot_policy import MASK, TOKENS, read_weights
 from .lerobot_processors import BINARIZE, CLIP, PREPARE, SNAP, Processors
-from .qwen3_vl import Qwen3VLConfig
+from .qwen3_vl import Qwen3VLConfig, rebuilt_weights
 from .saved_weights import filled, renamed
 from .settings import Settings
 
@@ -214,7 +214,7 @@ def read_config(shared: LeRobotConfig, language: Qwen3VLConfig) -> GrootConfig:
 
 def _weights(saved: Mapping[str, Tensor], config: GrootConfig) -> dict[str, Tensor]:
     """The weights under the names of ``Groot``; of places in a chunk, those that there are."""
-    others, backbone = qwen.of_backbone(saved, _INNER, config.language)
+    others, backbone = qwen.of_backbone(saved, _INNER, partial(rebuilt_weights, config=config.language))
     left = (_VIDEO,) if config.state else (_VIDEO, "model.action_model.state_encoder.")
     found = {renamed(name, _RENAMED): value for name, value in others.items() if not name.startswith(left)}
     if (places := "action_head.position_embedding.weight") in found:

@@ -157,11 +157,7 @@ class Qwen3VL(nn.Module):
             mask: bool ``[B, L]``; padding is at the end.
         """
         config, language, later = self.config, self.language_model, self.prompt.later
-        seen, channels = dict[int, Tensor](), config.text.channels // 2
-        for grid in dict.fromkeys(config.grids):  # images of one size go through their transformer together
-            own = [camera for camera, each in enumerate(config.grids) if each == grid]
-            made = self.visual(torch.stack([images[camera] for camera in own], 1).flatten(0, 1))
-            seen |= dict(zip(own, made.unflatten(0, (-1, len(own))).unbind(1), strict=True))
+        seen, channels = seen_by(self.visual, images, config.grids), config.text.channels // 2
         shown = [seen[place % len(images)] for place in range(len(self.prompt.between))]
         levels = list(zip(*(each.chunk(1 + len(config.vision.stacked), -1) for each in shown), strict=True))
         valid = functional.pad(mask, (len(self.places), len(later)), value=True)
@@ -187,6 +183,16 @@ class Qwen3VL(nn.Module):
                 x = x + laid(levels[number], blank, none.expand(len(x), -1, -1))
             x = layer(x, turns, hidden)[0]
         return x, valid
+
+
+def seen_by(visual: nn.Module, images: list[Tensor], grids: tuple[tuple[int, int], ...]) -> list[Tensor]:
+    """What a vision transformer makes of each camera's images; those of one grid go through it together."""
+    seen = dict[int, Tensor]()
+    for grid in dict.fromkeys(grids):
+        own = [camera for camera, each in enumerate(grids) if each == grid]
+        made = visual(torch.stack([images[camera] for camera in own], 1).flatten(0, 1))
+        seen |= dict(zip(own, made.unflatten(0, (-1, len(own))).unbind(1), strict=True))
+    return [seen[camera] for camera in range(len(grids))]
 
 
 def rebuilt_weights(saved: Mapping[str, Tensor], config: Qwen3VLConfig) -> dict[str, Tensor]:

@@ -108,9 +108,8 @@ def axis_after(node: Node, axis: int, types: Types) -> int | None:
         mixed = row.mixes(node, types)
         return None if mixed is None or axis >= len(before) - mixed else axis
     if row.along is not None and axis not in (along := axes_along(node, len(before))):
-        return axis - (
-            len(after) < len(before) and sum(a < axis for a in along)
-        )  # select and mean may take theirs away
+        # Select and mean may take away the axes that they work along.
+        return axis - (len(after) < len(before) and sum(a < axis for a in along))
     return axis if node.op == GETITEM else None
 
 

@@ -98,6 +98,7 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
     size, (copies, rows) = node.type.shape[axis], layouts[0]
     assert isinstance(size, Batch)
     row, rank = operation(node.op), len(node.type.shape)
+    kept = row.movement is None and rank == len(read[0].shape)  # a mean without its axis leaves the others in order
     if row.name in ("repeat", "tile"):
         copies = size.multiple // rows
     elif row.name == "repeat_interleave":
@@ -112,10 +113,7 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
         copies = size.multiple // rows
     elif row.name == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
         copies = sum(layout.copies for layout in layouts)
-    # A mean that takes an axis away leaves the others in their order.
-    elif len(set(layouts)) > 1 or (
-        row.movement is None and rank == len(read[0].shape) and axis in axes_along(node, rank)
-    ):
+    elif len(set(layouts)) > 1 or (kept and axis in axes_along(node, rank)):
         return None  # rows of several kinds, or rows that change places
     return _Layout(copies, rows) if copies * rows == size.multiple else None
 
