@@ -91,7 +91,7 @@ def test_copies_count_where_they_have_no_room_on_disk(mapped: Path, monkeypatch:
     sizes = [(2**28, False), (2**28, True)]
     monkeypatch.setattr(saved_weights, "memory_bytes", lambda: 2**30 + 1)
     saved_weights.require_memory_for(mapped / "policy", sizes)
-    told = "about 2.0 GiB of memory.* 1.0 GiB of it can be on disk, but .* has no room: set TMPDIR to a folder"
+    told = "about 2.0 GiB of memory.* 1.0 GiB of it can be on disk: .* has no room, so set TMPDIR"
     with monkeypatch.context() as full:
         full.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**29))
         with pytest.raises(CheckpointError, match=told):

@@ -19,7 +19,6 @@ from .settings import Settings, read_json
 _MOST_PATCHES = 2**22
 TURN, IMAGE, END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""
-_EMBEDDING = "language_model.embed_tokens.weight"
 Rebuilt = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
 DIT_LAYERS = (
     (r"\.timestep_embedder\.", "."),
@@ -88,8 +87,7 @@ def image_processor(folder: Path, defaults: Mapping[str, int | None]) -> Setting
     path = folder / "processor_config.json"
     found = read_json(path).get("image_processor") if path.is_file() else None
     if not isinstance(found, dict):
-        path = folder / "preprocessor_config.json"
-        found = read_json(path)
+        found = read_json(path := folder / "preprocessor_config.json")
     return Settings({**defaults, **found}, f"{path}: ")
 
 
@@ -160,5 +158,5 @@ def of_backbone(weights: Mapping[str, Tensor], inner: str, rebuilt: Rebuilt) -> 
     own = {name.removeprefix(f"{inner}model."): value for name, value in weights.items() if name not in others}
     tied = own.pop(f"{inner}lm_head.weight", None)  # the numbers of the embedding, of which a file may have either
     if tied is not None:
-        own.setdefault(_EMBEDDING, tied)
+        own.setdefault("language_model.embed_tokens.weight", tied)
     return others, {f"backbone.{name}": value for name, value in rebuilt(own).items()}

@@ -67,11 +67,9 @@ def require_memory_for(path: Path, sizes: Iterable[tuple[int, bool]]) -> None:
     (folder, room), there = _room(), memory_bytes()
     need = BYTES_A_WEIGHT * numbers + copied * (not _LEAST_MAPPED <= copied <= room)
     if need > there:
-        disk = (
-            f"{copied / 2**30:.1f} GiB of it can be on disk, but {folder} has no room: set TMPDIR to a folder that has."
-        )
-        remedy = "Convert on a larger machine: in precision 'int4' the artifact takes about a byte a weight to run."
-        remedy = f"{disk} Or: {remedy}" if copied > max(room, _LEAST_MAPPED) else remedy
+        disk = f"{copied / 2**30:.1f} GiB of it can be on disk: {folder} has no room, so set TMPDIR. Or: "
+        remedy = disk * (copied > max(room, _LEAST_MAPPED))
+        remedy += "Convert on a larger machine: in precision 'int4' the artifact takes about a byte a weight to run."
         raise CheckpointError(
             f"{path}: {numbers / 1e6:,.0f} million weights. Compiling them takes about {need / 2**30:.1f} GiB of memory"
             f" beside the file; this machine has {there / 2**30:.1f} GiB. {remedy}"
