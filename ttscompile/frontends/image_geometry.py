@@ -43,10 +43,8 @@ class ResizeCrop(nn.Module):
         self.top, self.left = (round((n - m) / 2.0) for n, m in zip(whole, self.size, strict=True))
         self.resized = resize is not None and resize != (height, width)
         if self.resized:
-            rows, columns = (
-                resize_matrix(*each, antialias, mode, torch.float32)
-                for each in zip((height, width), whole, strict=True)
-            )
+            sides = zip((height, width), whole, strict=True)
+            rows, columns = (resize_matrix(*each, antialias, mode, torch.float32) for each in sides)
             self.register_buffer("rows", rows[self.top : self.top + self.size[0]].clone(), persistent=False)
             columns = columns[self.left : self.left + self.size[1]]
             self.register_buffer("columns", columns.t().contiguous(), persistent=False)

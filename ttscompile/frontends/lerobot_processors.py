@@ -38,8 +38,12 @@ PREPARE, CLIP = "vla_jepa_image_prep", "vla_jepa_clip_actions"
 SNAP, BINARIZE = "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
 CONVERSATION, READ = "eo1_conversation_template_processor", "eo1_qwen_processor"
 SENTENCE = "wall_x_task_processor"
-OWN_STEPS: Mapping[str, tuple[str, ...]] = {"xvla": ("xvla_image_to_float", IMAGENET, DOMAIN), "vla_jepa": (PREPARE,)}
-OWN_STEPS = {**OWN_STEPS, "eo1": (CONVERSATION, READ), "wall_x": (SENTENCE,)}
+OWN_STEPS: Mapping[str, tuple[str, ...]] = {
+    "xvla": ("xvla_image_to_float", IMAGENET, DOMAIN),
+    "vla_jepa": (PREPARE,),
+    "eo1": (CONVERSATION, READ),
+    "wall_x": (SENTENCE,),
+}
 """By type of policy, steps before it that no other has, in the order that lerobot saves."""
 _OWN_LATER: Mapping[str, tuple[str, ...]] = {"vla_jepa": (CLIP, SNAP, _UNNORMALIZE, BINARIZE)}
 """By type of policy, steps after it of which no other has all, in the only order that is known."""

@@ -16,7 +16,6 @@ from .lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_VOCABULARY
 from .qwen3_vl import Qwen3VLConfig, QwenVisionConfig
 from .settings import Settings, read_json
 
-_MOST_PATCHES = 2**22
 TURN, IMAGE, END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""
 Rebuilt = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
@@ -114,7 +113,7 @@ def read_language(model: Settings, layers: int, images: list[tuple[int, int]]) -
     image.require(in_channels=3, out_hidden_size=text.values.get("hidden_size"))
     text.require(hidden_act="silu", attention_bias=False)
     rope.require(rope_type="default", mrope_interleaved=True)
-    depth, table = image.number("depth", 27, MOST_LAYERS), image.number("num_position_embeddings", 2304, _MOST_PATCHES)
+    depth, table = image.number("depth", 27, MOST_LAYERS), image.number("num_position_embeddings", 2304, 2**22)
     stacked, sections = image.values.get("deepstack_visual_indexes", [8, 16, 24]), rope.values.get("mrope_section")
     if not isinstance(stacked, list) or len(set(map(str, stacked)) & set(map(str, range(depth)))) < len(stacked):
         raise image.refusal("deepstack_visual_indexes", f"different layers, from 0 to {depth - 1}")
