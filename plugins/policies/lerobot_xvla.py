@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from ttscompile.core.spec import PolicySpec, SamplerTable
 from ttscompile.errors import SpecError
-from ttscompile.frontends.clip import TowerConfig, find_encoder
+from ttscompile.frontends.clip import TowerConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, task_tokens
+from ttscompile.frontends.instruction import encoder_folders, find_encoder, task_tokens
 from ttscompile.frontends.internvl import MEAN
 from ttscompile.frontends.lerobot_config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
 from ttscompile.frontends.lerobot_policy import integration_steps, read_weights

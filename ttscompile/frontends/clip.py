@@ -19,20 +19,18 @@ from torch import nn
 from torch.nn import functional
 
 from ..errors import CheckpointError
+from .instruction import NAME_FOLDER, find_encoder
 from .language_layers import Rotation, rotate
 from .settings import Settings, read_json
 
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}
 _MOST_OTHERWISE = 2**20
-_MOST_LETTERS = 200
 ACTIVATIONS: Mapping[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "quick_gelu": lambda x: x * torch.sigmoid(1.702 * x),
     "gelu": functional.gelu,
     "gelu_pytorch_tanh": lambda x: functional.gelu(x, approximate="tanh"),
 }
 """By the names of transformers."""
-
-NAME_FOLDER = "Name the folder that has it: encoders= in Python, --encoders on the command line."
 
 
 @dataclass(frozen=True)
@@ -132,32 +130,6 @@ RELEASED: Mapping[str, Mapping[str, Any]] = {
 """Configurations of the released models: with these names nothing but the policy's own weights is needed."""
 
 Tower = TypeVar("Tower", bound=TowerConfig)
-
-
-def find_encoder(name: str, folders: Sequence[Path], kind: str = "clip") -> Path | None:
-    """The local directory of an encoder: ``name``, or its last part, in one of ``folders``, or one of them itself.
-
-    Args:
-        name: as the policy's configuration says it: ``openai/clip-vit-base-patch16``, or a path of the machine that
-            trained it, which may be this one.
-        folders: where to look. They go first, so that a copy beside the policy is the one that is read.
-        kind: how the ``model_type`` of its ``config.json`` begins.
-    """
-    given = Path(name)
-    if max(map(len, given.parts), default=0) > _MOST_LETTERS:
-        return None  # no file system has such a name, and some say so with an error
-    names, places = [given.name], list(folders)
-    if given.is_absolute():
-        places.append(given)
-    elif ".." not in given.parts:
-        names.insert(0, name)
-    for folder in places:
-        for candidate in (*(folder / each for each in names if each), folder):
-            path = candidate / "config.json"
-            # The policy's own directory has one, too.
-            if path.is_file() and str(read_json(path).get("model_type")).startswith(kind):
-                return candidate
-    return None
 
 
 def encoder_config(name: str, part: str, cls: type[Tower], folders: Sequence[Path]) -> Tower:

@@ -1,20 +1,49 @@
 """An instruction that is compiled in: its tokens, as the tokenizer of the checkpoint makes them."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from ..core.spec import Instruction
 from ..core.tokenizer import Tokenizer, find_tokenizer
 from ..errors import CheckpointError
-from .clip import NAME_FOLDER, find_encoder
+from .settings import read_json
 
+NAME_FOLDER = "Name the folder that has it: encoders= in Python, --encoders on the command line."
 NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
+_MOST_LETTERS = 200
 
 
 def encoder_folders(encoders: str | os.PathLike[str] | None, directory: Path) -> list[Path]:
     """Where a language model's files are looked for: the folder that the user names, the checkpoint's, its parent."""
     return [*([] if encoders is None else [Path(encoders)]), directory, directory.resolve().parent]
+
+
+def find_encoder(name: str, folders: Sequence[Path], kind: str = "clip") -> Path | None:
+    """The local directory of an encoder: ``name``, or its last part, in one of ``folders``, or one of them itself.
+
+    Args:
+        name: as the policy's configuration says it: ``openai/clip-vit-base-patch16``, or a path of the machine that
+            trained it, which may be this one.
+        folders: where to look. They go first, so that a copy beside the policy is the one that is read.
+        kind: how the ``model_type`` of its ``config.json`` begins.
+    """
+    given = Path(name)
+    if max(map(len, given.parts), default=0) > _MOST_LETTERS:
+        return None  # no file system has such a name, and some say so with an error
+    names, places = [given.name], list(folders)
+    if given.is_absolute():
+        places.append(given)
+    elif ".." not in given.parts:
+        names.insert(0, name)
+    for folder in places:
+        for candidate in (*(folder / each for each in names if each), folder):
+            path = candidate / "config.json"
+            # The policy's own directory has one, too.
+            if path.is_file() and str(read_json(path).get("model_type")).startswith(kind):
+                return candidate
+    return None
 
 
 def language_model_folder(name: str, folders: list[Path], kind: str, what: str = "language model") -> Path:

@@ -20,11 +20,11 @@ from ..core.spec import Instruction, PolicySpec, SamplerTable
 from ..errors import CheckpointError
 from ..samplers.flow import METHODS, flow_matching_table
 from . import lerobot_policy as lerobot
-from .clip import TextConfig, VisionConfig, encoder_config, find_encoder
+from .clip import TextConfig, VisionConfig, encoder_config
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
 from .image_geometry import ResizeCrop
-from .instruction import NO_TASK, encoder_folders, task_tokens
+from .instruction import NO_TASK, encoder_folders, find_encoder, task_tokens
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
 from .lerobot_processors import PREPROCESSOR, Processors, read_processors
 from .loops import Loops, loops_of

@@ -16,10 +16,9 @@ from torch import Tensor, nn
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
 from . import lerobot_vla as vla
-from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
-from .instruction import encoder_folders, task_tokens
+from .instruction import encoder_folders, find_encoder, task_tokens
 from .language_layers import LanguageConfig
 from .lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
 from .lerobot_policy import read_weights

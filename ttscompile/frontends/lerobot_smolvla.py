@@ -12,10 +12,9 @@ from torch import nn
 
 from ..core.spec import PolicySpec
 from . import lerobot_vla as vla
-from .clip import find_encoder
 from .encoded import EncodedDenoiser
 from .families import LoadOptions
-from .instruction import encoder_folders, language_model_folder, task_tokens
+from .instruction import encoder_folders, find_encoder, language_model_folder, task_tokens
 from .lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
 from .lerobot_policy import read_weights
 from .saved_weights import filled
