@@ -89,7 +89,7 @@ test-lerobot:
 	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
 		'lerobot[async,diffusion,multi-task-dit,pusht]==0.6.1' gymnasium-robotics -e '.[compile,videos]' -e plugins/lerobot_policy_ttscompile \
 		hypothesis pytest pytest-benchmark
-	$(LEROBOT)/bin/python -m pytest tests/plugins tests/capture/test_export.py tests/frontends/test_lerobot.py tests/trajectories
+	$(LEROBOT)/bin/python -m pytest tests/plugins tests/capture/test_export.py tests/policies/test_lerobot.py tests/trajectories
 
 # The published client of openpi, which has numpy below 2 and so an environment of its own, against ttscompile serve --openpi.
 OPENPI := build/openpi-venv

@@ -17,8 +17,9 @@ from tests.once import Once
 from tests.pages import EXTENDING, examples, load
 from ttscompile.calibration import proposer, sparse_loop, strategies
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.frontends import families, lerobot_vla
+from ttscompile.frontends import families
 from ttscompile.frontends.settings import Settings
+from ttscompile.policies.lerobot import vla
 from ttscompile.runtimes import open as open_module
 from ttscompile.runtimes.reference.sampler import through
 from ttscompile.samplers import flow
@@ -57,7 +58,7 @@ def test_the_policy_family(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     module, row, its_test = guide("family")
     rows = eval(f"({row})", vars(families).copy())
     monkeypatch.setattr(families, "FAMILIES", (*rows, *families.FAMILIES))
-    contributed(module, "ttscompile.frontends.action_dit", tmp_path, monkeypatch)
+    contributed(module, "ttscompile.policies.action_dit", tmp_path, monkeypatch)
     test = contributed(its_test, "contributed_test", tmp_path, monkeypatch)
     for name in ("compiled", "options"):
         (tmp_path / name).mkdir()
@@ -113,7 +114,7 @@ def test_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     test.test_a_step_evaluates_the_network_twice()
     test.test_it_is_of_second_order()
     test.test_it_bounds_nothing()
-    asked = lerobot_vla._sampler(Settings({}, "config.json: "), families.LoadOptions("midpoint", 5))
+    asked = vla._sampler(Settings({}, "config.json: "), families.LoadOptions("midpoint", 5))
     assert (asked.name, asked.steps) == ("midpoint", 10)
 
 

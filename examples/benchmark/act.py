@@ -30,7 +30,7 @@ from ttscompile.core.spec import Noise
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.measure.machine import fingerprint, one_line
-from ttscompile.policies.lerobot_act import ACT, as_saved, read_config
+from ttscompile.policies.lerobot.act import ACT, as_saved, read_config
 
 STATE, IMAGE, SIZE = "observation.state", "observation.images.camera{}", (480, 640)
 MODES = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "MEAN_STD")

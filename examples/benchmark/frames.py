@@ -38,11 +38,11 @@ import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
-from ttscompile.frontends.clip import TextConfig, VisionConfig
-from ttscompile.frontends.diffusion_policy_images import Camera, MultiImageEncoder
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
-from ttscompile.frontends.resnet import group_norm
+from ttscompile.policies.diffusion_policy.images import Camera, MultiImageEncoder
+from ttscompile.policies.networks.clip import TextConfig, VisionConfig
+from ttscompile.policies.networks.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
+from ttscompile.policies.networks.resnet import group_norm
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy

@@ -11,9 +11,9 @@ from large_smolvla import call
 from torch import nn
 
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
-from ttscompile.frontends.clip import RELEASED, TextConfig, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
+from ttscompile.policies.networks.clip import RELEASED, TextConfig, VisionConfig
+from ttscompile.policies.networks.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from ttscompile.samplers.flow import flow_matching_table
 
 CAMERAS, FRAMES, STATE, WIDTH, STEPS, HORIZON, ACTIONS, TOKENS = ("front", "wrist"), 2, 14, 512, 100, 32, 14, 77

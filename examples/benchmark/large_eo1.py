@@ -11,11 +11,11 @@ from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, save_drawn, write_js
 
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.frontends.lerobot_processors import CONVERSATION, READ
-from ttscompile.frontends.lerobot_vla import read_vla_config
 from ttscompile.frontends.settings import Settings, read_json
-from ttscompile.policies.eo1 import EO1
-from ttscompile.policies.lerobot_eo1 import read_config
-from ttscompile.policies.lerobot_qwen25_vl import DEVIATION, MEAN, read_qwen25
+from ttscompile.policies.lerobot.eo1 import read_config
+from ttscompile.policies.lerobot.qwen25_vl import DEVIATION, MEAN, read_qwen25
+from ttscompile.policies.lerobot.vla import read_vla_config
+from ttscompile.policies.networks.eo1 import EO1
 
 BACKBONE = "Qwen2.5-VL-3B-Instruct"
 _MARKS = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")

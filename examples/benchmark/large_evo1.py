@@ -11,12 +11,12 @@ import torch
 from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, random_weight, write_json, write_processors
 from safetensors.torch import save_file
 
-from ttscompile.frontends.evo1 import Evo1
 from ttscompile.frontends.families import AS_SAVED
-from ttscompile.frontends.internvl import Prompt
-from ttscompile.frontends.lerobot_evo1 import read_config
-from ttscompile.frontends.lerobot_vla import read_vla_config
 from ttscompile.frontends.settings import Settings
+from ttscompile.policies.lerobot.evo1 import read_config
+from ttscompile.policies.lerobot.vla import read_vla_config
+from ttscompile.policies.networks.evo1 import Evo1
+from ttscompile.policies.networks.internvl import Prompt
 
 TASK = "put the red cup on the shelf"
 MODEL: dict[str, Any] = {

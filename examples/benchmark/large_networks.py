@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from ttscompile.policies.networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
 
 ACTIONS, OBSERVED = 14, 64
 """Channels of an action, and numbers of an observation."""

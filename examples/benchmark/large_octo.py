@@ -12,10 +12,10 @@ import torch
 from large_smolvla import random_weight, write_json
 from torch import nn
 
+from ttscompile.policies.networks.octo_network import MASK, PADDING, TOKENS, Head, Octo, OctoConfig, Stem
+from ttscompile.policies.networks.t5 import Words
 from ttscompile.policies.octo import CHECKPOINT, CONFIG, EXAMPLE
-from ttscompile.policies.octo_network import MASK, PADDING, TOKENS, Head, Octo, OctoConfig, Stem
 from ttscompile.policies.quantiles import STATISTICS
-from ttscompile.policies.t5 import Words
 
 WINDOW, LENGTH, ACTIONS = 2, 16, 7
 CAMERAS = {"primary": 256, "wrist": 128}

@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, save_drawn, write_json, write_processors
 
-from ttscompile.frontends.language_layers import LanguageConfig
-from ttscompile.frontends.pi import Pi, PiConfig
-from ttscompile.frontends.siglip import SiglipConfig
+from ttscompile.policies.networks.language_layers import LanguageConfig
+from ttscompile.policies.networks.pi import Pi, PiConfig
+from ttscompile.policies.networks.siglip import SiglipConfig
 
 GEMMA = LanguageConfig(width=2048, hidden=16384, layers=18, heads=8, groups=1, channels=256, gemma=True)
 EXPERT = LanguageConfig(width=1024, hidden=4096, layers=18, heads=8, groups=1, channels=256, gemma=True)

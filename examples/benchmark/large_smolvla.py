@@ -16,10 +16,10 @@ from torch import nn
 from ttscompile import Noise, PolicySpec
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED
-from ttscompile.frontends.lerobot_smolvla import RELEASED, read_config
-from ttscompile.frontends.lerobot_vla import read_vla_config
 from ttscompile.frontends.settings import Settings
-from ttscompile.frontends.smolvla import SmolVLA
+from ttscompile.policies.lerobot.smolvla import RELEASED, read_config
+from ttscompile.policies.lerobot.vla import read_vla_config
+from ttscompile.policies.networks.smolvla import SmolVLA
 from ttscompile.runtimes.random_calls import random_calls
 
 MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"

@@ -9,10 +9,10 @@ import torch
 from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, random_weight, write_json
 from safetensors.torch import save_file
 
-from ttscompile.frontends.clip import TowerConfig
 from ttscompile.frontends.settings import Settings
-from ttscompile.policies.florence import read_florence
-from ttscompile.policies.xvla import XVLA, XVLAConfig
+from ttscompile.policies.lerobot.florence import read_florence
+from ttscompile.policies.networks.clip import TowerConfig
+from ttscompile.policies.networks.xvla import XVLA, XVLAConfig
 
 FLORENCE: dict[str, Any] = {
     "vision_config": {

@@ -20,7 +20,7 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.diffusion_policy_parts import TokensDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_sampler
-from ttscompile.frontends.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
+from ttscompile.policies.networks.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 PUSHT = Path(__file__).parents[1] / "pusht" / "pusht_dpt_ema_fp16.ckpt"
 PUSHT_WIDTH = 256

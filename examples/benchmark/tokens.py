@@ -30,10 +30,7 @@ import ttscompile
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
 from ttscompile.capture.export import capture
-from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.multi_task_dit import DiffusionTransformer, DiTConfig
-from ttscompile.frontends.siglip import Siglip
 from ttscompile.ir.graph import backward_slice
 from ttscompile.ir.pieces import INDEX, PIXELS, renewed_name
 from ttscompile.ir.tokens import find_tokens
@@ -41,6 +38,9 @@ from ttscompile.lower.precision import LEAST_ROWS, quantize_model
 from ttscompile.lower.program import lower_graph
 from ttscompile.passes.clean_up import clean_graph
 from ttscompile.passes.reuse_tokens import for_tokens
+from ttscompile.policies.networks.clip import ClipVision, VisionConfig
+from ttscompile.policies.networks.multi_task_dit import DiffusionTransformer, DiTConfig
+from ttscompile.policies.networks.siglip import Siglip
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.onnxruntime.sessions import Bound
 from ttscompile.runtimes.tokens import sizes_of

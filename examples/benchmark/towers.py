@@ -27,14 +27,14 @@ from torch import nn
 
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.capture.export import capture
-from ttscompile.frontends.clip import ClipVision, VisionConfig
-from ttscompile.frontends.resnet import group_norm, resnet
-from ttscompile.frontends.siglip import Siglip, SiglipConfig
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.pieces import CONDITION
 from ttscompile.lower.integer_attention import HEADS
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
 from ttscompile.lower.program import lower_graph
+from ttscompile.policies.networks.clip import ClipVision, VisionConfig
+from ttscompile.policies.networks.resnet import group_norm, resnet
+from ttscompile.policies.networks.siglip import Siglip, SiglipConfig
 from ttscompile.samplers.flow import flow_matching_table
 
 SIGLIP = SiglipConfig(768, 3072, 12, 12, image_size=512, patch_size=16)

@@ -1,8 +1,7 @@
-"""Policies beside the core's: as their authors' code saved them; LeRobot's ``act``, ``eo1``, ``wall_x``, ``xvla``.
+"""The policies that are read: their networks, and how what a training saved becomes one of them.
 
-``act`` has no loop, ``eo1`` and ``wall_x`` alone denoise inside a language model, and no other sees as ``xvla`` does.
-
-Each is one module with the network and its loading, and one row: in ``frontends/families.py``, for a class of Diffusion
-Policy's kind in ``diffusion_policy.py``, or for a type of LeRobot's in ``lerobot.py``. Of an action head the
-observations are what the rest of its model gives it.
+``networks`` has what is computed, under the names of the original's weights. ``diffusion_policy`` and ``lerobot`` read
+what these two projects save; a module beside them reads what the authors of one policy save. Each is found by a row: in
+``frontends/families.py``, for a class of Diffusion Policy's kind in ``diffusion_policy.py``, or for a type of LeRobot's
+in ``lerobot.py``. Of an action head the observations are what the rest of its model gives it.
 """

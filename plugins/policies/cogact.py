@@ -24,7 +24,7 @@ from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import configured_loops
 
 from .last_step import changed, clipped
-from .layers import TimestepEmbedder, TimmAttention, TimmMlp
+from .networks.layers import TimestepEmbedder, TimmAttention, TimmMlp
 from .quantiles import GRIPPER, read_statistics
 
 MODELS = {"DiT-S": (384, 6, 4), "DiT-B": (768, 12, 12), "DiT-L": (1024, 24, 16)}

@@ -28,7 +28,7 @@ from ttscompile.frontends.loops import loops_of
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import MOST_STEPS, MOST_TIMESTEPS, configured_sampler
 
-from .layers import split
+from .networks.layers import split
 
 _SCALE = 1.414
 """What a sum of two is divided by."""

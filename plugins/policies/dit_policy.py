@@ -22,14 +22,14 @@ from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.resnet import DEPTHS
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import MOST_TIMESTEPS
 from ttscompile.frontends.settings import Settings, read_json
 
-from .dit_policy_tokens import CAMERA, PIXELS, STATE, Observed, Tokens, TokensConfig
-from .layers import ModulatedFinal
 from .loops import ddim_loops
+from .networks.dit_policy_tokens import CAMERA, PIXELS, STATE, Observed, Tokens, TokensConfig
+from .networks.layers import ModulatedFinal
+from .networks.resnet import DEPTHS
 from .yaml_files import read_yaml
 
 AGENT, NORMS = "agent_config.yaml", "ac_norm.json"

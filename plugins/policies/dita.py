@@ -21,12 +21,12 @@ from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.language_layers import FeedForward, LanguageConfig, Norm
 from ttscompile.frontends.refusals import MERGE
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.settings import Settings
 
 from .loops import ddim_loops
+from .networks.language_layers import FeedForward, LanguageConfig, Norm
 from .yaml_files import read_yaml
 
 CONFIG = Path(".hydra") / "config.yaml"

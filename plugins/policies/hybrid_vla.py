@@ -28,13 +28,13 @@ from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.language_layers import LanguageConfig, Layer, Norm, Rotation, Seen, added, rotate, rotation
 from ttscompile.frontends.saved_weights import as_float32, filled, require_memory_for
 from ttscompile.frontends.settings import Settings, read_json
 
 from .last_step import changed, clipped
-from .layers import TimestepEmbedder
 from .loops import ddim_loops
+from .networks.language_layers import LanguageConfig, Layer, Norm, Rotation, Seen, added, rotate, rotation
+from .networks.layers import TimestepEmbedder
 from .quantiles import GRIPPER, Range, read_statistics
 
 CONFIG, LENGTH = "config.json", "prefix_tokens"

@@ -28,10 +28,10 @@ from ttscompile.frontends.scheduler import MOST_STEPS
 from ttscompile.frontends.settings import Settings, read_json
 
 from .flax_files import Tree, for_torch, leaves, read_tree
+from .networks.octo_network import MASK, PADDING, TOKENS, Head, Octo, OctoConfig, OctoDenoiser, OctoObserved, Stem
+from .networks.t5 import Words
 from .octo_loop import loop_table, schedule
-from .octo_network import MASK, PADDING, TOKENS, Head, Octo, OctoConfig, OctoDenoiser, OctoObserved, Stem
 from .quantiles import STATISTICS, read_moments
-from .t5 import Words
 
 CONFIG, EXAMPLE, CHECKPOINT = "config.json", "example_batch.msgpack", "checkpoint"
 

@@ -9,7 +9,7 @@ from ttscompile.core.spec import FloatArray, SamplerTable
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_sampler
 
-from .octo_network import Head
+from .networks.octo_network import Head
 
 
 def schedule(steps: int) -> tuple[FloatArray, FloatArray]:

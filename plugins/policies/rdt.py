@@ -27,7 +27,7 @@ from ttscompile.frontends.scheduler import configured_loops
 from ttscompile.frontends.settings import Settings, read_json
 
 from .last_step import changed, marked, unmarked
-from .layers import TimestepEmbedder, TimmMlp, split
+from .networks.layers import TimestepEmbedder, TimmMlp, split
 
 CONFIG, WEIGHTS, PICKLED = "config.json", "model.safetensors", "pytorch_model.bin"
 _MOST, _MOST_LAYERS, _MOST_DEPTH = 2**16, 512, 16

@@ -26,8 +26,8 @@ from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.scheduler import MOST_TIMESTEPS
 from ttscompile.frontends.settings import Settings, read_json
 
-from .layers import ModulatedFinal, TimmAttention, TimmMlp
 from .loops import ddim_loops
+from .networks.layers import ModulatedFinal, TimmAttention, TimmMlp
 from .shards import read_part
 
 CONFIG, BESIDE_ADAPTER = "config.json", "non_lora_trainables.bin"

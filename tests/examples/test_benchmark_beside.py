@@ -24,8 +24,8 @@ from onnx import TensorProto, helper
 from safetensors.torch import save_file
 
 from tests.families import cameras
-from tests.frontends import evo1s, vla_jepas
 from tests.once import Once
+from tests.policies import evo1s, vla_jepas
 from ttscompile import Noise, load
 from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.policies.t5 import Words
+from ttscompile.policies.networks.t5 import Words
 
 
 @pytest.fixture(autouse=True)

@@ -13,13 +13,13 @@ import ttscompile
 from tests.once import Once
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.core.plan import Plan
-from ttscompile.frontends.clip import ClipVision, VisionConfig
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.internvl import Prompt
-from ttscompile.frontends.language_layers import LanguageConfig, Norm
-from ttscompile.frontends.qwen3_vl import Qwen3VL, Qwen3VLConfig, QwenVisionConfig
-from ttscompile.frontends.siglip import Siglip, SiglipConfig
-from ttscompile.policies.qwen25_vl import Qwen25VL, Qwen25VLConfig
+from ttscompile.policies.networks.clip import ClipVision, VisionConfig
+from ttscompile.policies.networks.internvl import Prompt
+from ttscompile.policies.networks.language_layers import LanguageConfig, Norm
+from ttscompile.policies.networks.qwen3_vl import Qwen3VL, Qwen3VLConfig, QwenVisionConfig
+from ttscompile.policies.networks.qwen25_vl import Qwen25VL, Qwen25VLConfig
+from ttscompile.policies.networks.siglip import Siglip, SiglipConfig
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.samplers.flow import flow_matching_table
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from ttscompile.frontends.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
+from ttscompile.policies.networks.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 HORIZON, TO, DO, DA = 6, 2, 5, 3
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from ttscompile.frontends.clip import TextConfig, VisionConfig
-from ttscompile.frontends.lerobot_multi_task_dit import MultiTaskDiTConfig, Network, read_config
+from ttscompile.policies.lerobot.multi_task_dit import MultiTaskDiTConfig, Network, read_config
+from ttscompile.policies.networks.clip import TextConfig, VisionConfig
 
 TO, DS, DA, SIDE = 2, 5, 3, 24
 

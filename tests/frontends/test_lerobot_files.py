@@ -16,7 +16,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import files_beside, load_checkpoint_policy
 from ttscompile.frontends.lerobot_files import lerobot_files
 
-from . import lerobot_unets, pis
+from ..policies import lerobot_unets, pis
 from .lerobot_tiny import DA, DS, SIDE, change_json, save_policy
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:normaliser of observation.state")]

@@ -16,14 +16,14 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.clip import TextConfig
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.lerobot_multi_task_dit import Network
 from ttscompile.hub import fetch_checkpoint
+from ttscompile.policies.lerobot.multi_task_dit import Network
+from ttscompile.policies.networks.clip import TextConfig
 
 from ..hub.conftest import hub as hub
 from ..hub.served import Hub
-from . import lerobot_unets, vla_jepas
+from ..policies import lerobot_unets, vla_jepas
 from .lerobot_tiny import TEXT, change_json, dit_config, save_policy, write_json
 
 Tensors = dict[str, torch.Tensor]

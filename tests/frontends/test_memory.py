@@ -13,9 +13,9 @@ from safetensors.torch import load_file, save_file
 
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import saved_weights
-from ttscompile.frontends.language_layers import LanguageConfig
+from ttscompile.policies.networks.language_layers import LanguageConfig
 
-from . import pis
+from ..policies import pis
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,7 +13,6 @@ from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
 from ttscompile import ObservationSpec, PolicySpec
 from ttscompile.driver import transform
-from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Ref
 from ttscompile.ir.pieces import LoopPiece
@@ -21,6 +20,7 @@ from ttscompile.ir.program import Binding, Captured, Pieces, Program
 from ttscompile.passes.find_residual_blocks import find_residual_blocks
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.partition import Partition
+from ttscompile.policies.networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
 
 STREAMS = 2
 

@@ -13,8 +13,8 @@ from torch import nn
 
 from tests.families.checks import Arrays, golden
 from tests.families.weights import draw_weights
-from tests.frontends import hybrid
-from ttscompile.frontends.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from tests.policies import hybrid
+from ttscompile.policies.networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
 
 SEED, STREAMS, CALLS, OBS, ACTION = 41, 2, 3, 5, 3
 _PACKAGE = "diffusion_policy"

@@ -19,7 +19,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions, find_family
 from ttscompile.policies.dit_policy import DiTPolicyHead
-from ttscompile.policies.dit_policy_tokens import Observed, Tokens, TokensConfig
+from ttscompile.policies.networks.dit_policy_tokens import Observed, Tokens, TokensConfig
 
 CLASS = "data4robotics.models.diffusion.DiffusionTransformerAgent"
 NET = {"time_dim": 16, "hidden_dim": 24, "num_blocks": 2, "dim_feedforward": 40, "nhead": 3, "activation": "gelu"}

@@ -17,7 +17,7 @@ from ttscompile.errors import CheckpointError, ObservationError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.policies.streaming import Buffer, StreamingDenoiser
+from ttscompile.policies.diffusion_policy.streaming import Buffer, StreamingDenoiser
 
 from . import streams
 

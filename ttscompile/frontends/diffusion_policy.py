@@ -14,7 +14,6 @@ from torch import nn
 
 from ..core.spec import ChunkSpec, PolicySpec
 from ..errors import CheckpointError
-from . import diffusion_policy_transformer as transformer, diffusion_policy_unet as unet
 from .checkpoint import plain_config, read_checkpoint
 from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved, affine, choose_weights
 from .families import LoadOptions
@@ -27,23 +26,23 @@ from .settings import Settings
 _STUDENT = "CTMPPUnetHybridImagePolicy"
 
 
-def _beside(module: str, which: str) -> Callable[[Saved], Rebuilt]:
-    """A function of a policy beside those of the core, which is imported when it is called."""
-    return lambda saved: getattr(import_module(f"..policies.{module}", __package__), which)(saved)
+def _row(module: str, which: str) -> Callable[[Saved], Rebuilt]:
+    """A function of a module of ``policies.diffusion_policy``, which is imported when it is called."""
+    return lambda saved: getattr(import_module(f"..policies.diffusion_policy.{module}", __package__), which)(saved)
 
 
 _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
-    "DiffusionTransformerLowdimPolicy": transformer.low_dim,
-    "DiffusionTransformerHybridImagePolicy": transformer.on_images,
-    "DiffusionUnetLowdimPolicy": unet.low_dim,
-    "DiffusionUnetHybridImagePolicy": unet.hybrid,
-    "DiffusionUnetImagePolicy": unet.images,
-    "DP3": _beside("dp3", "full"),
-    "SimpleDP3": _beside("dp3", "simple"),
-    "KarrasUnetHybridImagePolicy": _beside("consistency_policy", "teacher"),
-    _STUDENT: _beside("consistency_policy", "student"),
-    "TEDiUnetLowdimPolicy": _beside("streaming", "low_dim"),
-    "TEDIUnetHybridImagePolicy": _beside("streaming", "on_images"),
+    "DiffusionTransformerLowdimPolicy": _row("transformer", "low_dim"),
+    "DiffusionTransformerHybridImagePolicy": _row("transformer", "on_images"),
+    "DiffusionUnetLowdimPolicy": _row("unet", "low_dim"),
+    "DiffusionUnetHybridImagePolicy": _row("unet", "hybrid"),
+    "DiffusionUnetImagePolicy": _row("unet", "images"),
+    "DP3": _row("dp3", "full"),
+    "SimpleDP3": _row("dp3", "simple"),
+    "KarrasUnetHybridImagePolicy": _row("consistency_policy", "teacher"),
+    _STUDENT: _row("consistency_policy", "student"),
+    "TEDiUnetLowdimPolicy": _row("streaming", "low_dim"),
+    "TEDIUnetHybridImagePolicy": _row("streaming", "on_images"),
 }
 """By the class name of the original policy."""
 

@@ -1,6 +1,6 @@
 """The policy families that are read: how a checkpoint of each is told, which options it takes, and what loads it.
 
-A family is a module beside this one and a row in ``FAMILIES``. Nothing here imports torch, so that the command line can
+A family is a module of ``policies`` and a row in ``FAMILIES``. Nothing here imports torch, so that the command line can
 list formats and samplers, and say what is wrong with a path or an option, before the compiler is loaded.
 """
 
@@ -73,8 +73,8 @@ class Family:
         reads: what the user gives, for messages; begins with an article.
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
-        module: in this package, or with a dot before it in ``ttscompile``. Its ``load(path, options)`` gives network
-            and ``PolicySpec``, or a CheckpointError or SpecError; imported then, with torch.
+        module: in ``ttscompile``. Its ``load(path, options)`` gives network and ``PolicySpec``, or a CheckpointError or
+            SpecError; imported then, with torch.
         options: names of ``LoadOptions`` that it takes; the others are refused.
     """
 
@@ -94,7 +94,7 @@ class Family:
                 raise CheckpointError(
                     f"{path}: the option {name} is for {takers} policies; this is one of {self.title}. Leave it out."
                 )
-        return import_module(f".{self.module}", __package__).load(path, options)  # type: ignore[no-any-return]
+        return import_module(f"..{self.module}", __package__).load(path, options)  # type: ignore[no-any-return]
 
 
 def _config(path: Path) -> Mapping[str, object]:
@@ -116,7 +116,7 @@ FAMILIES = (
         reads="a directory that lerobot's save_pretrained wrote, with config.json and model.safetensors",
         kind="directory",
         detect=lambda path: "type" in _config(path),
-        module="lerobot",
+        module="frontends.lerobot",
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras", "base"},
     ),
     Family(
@@ -125,7 +125,7 @@ FAMILIES = (
         reads="a directory that DexVLA's training saved, with config.json and safetensors",
         kind="directory",
         detect=lambda path: "scale_dp_policy" in map(_config(path).get, ("policy_head_type", "model_type")),
-        module=".policies.scaledp",
+        module="policies.scaledp",
     ),
     Family(
         name="dit_policy",
@@ -133,7 +133,7 @@ FAMILIES = (
         reads="a .ckpt file of DiT-Policy with agent_config.yaml beside it",
         kind="file",
         detect=lambda path: path.is_file() and (path.parent / "agent_config.yaml").is_file(),
-        module=".policies.dit_policy",
+        module="policies.dit_policy",
     ),
     Family(
         name="dita",
@@ -141,7 +141,7 @@ FAMILIES = (
         reads="a .pth file of Dita with .hydra/config.yaml in its folder or in the one above",
         kind="file",
         detect=lambda at: at.suffix == ".pth" and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
-        module=".policies.dita",
+        module="policies.dita",
     ),
     Family(
         name="rdt",
@@ -149,7 +149,7 @@ FAMILIES = (
         reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
         kind="directory",
         detect=lambda path: "lang_adaptor" in _config(path),
-        module=".policies.rdt",
+        module="policies.rdt",
     ),
     Family(
         name="octo",
@@ -157,7 +157,7 @@ FAMILIES = (
         reads="a folder that Octo's save_pretrained wrote, with config.json and example_batch.msgpack",
         kind="directory",
         detect=lambda path: (path / "example_batch.msgpack").is_file(),
-        module=".policies.octo",
+        module="policies.octo",
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
     Family(
@@ -166,7 +166,7 @@ FAMILIES = (
         reads="a .pt file of CogACT",
         kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"action_model"),
-        module=".policies.cogact",
+        module="policies.cogact",
     ),
     Family(
         name="hybrid_vla",
@@ -174,7 +174,7 @@ FAMILIES = (
         reads="a .pt file of HybridVLA that was trained with use_diff",
         kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"proprio_embedder"),
-        module=".policies.hybrid_vla",
+        module="policies.hybrid_vla",
     ),
     Family(
         name="diffusion_bc",
@@ -182,7 +182,7 @@ FAMILIES = (
         reads="a state_dict of Diffusion BC, a Model_Cond_Diffusion's, in a file",
         kind="file",
         detect=lambda path: path.is_file() and _begins_with(path, b"mab_over_sqrtmab"),
-        module=".policies.diffusion_bc",
+        module="policies.diffusion_bc",
     ),
     Family(
         name="diffusion_policy",
@@ -191,7 +191,7 @@ FAMILIES = (
         kind="file",
         # Every file that no other family takes: its module names what a file is that is none of its own.
         detect=lambda path: not path.is_dir(),
-        module="diffusion_policy",
+        module="frontends.diffusion_policy",
     ),
 )
 

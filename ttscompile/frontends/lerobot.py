@@ -1,6 +1,6 @@
 """LeRobot: a directory that lerobot saved to module and ``PolicySpec``.
 
-A type of policy is a module beside this one and a row in ``TYPES``. Everything in the directory is JSON and
+A type of policy is a module of ``policies.lerobot`` and a row in ``TYPES``. Everything in the directory is JSON and
 safetensors; neither lerobot nor torchvision is needed.
 """
 
@@ -15,10 +15,9 @@ from .lerobot_config import CONFIG
 from .refusals import LEROBOT, refuse_policy
 from .settings import read_json
 
-TYPES = {name: f"lerobot_{name}" for name in "diffusion evo1 groot multi_task_dit smolvla vla_jepa".split()}
-TYPES |= {"pi0": "lerobot_pi", "pi05": "lerobot_pi"}
-TYPES |= {name: f".policies.lerobot_{name}" for name in ("act", "eo1", "wall_x", "xvla")}
-"""The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
+TYPES = {name: name for name in "act diffusion eo1 evo1 groot multi_task_dit smolvla vla_jepa wall_x xvla".split()}
+TYPES |= {"pi0": "pi", "pi05": "pi"}
+"""The module of ``policies.lerobot`` by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 
 
 def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
@@ -27,5 +26,5 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     kind = str(entries.get("type"))
     if kind not in TYPES:
         refuse_policy(f"{kind:.80}", LEROBOT, f"{directory}: ")
-    module = import_module(f".{TYPES[kind]}", __package__)
+    module = import_module(f"..policies.lerobot.{TYPES[kind]}", __package__)
     return module.load(directory, entries, options)  # type: ignore[no-any-return]

@@ -17,8 +17,8 @@ import diffusers.utils
 import numpy as np
 import torch
 
-from tests.frontends.golden.torchvision_stand_in import put_in_place
 from tests.policies import streams
+from tests.policies.golden.torchvision_stand_in import put_in_place
 
 from .originals import Arrays, generator
 

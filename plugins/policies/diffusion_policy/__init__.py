@@ -1,0 +1,1 @@
+"""Diffusion Policy's classes, and those of projects that save as it does: each rebuilt from ``Saved``."""

@@ -1,0 +1,168 @@
+"""3D Diffusion Policy: its observation encoder, rebuilt, and configuration and weights to that and a U-Net.
+
+Its checkpoints have the form of Diffusion Policy's, and its networks are the U-Net of that with other conditions. The
+encoder, a small PointNet and an MLP for the robot's state, is written from the description of the networks, with
+attribute names under which the weights of an original checkpoint load.
+
+Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., arXiv 2403.03954); PointNet of Qi et al.
+(arXiv 1612.00593).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import nn
+
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.diffusion_policy_parts import (
+    COMMON_KEYS,
+    Observed,
+    Rebuilt,
+    Saved,
+    Weights,
+    read_shape_meta,
+    require_room,
+)
+from ttscompile.frontends.saved_weights import require_weights
+from ttscompile.frontends.settings import Settings
+
+from .unet import DEFAULTS, behind_encoder
+
+POINTS, STATE, ROBOT = "point_cloud", "agent_pos", "imagin_robot"
+"""Keys of the observation: the points seen, the robot's state, and points of the robot that are added to those seen."""
+PLACE, COLOURED = 3, 6
+"""Channels of a point: where it is, and its colour."""
+
+_STATE_WIDTH = 64
+_WIDTHS = (64, 128, 256)
+_COLOURED_WIDTHS = (*_WIDTHS, 512)
+
+
+class PointNet(nn.Module):
+    """Points to a vector: an MLP of each point, the largest of each feature over all points, and a linear layer.
+
+    Args:
+        coloured: whether points have a colour; the MLP is a layer deeper then, which has no norm.
+        features: of the vector; None for those of the MLP, without a layer after it.
+        norms: whether the MLP has layer norms.
+    """
+
+    def __init__(self, coloured: bool, features: int | None, norms: bool, last_norm: bool) -> None:
+        super().__init__()
+        widths = _COLOURED_WIDTHS if coloured else _WIDTHS
+        layers: list[nn.Module] = []
+        before = COLOURED if coloured else PLACE
+        for width in widths:
+            layers += [nn.Linear(before, width), nn.LayerNorm(width) if norms else nn.Identity(), nn.ReLU()]
+            before = width
+        self.mlp = nn.Sequential(*(layers[:-2] if coloured else layers))
+        self.final_projection: nn.Module = nn.Identity()
+        self.width = features or before
+        if features is not None:
+            linear = nn.Linear(before, features)
+            self.final_projection = nn.Sequential(linear, nn.LayerNorm(features)) if last_norm else linear
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        """``[N, points, channels]`` -> ``[N, width]``."""
+        return self.final_projection(self.mlp(points).amax(1))  # type: ignore[no-any-return]
+
+
+class PointCloudEncoder(nn.Module):
+    """Points and the robot's state to one vector for each observed step."""
+
+    def __init__(self, extractor: PointNet, channels: int, state: int) -> None:
+        super().__init__()
+        self.extractor, self.channels = extractor, channels
+        self.state_mlp = nn.Sequential(nn.Linear(state, _STATE_WIDTH), nn.ReLU(), nn.Linear(_STATE_WIDTH, _STATE_WIDTH))
+        self.width = extractor.width + _STATE_WIDTH
+
+    def forward(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """By key ``[B, To, ...]``, normalised -> ``[B, To, width]``."""
+        clouds = [observations[key][..., : self.channels] for key in (POINTS, ROBOT) if key in observations]
+        points = torch.cat(clouds, dim=2)
+        features = self.extractor(points.flatten(0, 1)).reshape(*points.shape[:2], self.extractor.width)
+        return torch.cat((features, self.state_mlp(observations[STATE])), dim=-1)
+
+
+_NAME = "3D Diffusion Policy"
+_CHANGED = "The policy was changed; use ttscompile.compile_denoiser(module, spec)."
+_PREFIX = "obs_encoder."
+_CONDITIONS = {
+    "film": {"cond_predict_scale": True},
+    "add": {"cond_predict_scale": False},
+    "mlp_film": {"cond_predict_scale": True, "condition_layer": True},
+}
+_MOST_POINTS = 2**16
+"""Of a cloud, which the weights do not limit; in use are 512 to 4096."""
+_PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
+_ENCODER_KEYS = {"shape_meta", "encoder_output_dim", "use_pc_color", "pointnet_type", "pointcloud_encoder_cfg"}
+_UNUSED = {"crop_shape", "use_point_crop"}  # of the policy: one has no image, the other is for its environments
+_KNOWN = {*DEFAULTS, *_PLACES, *_ENCODER_KEYS, *_UNUSED, "condition_type", "obs_as_global_cond"}
+
+
+def full(saved: Saved) -> Rebuilt:
+    """``DP3``."""
+    return _rebuilt(saved, 2)
+
+
+def simple(saved: Saved) -> Rebuilt:
+    """``SimpleDP3``, whose U-Net has half as many blocks."""
+    return _rebuilt(saved, 1)
+
+
+def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
+    settings = saved.settings
+    unknown = sorted(set(saved.policy) - _KNOWN - COMMON_KEYS)
+    if unknown:
+        raise CheckpointError(f"cfg.policy has settings that {_NAME} does not know: {', '.join(unknown)}. {_CHANGED}")
+    if not settings.flag("obs_as_global_cond", True):
+        raise settings.error("obs_as_global_cond is false; expected true, without which the original cannot run either")
+    condition = settings.values.get("condition_type", "film")
+    if condition not in tuple(_CONDITIONS):
+        raise settings.error(
+            f"condition_type is {condition!r:.80}; expected {' or '.join(_CONDITIONS)}. The original's networks with"
+            " cross_attention_* cannot run: they put a timestep without an axis of observed steps beside observations"
+            " with one"
+        )
+    action_dim, every = read_shape_meta(settings, "low_dim", "point_cloud", "rgb", "depth")
+    observed = {key: each for key, each in every.items() if key in (POINTS, STATE, ROBOT)}
+    encoder = _encoder(settings, observed, saved.weights)
+    network: dict[str, Any] = {name: saved.policy.get(name, default) for name, default in DEFAULTS.items()}
+    network |= _CONDITIONS[condition]
+    network |= {"blocks": blocks, "conditioned": tuple(settings.flag(name, True) for name in _PLACES)}
+    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, network, _KNOWN)
+
+
+def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointCloudEncoder:
+    coloured = settings.flag("use_pc_color", False)
+    settings.choice("pointnet_type", "pointnet")
+    cloud = settings.part("pointcloud_encoder_cfg")
+    for key, axes in ((POINTS, 2), (STATE, 1), (ROBOT, 2)):
+        if key == ROBOT and key not in observed:
+            continue
+        shape = observed[key][1] if key in observed else ()
+        channels = COLOURED if coloured else PLACE
+        if len(shape) != axes or (axes == 2 and (shape[1] < channels or max(shape) > _MOST_POINTS)):
+            found = f"{list(shape)}" if key in observed else "missing"
+            wanted = f"[points, {channels}], {_MOST_POINTS} points at most" if axes == 2 else "[length]"
+            raise settings.error(f"shape_meta.obs.{key} is {found}; expected the shape {wanted}")
+    # Only the PointNet without colours can do without the last layer.
+    projected = cloud.flag("use_projection", True) or coloured
+    features = cloud.number("out_channels", 1024) if projected else None
+    last_norm = cloud.choice("final_norm", "none", "layernorm") == "layernorm"
+    state = observed[STATE][1][0]
+    require_room({"out_channels": features or 0, f"shape_meta.obs.{STATE}": state}, weights, settings.where)
+    extractor = PointNet(coloured, features, cloud.flag("use_layernorm", False), last_norm)
+    if settings.number("encoder_output_dim", 256) != extractor.width:
+        found = f"encoder_output_dim is {settings.values.get('encoder_output_dim', 256)}"
+        raise settings.error(f"{found}; expected {extractor.width}, which its PointNet gives")
+    encoder = PointCloudEncoder(extractor, COLOURED if coloured else PLACE, state)
+    found_weights = {key: value for key, value in weights.items() if key.startswith(_PREFIX)}
+    require_weights(
+        {_PREFIX + name: value for name, value in encoder.state_dict().items()},
+        found_weights,
+        f"{settings.where}pointcloud_encoder_cfg",
+    )
+    encoder.load_state_dict({key.removeprefix(_PREFIX): value for key, value in found_weights.items()})
+    return encoder

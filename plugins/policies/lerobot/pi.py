@@ -1,0 +1,140 @@
+"""LeRobot's ``pi0`` and ``pi05``: a directory to module and ``PolicySpec``; cameras, instruction, state to actions.
+
+Sizes are those of the weights. Neither lerobot nor transformers is needed. Source: ``PI0Policy`` and ``PI05Policy`` of
+huggingface/lerobot 0.6.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ttscompile.core.spec import PolicySpec
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.instruction import encoder_folders, find_encoder, task_tokens
+from ttscompile.frontends.lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
+from ttscompile.frontends.lerobot_policy import read_weights
+from ttscompile.frontends.saved_weights import filled
+
+from ..networks.language_layers import LanguageConfig
+from ..networks.pi import Expert, Pi, PiConfig, Prefix
+from ..networks.siglip import SiglipConfig
+from . import vla
+
+_VISION = "paligemma_with_expert.paligemma.model.vision_tower."
+_TEXT = "paligemma_with_expert.paligemma.model.language_model."
+_EXPERT = "paligemma_with_expert.gemma_expert.model."
+_HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
+_UNREAD = (".gemma_expert.lm_head.weight", ".language_model.norm.weight", ".embed_tokens.position_ids")
+_VISION_HEADS = 16
+"""Of PaliGemma's SigLIP; the weights do not say."""
+
+
+def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
+    shared = vla.read_vla_config(directory, entries, options)
+    (shared, processors), adaptive = vla.read_vla_processors(shared), entries["type"] == "pi05"
+    if adaptive and options.task is not None:
+        raise CheckpointError(
+            f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"
+            " compiled in. Leave the task out: the policy takes tokens as an observation."
+        )
+    weights = _weights(shared, options)
+    try:
+        config = read_config(shared, weights, adaptive)
+    except CheckpointError as error:
+        raise CheckpointError(f"{directory}: {error}") from error
+    network = filled(lambda: Pi(config), weights, CONFIG, directory)
+    length = shared.settings.number("tokenizer_max_length", 200 if adaptive else 48, MOST)
+    sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
+    if options.task is not None:
+        name = str(processors.tokenizer.get("tokenizer_name") or "google/paligemma-3b-pt-224")
+        found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
+        text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
+        task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
+    encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task, config.trained_prefix > 0)
+    side = config.vision.image_size
+    spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options)
+    if adaptive:  # the instruction holds the state, which the network does not read; actions may be relative to it
+        unread = () if spec.chunk.relative else (processors.renamed.get(STATE, STATE),)
+        others = {key: each for key, each in spec.observations.items() if key not in unread}
+        spec = replace(spec, observations=others, instruction=None, trained_prefix=config.trained_prefix)
+    return EncodedDenoiser(encoder, Expert(network)).eval(), spec
+
+
+def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: bool) -> PiConfig:
+    """Sizes and variant."""
+    settings = shared.settings
+    patch = _shape(weights, f"{_VISION}embeddings.patch_embedding.weight", 4)
+    resolution = settings.size("image_resolution", [224, 224], MOST_PIXELS) or (224, 224)
+    vla.require_square(settings, "image_resolution", resolution, patch[2])
+    width = _shape(weights, f"{_VISION}encoder.layers.0.mlp.fc1.weight", 2)
+    vision = SiglipConfig(
+        hidden_size=patch[0],
+        intermediate_size=width[0],
+        num_hidden_layers=_layers(weights, f"{_VISION}encoder."),
+        num_attention_heads=_VISION_HEADS,
+        image_size=resolution[0],
+        patch_size=patch[2],
+    )
+    text, expert = _language(weights, _TEXT), _language(weights, _EXPERT)
+    if (text.layers, text.heads, text.channels) != (expert.layers, expert.heads, expert.channels):
+        raise CheckpointError("the language model and the expert differ in layers, heads or channels.")
+    delay = settings.number("rtc_training_max_delay", 0, shared.horizon - 1, least=0)
+    return PiConfig(
+        vision=vision,
+        text=text,
+        vocabulary=_shape(weights, f"{_TEXT}embed_tokens.weight", 2)[0],
+        expert=expert,
+        state=None if adaptive else vla.padded_size(settings, "max_state_dim", shared.state_dim),
+        actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
+        periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
+        trained_prefix=delay,
+    )
+
+
+def _language(weights: Mapping[str, Tensor], start: str) -> LanguageConfig:
+    queries, width = _shape(weights, f"{start}layers.0.self_attn.q_proj.weight", 2)
+    channels = _shape(weights, f"{start}layers.0.self_attn.k_proj.weight", 2)[0]
+    if channels % 2 or queries % channels:
+        raise CheckpointError(f"{start}: {queries} numbers of queries do not fit heads of {channels}.")
+    return LanguageConfig(
+        width=width,
+        hidden=_shape(weights, f"{start}layers.0.mlp.gate_proj.weight", 2)[0],
+        layers=_layers(weights, start),
+        heads=queries // channels,
+        groups=1,
+        channels=channels,
+        gemma=True,
+    )
+
+
+def _layers(weights: Mapping[str, Tensor], start: str) -> int:
+    found = re.compile(re.escape(start) + r"layers\.(\d{1,3})\.")
+    return 1 + max((int(match[1]) for name in weights if (match := found.match(name))), default=-1)
+
+
+def _shape(weights: Mapping[str, Tensor], name: str, axes: int) -> tuple[int, ...]:
+    value = weights.get(name)
+    if value is None or value.ndim != axes or not value.numel():
+        raise CheckpointError(f"weight {name} is missing, or has not {axes} axes; expected weights of a pi0 or pi05.")
+    return tuple(value.shape)
+
+
+def _weights(shared: LeRobotConfig, options: LoadOptions) -> dict[str, Tensor]:
+    """The weights under the names of ``Pi``, whichever transformers saved them, lerobot or openpi's converter."""
+    found = {}
+    for name, value in read_weights(shared, options, *_UNREAD).items():
+        short = name.removeprefix("model.").replace(".vision_tower.vision_model.", ".vision_tower.")
+        if not short.startswith(f"{_VISION}head."):
+            found[short] = value
+    head = found.pop(_HEAD, None)
+    if head is not None:  # the same numbers as the embedding, of which a file may have either
+        found.setdefault(f"{_TEXT}embed_tokens.weight", head)
+    return found

@@ -1,0 +1,264 @@
+"""Parity with LeRobot 0.6.1's SmolVLA: from raw images, state and instruction to robot actions."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import ttscompile
+from tests.once import Once
+from ttscompile.artifact.load import load_artifact
+from ttscompile.cli.contestants import original_policy
+from ttscompile.core.spec import Noise
+from ttscompile.errors import CheckpointError, ObservationError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.eager import eager_policy
+from ttscompile.frontends.encoded import parts
+from ttscompile.frontends.families import LoadOptions
+
+from ..families.support import record
+from ..frontends.lerobot_tiny import change_json
+from ..verification.broken import edited
+from . import originals
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
+
+pytestmark = pytest.mark.slow
+
+SIZE = (96, 128)
+"""Of the golden images, height and width."""
+
+
+@pytest.fixture(scope="module")
+def directory(shared: Path) -> Path:
+    return shared / "golden" / "lerobot_whole" / "smolvla"
+
+
+@pytest.fixture(scope="module")
+def golden(directory: Path) -> Mapping[str, Array]:
+    with np.load(directory.with_suffix(".npz")) as numbers:
+        return dict(numbers)
+
+
+@pytest.fixture(scope="module")
+def others() -> Mapping[str, Array]:
+    """What lerobot made of images of another size, and without a camera."""
+    return originals.golden("lerobot_smolvla")
+
+
+@pytest.fixture(scope="module")
+def compiled(once: Once, directory: Path) -> Path:
+    artifact, program = once.compiled("smolvla", lambda to: ttscompile.convert(directory, to))
+    record("LeRobot smolvla", "actions that lerobot 0.6.1 gave, raw observation to action, 1e-4", "euler 10", program)
+    return artifact
+
+
+def observed(given: Mapping[str, Array], size: tuple[int, int] = SIZE) -> dict[str, Array]:
+    """A frame of one stream as LeRobot's batch holds it."""
+    one = {key: value[None] for key, value in frame(given, size).items()}
+    return one | {TOKENS: given["tokens"], MASK: given["attention_mask"]}
+
+
+def eager(directory: Path, given: Mapping[str, Array], batch: Mapping[str, Array], options: LoadOptions) -> Array:
+    """The actions of the rebuilt network, not compiled."""
+    module, spec = load_checkpoint_policy(directory, options=options)
+    obs = {key: torch.from_numpy(as_given(key, batch, spec)) for key in spec.observations}
+    return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(given["noise"])).numpy())
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "reference"])
+def test_two_instructions(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
+    policy = ttscompile.load(compiled, runtime=runtime)
+    assert policy.info.observation[CAMERAS[0]].shape == (1, 3, 64, 64)
+    for call in (0, 1):
+        given = arrays(golden, call)
+        found = policy.predict_action_chunk(observed(given), noise=Noise(given["noise"]), plan="dense")
+        assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
+
+
+def test_tokens_of_both_cameras_may_be_reused(compiled: Path) -> None:
+    """SigLIP and the connector behind it are one piece, whose tokens are found."""
+    manifest = load_artifact(compiled).manifest
+    assert {name: (one.tokens, one.fixed) for name, one in manifest.tokens.items()} == {"frame_00": (64, 0)}
+    assert set(CAMERAS) <= set(manifest.pieces["frames"].inputs)
+
+
+def test_images_of_another_size_in_the_same_artifact(
+    compiled: Path, golden: Mapping[str, Array], others: Mapping[str, Array]
+) -> None:
+    policy, given = ttscompile.load(compiled), arrays(golden, 0)
+    found = policy.predict_action_chunk(observed(given, (150, 110)), noise=Noise(given["noise"]), plan="dense")
+    assert np.abs(found - others["large"]).max() < 1e-4
+    assert np.abs(found - golden["call0.action"]).max() > 0.01
+
+
+def test_select_action_over_twenty_ticks(compiled: Path, golden: Mapping[str, Array]) -> None:
+    policy, given = ttscompile.load(compiled), arrays(golden, 0)
+    batch = {key: torch.from_numpy(value) for key, value in observed(given).items()} | {"task": [str(given["task"])]}
+    found = [policy.select_action(batch, noise=Noise(given["noise"]), plan="dense") for _ in range(20)]
+    assert np.abs(torch.stack(found, 1).numpy() - golden["call0.action"][:, :20]).max() < 1e-4
+
+
+def test_the_text_of_a_task_in_place_of_its_tokens(
+    compiled: Path, directory: Path, golden: Mapping[str, Array]
+) -> None:
+    """With a tokenizer on the robot; of two episodes the instructions differ."""
+    policy = ttscompile.load(compiled, tokenizer=directory.parent / "smolvlm-tiny")
+    for call in (0, 1):
+        given = arrays(golden, call)
+        batch = {key: value for key, value in observed(given).items() if key not in (TOKENS, MASK)}
+        for task in (str(given["task"]), [str(given["task"])]):
+            policy.reset()
+            found = policy.predict_action_chunk(batch | {"task": task}, noise=Noise(given["noise"]), plan="dense")
+            assert np.abs(found - golden[f"call{call}.action"]).max() < 1e-4
+    # What else LeRobot has in a batch tells nothing about the number of streams.
+    for foreign in ({"timestamp": np.float32(0.5)}, {"frame_index": np.arange(3)}):
+        policy.reset()
+        one = foreign | batch | {"task": str(given["task"])}
+        found = policy.predict_action_chunk(one, noise=Noise(given["noise"]), plan="dense")
+        assert np.abs(found - golden["call1.action"]).max() < 1e-4
+    with pytest.raises(ObservationError, match="the task is 3; expected a text"):
+        policy.predict_action_chunk(batch | {"task": 3})
+    with pytest.raises(ObservationError, match="no such file; expected the tokenizer.json"):
+        ttscompile.load(compiled, tokenizer=compiled)
+
+
+def test_verify_names_a_broken_layer(compiled: Path, tmp_path: Path) -> None:
+    shutil.copytree(compiled, tmp_path / "compiled")
+    with edited(tmp_path / "compiled", "weights") as arrays:
+        (name,) = (name for name in arrays if name.endswith("denoiser.layers.1.mlp.down_proj.weight"))
+        arrays[name] *= 1.05
+    found = ttscompile.verify(tmp_path / "compiled", calls=1).first_failure
+    assert found is not None
+    assert (found.name, found.blocks) == ("block", (3,))
+    assert "block 3 (feed_forward)" in found.told
+
+
+def test_a_camera_that_the_robot_lacks(
+    directory: Path, golden: Mapping[str, Array], others: Mapping[str, Array]
+) -> None:
+    """LeRobot masks a black image; here it is left out."""
+    given = arrays(golden, 0)
+    without = LoadOptions(without_cameras=[CAMERAS[1]])
+    found = eager(directory, given, observed(given), without)
+    assert np.abs(found - others["missing"]).max() < 1e-4
+    assert np.abs(found - golden["call0.action"]).max() > 0.01
+
+
+def test_a_rival_is_the_original_without_the_same_camera(directory: Path) -> None:
+    _, spec = load_checkpoint_policy(directory, options=LoadOptions(task="push", without_cameras=[CAMERAS[1]]))
+    module, original = original_policy(directory, spec)
+    assert set(original.observations) == {CAMERAS[0], STATE}
+    assert original.source == spec.source
+    drawn = {key: each.draw(np.random.default_rng(0)) for key, each in original.observations.items()}
+    noise = Noise(np.zeros((1, *original.sample), np.float32))
+    obs = {key: torch.from_numpy(original.observations[key].normalized(value)) for key, value in drawn.items()}
+    assert np.isfinite(np.asarray(eager_policy(module, original)(obs, noise))).all()
+
+
+def test_what_a_configuration_leaves_out_is_lerobots_default(directory: Path, tmp_path: Path) -> None:
+    policy = copy(directory, tmp_path)
+    entries = json.loads((policy / "config.json").read_text())
+    for name in ("attention_mode", "self_attn_every_n_layers", "expert_width_multiplier", "min_period", "max_period"):
+        del entries[name]
+    (policy / "config.json").write_text(json.dumps(entries))
+    found: Any = parts(load_checkpoint_policy(policy)[0]).denoiser
+    expected: Any = parts(load_checkpoint_policy(directory)[0]).denoiser
+    assert found.config == expected.config
+    assert [layer.crosses for layer in found.layers] == [False, True, False, True]
+
+
+def test_cameras_that_lerobot_calls_empty_are_no_observation(directory: Path, tmp_path: Path) -> None:
+    copied = copy(directory, tmp_path)
+    entries = json.loads((copied / "config.json").read_text())
+    entries["input_features"]["observation.images.empty_camera_0"] = {"type": "VISUAL", "shape": [3, 480, 640]}
+    change_json(copied / "config.json", input_features=entries["input_features"])
+    _, spec = load_checkpoint_policy(copied)
+    assert {key for key in spec.observations if "images" in key} == set(CAMERAS)
+
+
+@pytest.mark.parametrize("call", [0, 1])
+def test_an_instruction_that_is_compiled_in(directory: Path, golden: Mapping[str, Array], call: int) -> None:
+    """Its padding is left out, and so is the tokenizer on the robot."""
+    given = arrays(golden, call)
+    task = LoadOptions(task=str(given["task"]))
+    module, spec = load_checkpoint_policy(directory, options=task)
+    encoder: Any = module.get_submodule("encoder")
+    assert encoder.task.tolist() == [given["tokens"][given["attention_mask"]].tolist()]
+    assert set(spec.observations) == {STATE, *CAMERAS}
+    assert np.abs(eager(directory, given, observed(given), task) - golden[f"call{call}.action"]).max() < 1e-4
+
+
+def copy(directory: Path, folder: Path) -> Path:
+    """The policy and its language model in a folder of the test's, with one that can be changed."""
+    shutil.copytree(directory.parent / "smolvlm-tiny", folder / "smolvlm-tiny", copy_function=shutil.copyfile)
+    shutil.copytree(directory, folder / "policy", copy_function=shutil.copyfile)
+    for each in (folder / "policy", folder / "smolvlm-tiny"):
+        each.chmod(0o755)
+    return folder / "policy"
+
+
+def test_what_does_not_fit_is_refused(directory: Path, tmp_path: Path) -> None:
+    policy = copy(directory, tmp_path)
+    with pytest.raises(CheckpointError, match="observation.images.side cannot be left out"):
+        load_checkpoint_policy(policy, options=LoadOptions(without_cameras=["observation.images.side"]))
+    with pytest.raises(CheckpointError, match="all cannot be left out"):
+        load_checkpoint_policy(policy, options=LoadOptions(without_cameras=CAMERAS))
+    for entry, value in (("adapt_to_pi_aloha", True), ("num_expert_layers", 2), ("resize_imgs_with_padding", [64, 32])):
+        change_json(policy / "config.json", **{entry: value})
+        with pytest.raises(CheckpointError, match=rf"{entry}.*\. If lerobot takes the file, this is not compiled"):
+            load_checkpoint_policy(policy)
+        shutil.copyfile(directory / "config.json", policy / "config.json")
+
+
+def test_a_tokenizer_that_is_missing_or_of_another_model(directory: Path, tmp_path: Path) -> None:
+    policy = copy(directory, tmp_path)
+    model = tmp_path / "smolvlm-tiny"
+    entries = json.loads((model / "tokenizer.json").read_text())
+    entries["model"]["vocab"]["zebra"] = 4000
+    entries["added_tokens"].append(dict(entries["added_tokens"][0], id=4000, content="zebra"))
+    (model / "tokenizer.json").write_text(json.dumps(entries))
+    with pytest.raises(CheckpointError, match="token 4000; the language model has 400"):
+        load_checkpoint_policy(policy, options=LoadOptions(task="zebra"))
+    (model / "tokenizer.json").write_text("{")
+    with pytest.raises(CheckpointError, match="no tokenizer that can be read"):
+        load_checkpoint_policy(policy, options=LoadOptions(task="go"))
+    (model / "tokenizer.json").unlink()
+    with pytest.raises(CheckpointError, match="is not on this machine: .* has none, and nothing is ever downloaded"):
+        load_checkpoint_policy(policy, options=LoadOptions(task="go"))
+
+
+def test_a_processor_or_a_language_model_that_is_missing(directory: Path, tmp_path: Path) -> None:
+    policy = copy(directory, tmp_path)
+    (policy / "policy_preprocessor.json").unlink()
+    with pytest.raises(CheckpointError, match="policy_preprocessor.json: no such file"):
+        ttscompile.convert(policy, tmp_path / "out")
+    shutil.rmtree(tmp_path / "smolvlm-tiny")
+    shutil.copyfile(directory / "policy_preprocessor.json", policy / "policy_preprocessor.json")
+    with pytest.raises(CheckpointError, match="language model 'smolvlm-tiny' is not on this machine"):
+        ttscompile.convert(policy, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_that_exceeds_the_memory_is_refused_before_work(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 2**16)
+    with pytest.raises(CheckpointError, match=r"million weights.* takes about 0\.0 GiB .*; this machine has 0\.0 GiB"):
+        ttscompile.convert(directory, tmp_path / "out")
+
+
+def test_a_path_of_this_machine_is_found(directory: Path, tmp_path: Path) -> None:
+    """The configuration may name the language model's folder wherever it is."""
+    policy = copy(directory, tmp_path)
+    (tmp_path / "smolvlm-tiny").rename(tmp_path / "elsewhere")
+    model = tmp_path / "elsewhere"
+    (tmp_path / "far").mkdir()
+    policy.rename(tmp_path / "far" / "policy")
+    change_json(tmp_path / "far" / "policy" / "config.json", vlm_model_name=str(model))
+    _, spec = load_checkpoint_policy(tmp_path / "far" / "policy")
+    assert spec.sample == (50, 32)

@@ -1,0 +1,264 @@
+"""Parity with LeRobot 0.6.1's xvla at tiny sizes: from raw images, state and instruction to robot actions."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import ttscompile
+from tests.once import Once
+from ttscompile.core.spec import Noise
+from ttscompile.errors import CheckpointError, TtscompileError
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.examined import examine
+from ttscompile.frontends.families import AS_SAVED, LoadOptions
+from ttscompile.frontends.lerobot_files import lerobot_files
+from ttscompile.passes.split_frames import SplitFrames
+
+from ..families.support import record
+from ..frontends.lerobot_tiny import change_json
+from . import originals, xvlas
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
+from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
+
+TOKENIZER = xvlas.SAVED / xvlas.LANGUAGE
+
+
+@pytest.fixture(scope="module")
+def golden() -> Mapping[str, Array]:
+    return originals.golden("lerobot_xvla")
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    return xvlas.save("ee6d", tmp_path)
+
+
+def eager(directory: Path, kind: str, call: int, options: LoadOptions = AS_SAVED) -> Array:
+    """The whole chunk of the rebuilt network, not compiled."""
+    told = TOKENIZER, xvlas.TASKS[call]
+    return eager_chunk(directory, options, xvlas.observation(call, kind), xvlas.noise(kind), *told)[1]
+
+
+@pytest.mark.parametrize(("kind", "compiled_in"), [("ee6d", False), *((kind, True) for kind in xvlas.KINDS)])
+def test_the_rebuilt_network_gives_lerobots_actions(
+    tmp_path: Path, kind: str, compiled_in: bool, golden: Mapping[str, Array]
+) -> None:
+    """Two instructions, of which one is cut, states and image sizes; and a camera that the robot lacks."""
+    directory = xvlas.save(kind, tmp_path)
+    for call in (0, 1):
+        found = eager(directory, kind, call, LoadOptions(task=xvlas.TASKS[call] if compiled_in else None))
+        assert found.shape == golden[f"{kind}.{call}"].shape
+        assert np.abs(found - golden[f"{kind}.{call}"]).max() < 1e-5
+        assert np.abs(found - golden[f"{kind}.{1 - call}"]).max() > 0.01
+    without = LoadOptions(task=xvlas.TASKS[0] if compiled_in else None, without_cameras=CAMERAS[:1])
+    found = eager(directory, kind, 0, without)
+    assert np.abs(found - golden[f"{kind}.missing"]).max() < 1e-5
+    assert np.abs(found - golden[f"{kind}.0"]).max() > 0.001
+
+
+@pytest.mark.parametrize("mode", xvlas.MODES)
+def test_other_action_modes(tmp_path: Path, mode: str, golden: Mapping[str, Array]) -> None:
+    found = eager(xvlas.save(mode, tmp_path), mode, 0, LoadOptions(task=xvlas.TASKS[0]))
+    assert found.shape == golden[mode].shape
+    assert np.abs(found - golden[mode]).max() < 1e-5
+
+
+@pytest.fixture(scope="module")
+def compiled(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("xvla")
+    artifact, program = once.compiled("whole xvla", lambda to: ttscompile.convert(xvlas.save("ee6d", folder), to))
+    record("LeRobot xvla", "actions that lerobot 0.6.1 gave, raw observation to action, 1e-4", "remix 4", program)
+    return artifact
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_what_is_compiled_gives_them_too(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
+    """The text of the task is an observation, whose tokens the policy makes, and cuts."""
+    policy = ttscompile.load(compiled, runtime=runtime, tokenizer=TOKENIZER)
+    assert set(policy.info.observation) == {STATE, *CAMERAS, TOKENS, MASK}
+    for call in (0, 1):
+        given = {key: value[None] for key, value in xvlas.observation(call).items()} | {"task": xvlas.TASKS[call]}
+        found = policy.predict_action_chunk(given, noise=Noise(xvlas.noise("ee6d")), plan="dense")
+        assert found.shape == (1, 3, 20)
+        assert np.abs(found - golden[f"ee6d.{call}"][:, :3]).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_runtimes_agree_on_random_plans(compiled: Path) -> None:
+    for runtime in ("onnxruntime", "torch"):
+        assert_agreement_on_random_plans(compiled, runtime)
+
+
+@pytest.mark.slow
+def test_pictures_are_encoded_each_by_itself(once: Once, compiled: Path) -> None:
+    """At its real size; the tower of this one costs less than looking whether a picture is new."""
+    _, program = once.compiled("whole xvla", lambda _: pytest.fail("made above"))
+    (tower,) = SplitFrames(1000)(program).program.pieces.towers
+    assert [each.shape[1:] for each in tower.inputs.values()] == [(3, 32, 32)]
+    assert len(tower.outputs) == 1
+
+
+@pytest.mark.slow
+def test_every_rung_of_verify_holds(compiled: Path) -> None:
+    assert ttscompile.verify(compiled, calls=1).passed
+
+
+@pytest.mark.parametrize("steps", [1, 3, 10])
+def test_a_step_mixes_the_prediction_with_the_first_noise(directory: Path, steps: int) -> None:
+    _, spec = load_checkpoint_policy(directory, options=LoadOptions(task="go", steps=steps))
+    (name,), (table,) = spec.loops.keys(), spec.loops.values()
+    assert (name, spec.sampler.steps, table.memories) == (f"remix-{steps}", 4, 1)
+    assert table.timesteps.tolist() == [np.float32(i / steps) for i in range(steps, 0, -1)]
+    with pytest.raises(TtscompileError, match="the loop of xvla is its own. Leave it out"):
+        load_checkpoint_policy(directory, options=LoadOptions(task="go", sampler="euler"))
+
+
+def test_what_is_beside_an_image_is_the_mean_colour(directory: Path) -> None:
+    """lerobot pads what is normalised with zeros."""
+    _, spec = load_checkpoint_policy(directory)
+    assert [spec.observations[key].fill for key in CAMERAS] == [(0.485, 0.456, 0.406)] * 2
+
+
+def test_the_robot_is_the_preprocessors(directory: Path, golden: Mapping[str, Array]) -> None:
+    """Without its step it is the first."""
+    path = directory / "policy_preprocessor.json"
+    steps = json.loads(path.read_text())["steps"]
+    assert load_checkpoint_policy(directory)[1].source["domain"] == "2"
+    change_json(path, steps=[step for step in steps if step["registry_name"] != "xvla_add_domain_id"])
+    assert load_checkpoint_policy(directory)[1].source["domain"] == "0"
+    assert np.abs(eager(directory, "ee6d", 0) - golden["ee6d.0"]).max() > 0.01
+
+
+def test_weights_as_its_authors_save_them(tmp_path: Path) -> None:
+    """Beside LeRobot's JSON files: without the level ``model``, and as Microsoft's code names Florence's layers."""
+    directory, options = xvlas.save("auto", tmp_path), LoadOptions(task=xvlas.TASKS[0])
+    before, path = load_checkpoint_policy(directory, options=options)[0].state_dict(), directory / "model.safetensors"
+    weights = load_file(path)
+    assert any(name.startswith("model.vlm.language_model.model.encoder.") for name in weights)
+    path.unlink()
+    save_file({name.removeprefix("model."): value for name, value in weights.items()}, path)
+    found = load_checkpoint_policy(directory, options=options)[0].state_dict()
+    assert all(torch.equal(found[name], before[name]) for name in before | found)
+
+
+def test_a_policy_without_state(tmp_path: Path, golden: Mapping[str, Array]) -> None:
+    directory = xvlas.save("agibot_ee6d", tmp_path)
+    entries = json.loads((directory / "config.json").read_text())
+    entries["input_features"].pop(STATE)
+    change_json(directory / "config.json", use_proprio=False, input_features=entries["input_features"])
+    weights = load_file(directory / "model.safetensors")
+    name = "model.transformer.action_encoder.fc.weight"
+    rows = weights[name].view(3, 46, 32)
+    weights[name] = torch.cat([rows[:, :20], rows[:, 40:]], 1).flatten(1).contiguous()
+    (directory / "model.safetensors").unlink()
+    save_file(weights, directory / "model.safetensors")
+    _, spec = load_checkpoint_policy(directory, options=LoadOptions(task="go"))
+    assert set(spec.observations) == set(CAMERAS)
+    assert np.isfinite(eager(directory, "agibot_ee6d", 0, LoadOptions(task=xvlas.TASKS[0]))).all()
+
+
+def test_doctor_tries_its_tokenizer(directory: Path) -> None:
+    _, spec = load_checkpoint_policy(directory)
+    told = {finding.what: finding for finding in examine(directory, spec)}
+    assert "259 tokens; 259 are known" in told["tokenizer"].found
+
+
+def test_lerobots_commands_take_it(directory: Path) -> None:
+    files = lerobot_files(directory, load_checkpoint_policy(directory)[1])
+    steps = {step["registry_name"]: step["config"] for step in json.loads(files["policy_preprocessor.json"])["steps"]}
+    assert steps["tokenizer_processor"]["max_length"] == 24
+    assert not [name for name in steps if name.startswith("xvla")]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action_mode": "ee7d"}, "action_mode is 'ee7d'; expected one of ee6d, .*, auto"),
+        ({"action_mode": "so101_bimanual"}, "max_state_dim is 32; expected 20, with the action_mode so101_bimanual"),
+        ({"use_proprio": False}, "use_proprio is False; expected a state of 20 numbers at least .* this action_mode"),
+        ({"max_state_dim": 12}, "max_state_dim is 12; expected a state of 20 numbers at least"),
+        ({"action_mode": "joint"}, r"action.* has shape \(20,\); expected \(14,\)"),
+        ({"domain_feature_key": "robot"}, "domain_feature_key is 'robot'; expected null: .* at every call"),
+        ({"num_domains": 2}, "num_domains is 2, and xvla_add_domain_id.domain_id is 2; expected a whole number, 1 at"),
+        ({"num_domains": 4}, "do not fit the configuration: missing .*transformer.action_decoder.bias"),
+        ({"max_len_seq": 30}, "max_len_seq is 30; expected 49 at least, for 4 views of this size"),
+        ({"num_image_views": 50}, "max_len_seq is 96; expected .* at least, for 50 views"),
+        ({"depth": 1}, "unexpected transformer.blocks.layers.1"),
+        ({"num_heads": 5}, "hidden_size is 32; expected a multiple of num_attention_heads = 5"),
+        ({"resize_imgs_with_padding": [1, 320]}, r"images of \[1, 320\] become \[1, 20\] patches; expected 1-6 along"),
+        ({"empty_cameras": -1}, "empty_cameras is -1; expected a whole number, 64 at most"),
+        ({"florence_config": {}}, "florence_config.vision_config is None; expected its entries"),
+    ],
+)
+def test_what_is_not_rebuilt_is_named(directory: Path, changes: dict[str, Any], message: str) -> None:
+    change_json(directory / "config.json", **changes)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_policy(directory)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "message"),
+    [
+        ("vision_config", {"model_type": "swin"}, "model_type is 'swin'; expected davit or florence_vision"),
+        ("vision_config", {"depths": [1, 1]}, r"depths is \[1, 1\]; expected 3 sizes, one for each stage"),
+        ("vision_config", {"patch_padding": [1, -1, 1]}, "patch_padding is .*; expected 3 sizes"),
+        ("vision_config", {"embed_dim": None}, "embed_dim is None; expected some sizes"),
+        ("vision_config", {"projection_dim": 8}, "projection_dim is 8; expected text_config.d_model, 24"),
+        ("vision_config", {"in_channels": 4}, "in_channels is 4; expected 3"),
+        ("vision_config", {"num_groups": [3, 2, 4]}, "hidden_size is 8; expected a multiple of num_att.* = 3"),
+        ("vision_config", {"image_pos_embed": {"type": "sine"}}, "image_pos_embed is .*; expected the type learned"),
+        ("vision_config", {"image_feature_source": ["last_frame"]}, "image_feature_source is .*; expected spatial_avg"),
+        ("text_config", {"model_type": "t5"}, "model_type is 't5'; expected florence2_language or bart"),
+        ("text_config", {"activation_function": "relu"}, "activation_function is 'relu'; expected gelu"),
+        ("text_config", {"max_position_embeddings": 20}, "max_position_embeddings: expected 29 at least"),
+        ("text_config", {"pad_token_id": 259}, "pad_token_id is 259; expected a whole number, 258 at most"),
+    ],
+)
+def test_what_is_not_rebuilt_of_florence_is_named(
+    directory: Path, part: str, changes: dict[str, Any], message: str
+) -> None:
+    entries = json.loads((directory / "config.json").read_text())["florence_config"]
+    change_json(directory / "config.json", florence_config=entries | {part: entries[part] | changes})
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_policy(directory)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("tokenizer_processor", {"padding": "longest"}, "padding is longest, at the right: .* --task on the command"),
+        ("tokenizer_processor", {"padding_side": "left"}, "padding is max_length, at the left: instructions differ"),
+        ("tokenizer_processor", {"truncation": False}, "expected such a step, which cuts an instruction"),
+        ("xvla_add_domain_id", {"domain_id": -1}, "domain_id is -1; expected a whole number, 2 at most"),
+        ("xvla_imagenet_normalize", {"image_keys": [CAMERAS[0]]}, "image_keys is .*; expected all cameras, or none"),
+    ],
+)
+def test_processors_that_are_not_compiled(directory: Path, name: str, changes: dict[str, Any], message: str) -> None:
+    path = directory / "policy_preprocessor.json"
+    steps = json.loads(path.read_text())["steps"]
+    for step in steps:
+        step["config"] |= changes if step["registry_name"] == name else {}
+    change_json(path, steps=steps)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint_policy(directory)
+
+
+def test_steps_in_another_order_and_steps_of_a_robot(directory: Path) -> None:
+    path = directory / "policy_preprocessor.json"
+    steps = json.loads(path.read_text())["steps"]
+    change_json(path, steps=[steps[0], *steps[:0:-1]])
+    with pytest.raises(CheckpointError, match="xvla_imagenet_normalize is before xvla_image_to_float"):
+        load_checkpoint_policy(directory)
+    change_json(path, steps=steps)
+    path = directory / "policy_postprocessor.json"
+    steps = json.loads(path.read_text())["steps"]
+    change_json(path, steps=[*steps, {"registry_name": "xvla_rotation_6d_to_axis_angle", "config": {}}])
+    with pytest.raises(CheckpointError, match="'xvla_rotation_6d_to_axis_angle' is not known .* outside of the policy"):
+        load_checkpoint_policy(directory)

@@ -1,0 +1,65 @@
+"""Tiny xvla policies, as lerobot saved them, with weights that a seed gives, so that golden files stay small.
+
+``golden/make_lerobot_xvla.py`` wrote the folders, and gave lerobot the same weights, observations and noise.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+from ..frontends.lerobot_tiny import change_json
+from .hybrid import fill
+from .vlas import CAMERAS, STATE, Array
+
+KINDS = ("ee6d", "auto", "so101")
+"""The second has other entries where there is a choice, and files as earlier versions of lerobot wrote them."""
+MODES = ("joint", "agibot_ee6d", "franka_joint7")
+"""Action modes of which a policy is like the last kind's."""
+TASKS = ("push the block", "a task of more words than the policy reads, which is cut before its end")
+SIZES = ((28, 36), (50, 40))
+"""Height and width of the images of each call; those that are not resized have the first."""
+SAVED = Path(__file__).parent / "golden" / "lerobot_xvla"
+LANGUAGE, SHAPES = "bart-tiny", "shapes.json"
+STATE_DIM, HORIZON, ACTIONS = 7, 5, {"auto": 9, "joint": 14}
+"""Numbers of an action in the network, where they are not 20."""
+
+
+def save(kind: str, folder: Path) -> Path:
+    """A policy of a kind or a mode and, beside it, the files of its tokenizer. Returns the policy's directory."""
+    directory = folder / "policy"
+    shutil.copytree(SAVED / (kind if kind in KINDS else KINDS[-1]), directory)
+    shutil.copytree(SAVED / LANGUAGE, folder / LANGUAGE)
+    shapes = json.loads((directory / SHAPES).read_text())
+    (directory / SHAPES).unlink()
+    if kind in MODES:
+        change_json(directory / "config.json", action_mode=kind)
+        domains, most = shapes["model.transformer.action_decoder.bias.weight"]
+        width = shapes["model.transformer.action_encoder.bias.weight"][1]
+        actions = ACTIONS.get(kind, most)
+        shapes["model.transformer.action_decoder.bias.weight"] = [domains, actions]
+        shapes["model.transformer.action_decoder.fc.weight"] = [domains, actions * width]
+        shapes["model.transformer.action_encoder.fc.weight"][1] -= (most - actions) * width
+    save_file(weights(shapes), directory / "model.safetensors")
+    return directory
+
+
+def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
+    """By the names and shapes that lerobot saves."""
+    return fill({name: torch.empty(shape) for name, shape in shapes.items()}, 5)
+
+
+def observation(call: int, kind: str = "ee6d") -> dict[str, Array]:
+    """One frame; of the second call the state is another, and so is the size of images that are resized."""
+    rng = np.random.RandomState(call)
+    found: dict[str, Array] = {STATE: rng.standard_normal(STATE_DIM).astype(np.float32)}
+    size = SIZES[call if kind == "ee6d" else 0]
+    return found | {key: rng.uniform(0, 1, (3, *size)).astype(np.float32) for key in CAMERAS}
+
+
+def noise(kind: str) -> Array:
+    """``[1, T, D]``."""
+    return np.random.RandomState(7).standard_normal((1, HORIZON, ACTIONS.get(kind, 20))).astype(np.float32)
