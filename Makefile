@@ -45,7 +45,7 @@ types: $(READY)
 	rm -rf $(TYPED)
 	mkdir -p $(TYPED)/recipes
 	cp -Rp ttscompile tests examples plugins/lerobot_policy_ttscompile $(TYPED)
-	cp -Rp passes runtimes plugins/policies plugins/rivals $(TYPED)/ttscompile
+	cp -Rp passes runtimes plugins/policies plugins/rivals plugins/serving $(TYPED)/ttscompile
 	mv $(TYPED)/examples/policies/*.py $(TYPED)/recipes
 	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 
@@ -97,7 +97,7 @@ test-openpi: $(READY)
 	test -x $(OPENPI)/bin/python || $(PYTHON) -m venv $(OPENPI)
 	$(OPENPI)/bin/python -m pip install --quiet --disable-pip-version-check openpi-client==0.1.2 \
 		typing_extensions  # which it imports and does not ask for
-	$(BIN)/pytest tests/runtimes/fleet/test_openpi_client.py
+	$(BIN)/pytest tests/serving/test_openpi_client.py
 
 # Python 3.11 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
 test-matrix: $(READY)

@@ -17,5 +17,5 @@ def on_startup(command: str, dirty: bool) -> None:
     shutil.rmtree(TARGET, ignore_errors=True)
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "ttscompile", TARGET, ignore=ignored)
-    for part in ("passes", "runtimes", "plugins/policies", "plugins/rivals"):
+    for part in ("passes", "runtimes", "plugins/policies", "plugins/rivals", "plugins/serving"):
         shutil.copytree(ROOT / part, TARGET / Path(part).name, ignore=ignored)

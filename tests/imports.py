@@ -13,6 +13,7 @@ PACKAGES = {
     "runtimes": "ttscompile.runtimes",
     "plugins/policies": "ttscompile.policies",
     "plugins/rivals": "ttscompile.rivals",
+    "plugins/serving": "ttscompile.serving",
 }
 """Folder of the tree -> package that it is installed as."""
 

@@ -27,6 +27,7 @@ FLOORS = (
     ("builder", "rivals"),
     ("ttscompile",),
     ("cli",),
+    ("serving",),
     ("__main__",),
 )
 """The rooms from the ground up: each may import those on floors below its own. ``ttscompile`` is the package's own

@@ -18,7 +18,7 @@ from click.testing import CliRunner, Result
 
 from ttscompile.cli import main
 from ttscompile.cli.sections import Section
-from ttscompile.runtimes.server import listener
+from ttscompile.serving import listener
 
 NO_TEXT = os.fsdecode(b"\xff\xfe.html")
 UNKIND = (
@@ -128,7 +128,7 @@ def stops_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         yield
 
     monkeypatch.setattr(listener.Listener, "run", brief)
-    monkeypatch.setattr(sys.modules["ttscompile.cli.serve"], "ray_copies", nobody)
+    monkeypatch.setattr(sys.modules["ttscompile.serving.command"], "ray_copies", nobody)
 
 
 @pytest.mark.slow

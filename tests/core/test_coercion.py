@@ -164,7 +164,7 @@ def test_arguments_that_count_are_whole(make: Callable[[Any], Any], message: str
     from ttscompile import ChunkSpec, ExecutorSettings, ObservationSpec, flow_matching_table
     from ttscompile.calibration.budget import goal_of
     from ttscompile.frontends.families import LoadOptions
-    from ttscompile.runtimes.server.admission import ServerLimits
+    from ttscompile.serving.admission import ServerLimits
 
     def settings(name: str, value: Any) -> ExecutorSettings:
         return ExecutorSettings(**{name: value})

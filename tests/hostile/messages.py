@@ -97,10 +97,10 @@ def _ragged(rng: random.Random) -> Any:
 @cache
 def _server() -> Any:
     from tests.runtimes.executor.simulation import FakeClock
-    from tests.runtimes.server.serving import Quick
+    from tests.serving.serving import Quick
     from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-    from ttscompile.runtimes.server.admission import ServerLimits
-    from ttscompile.runtimes.server.executor_server import ExecutorServer
+    from ttscompile.serving.admission import ServerLimits
+    from ttscompile.serving.executor_server import ExecutorServer
 
     settings = ExecutorSettings(max_hold=1000)
     return ExecutorServer(

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 import ttscompile
 from tests.families.checks import kinds
 from tests.families.support import record, stored_program
-from tests.runtimes.server.serving import ServerError, connected, listening
+from tests.serving.serving import ServerError, connected, listening
 from ttscompile.artifact import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import Noise
@@ -26,8 +26,8 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions, find_family
 from ttscompile.policies import flax_files, octo, octo_loop
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.executor_server import ExecutorServer
+from ttscompile.serving.admission import ServerLimits
+from ttscompile.serving.executor_server import ExecutorServer
 
 from .octos import CHECKPOINT, MASK, TOKENS, WINDOW, actions, change, noise, shown, unpack
 

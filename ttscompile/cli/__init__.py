@@ -4,6 +4,8 @@ Results go to standard output, as a table or with ``--json`` as one JSON documen
 warnings go to standard error. ``ending`` has the exit statuses.
 """
 
+from importlib import import_module
+
 import click
 
 from ttscompile import __version__
@@ -16,7 +18,6 @@ from ttscompile.cli.ending import TRACEBACK, Commands
 from ttscompile.cli.inspect import inspect
 from ttscompile.cli.predict import predict
 from ttscompile.cli.push import push
-from ttscompile.cli.serve import serve
 from ttscompile.cli.verify import verify
 
 
@@ -31,6 +32,8 @@ from ttscompile.cli.verify import verify
 def main() -> None:
     """Compile diffusion policies of robots into artifacts that run in real time without PyTorch."""
 
+
+serve = import_module("ttscompile.serving.command").serve  # attached to the commands, and built on them
 
 # In the order in which they are used; a line each, short enough for a terminal of 80 columns.
 for _command, _what in (

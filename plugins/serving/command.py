@@ -28,13 +28,16 @@ from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.types import ADDRESS, ANY_TEXT, FILE, PATH, RATE, TEXT
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.fleet import LOCAL, FleetServer, FleetSettings, OpenPiServer, Plans, ray_copies
 from ttscompile.runtimes.instruct import Instruct
 from ttscompile.runtimes.load import open_policy
-from ttscompile.runtimes.server.admission import AUDIT, ServerLimits
-from ttscompile.runtimes.server.executor_server import ExecutorServer
-from ttscompile.runtimes.server.listener import Listener
-from ttscompile.runtimes.server.lock import Lock, hashed, read_by_others, read_token, tls_context
+
+from .admission import AUDIT, ServerLimits
+from .copies import LOCAL, FleetSettings, ray_copies
+from .executor_server import ExecutorServer
+from .fleet import FleetServer, Plans
+from .listener import Listener
+from .lock import Lock, hashed, read_by_others, read_token, tls_context
+from .openpi import OpenPiServer
 
 ROBOT_CLIENTS, FLEET_CLIENTS = 8, 256
 """That may be connected."""

@@ -1,6 +1,6 @@
 """Drive a server with the published client of openpi, in the environment that has it; see ``test_openpi_client.py``.
 
-    build/openpi-venv/bin/python tests/runtimes/fleet/openpi_drive.py ws://127.0.0.1:8765/ [TOKEN]
+    build/openpi-venv/bin/python tests/serving/openpi_drive.py ws://127.0.0.1:8765/ [TOKEN]
 
 Prints one JSON document.
 """

@@ -15,8 +15,8 @@ import pytest
 from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor
-from ttscompile.runtimes.server.admission import Admission, AdmittingSocket
-from ttscompile.runtimes.server.executor_server import ExecutorServer
+from ttscompile.serving.admission import Admission, AdmittingSocket
+from ttscompile.serving.executor_server import ExecutorServer
 
 from .serving import CLIENT, Quick, serving
 
@@ -78,7 +78,7 @@ def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
         )
         return await server._listen("localhost", 0)
 
-    monkeypatch.setattr("ttscompile.runtimes.server.listener.AdmittingSocket", Socket)
+    monkeypatch.setattr("ttscompile.serving.listener.AdmittingSocket", Socket)
     with AsyncExecutor(Quick(FakeClock()), 20, latencies={"dense": 0.01}) as executor:
         server = ExecutorServer(executor)
         if left is None:

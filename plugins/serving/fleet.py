@@ -21,10 +21,11 @@ from ttscompile.errors import DeadlineMissedError, IllegalPlanError, Observation
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.instruct import Instruct
 from ttscompile.runtimes.liveness import reads_earlier_calls
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.listener import Listener
-from ttscompile.runtimes.server.lock import Lock
-from ttscompile.runtimes.server.protocol import Metric, Request, read_frame
+
+from .admission import ServerLimits
+from .listener import Listener
+from .lock import Lock
+from .protocol import Metric, Request, read_frame
 
 METHODS = {"info": frozenset[str](), "predict": frozenset({"obs", "plan"})}
 

@@ -16,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from tests.runtimes.server.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
+from tests.serving.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ProtocolError
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.listener import Listener
-from ttscompile.runtimes.server.protocol import LARGE, read_request
+from ttscompile.serving.admission import ServerLimits
+from ttscompile.serving.listener import Listener
+from ttscompile.serving.protocol import LARGE, read_request
 
 PATIENT = replace(LIMITS, idle_timeout=30.0, handshake_timeout=10.0, send_timeout=10.0)
 """So that it does not matter what else the machine does."""

@@ -18,8 +18,8 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.runtimes.server.serving import Client, ServerError
-from tests.runtimes.server.watching import figures, get
+from tests.serving.serving import Client, ServerError
+from tests.serving.watching import figures, get
 from ttscompile.cli import main
 
 WRONG = 11, 2

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from ttscompile.runtimes.server.lock import Lock, hashed
-from ttscompile.runtimes.server.protocol import Metric, exposition
+from ttscompile.serving.lock import Lock, hashed
+from ttscompile.serving.protocol import Metric, exposition
 
 from .serving import LIMITS, Broken, ServerError, connected, serving
 from .watching import figures, get

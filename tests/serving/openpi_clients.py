@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import ttscompile
-from tests.runtimes.server.serving import LIMITS, listening
+from tests.serving.serving import LIMITS, listening
 from ttscompile.artifact.load import load_artifact
-from ttscompile.runtimes.fleet import OpenPiServer
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.lock import Lock
+from ttscompile.serving.admission import ServerLimits
+from ttscompile.serving.lock import Lock
+from ttscompile.serving.openpi import OpenPiServer
 
 if any(importlib.util.find_spec(name) is None for name in ("websockets", "msgpack")):
     pytest.skip("NO TESTS OF OPENPI: websockets or msgpack is not installed; see CONTRIBUTING", allow_module_level=True)

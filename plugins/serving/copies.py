@@ -16,7 +16,7 @@ from ttscompile.errors import ArtifactChangedError, ClusterError, TtscompileErro
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.load import load
 
-from .server import Answered
+from .fleet import Answered
 
 LOCAL = "local"
 """In the place of an address: a cluster of this machine's cores, for as long as the server runs."""

@@ -15,11 +15,11 @@ from ttscompile.core.tokenizer import TASK
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.lock import Lock
-from ttscompile.runtimes.server.protocol import DTYPES, Message, Request, read_arrays, read_task
 
-from .server import Answered, FleetServer
+from .admission import ServerLimits
+from .fleet import Answered, FleetServer
+from .lock import Lock
+from .protocol import DTYPES, Message, Request, read_arrays, read_task
 
 IDLE_TIMEOUT = 3600.0
 """Seconds. These clients say nothing between episodes, and do not come back when they are cut off."""

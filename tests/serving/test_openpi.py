@@ -17,16 +17,16 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.runtimes.server.serving import LIMITS, handshake, listening, raw
-from tests.runtimes.server.watching import figures, get
+from tests.serving.serving import LIMITS, handshake, listening, raw
+from tests.serving.watching import figures, get
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.errors import IllegalPlanError
 from ttscompile.runtimes.arrays import check_observation, read_observation
-from ttscompile.runtimes.fleet import OpenPiServer
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.lock import Lock, hashed
+from ttscompile.serving.admission import ServerLimits
+from ttscompile.serving.lock import Lock, hashed
+from ttscompile.serving.openpi import OpenPiServer
 
 from .openpi_clients import (
     GOOD,

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import ttscompile
-from tests.runtimes.server.serving import listening
+from tests.serving.serving import listening
 from ttscompile.artifact.load import load_artifact
-from ttscompile.runtimes.fleet import OpenPiServer
+from ttscompile.serving.openpi import OpenPiServer
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / "build" / "openpi-venv" / "bin" / "python"
 TOKEN = "a-token-of-these-tests-alone"
 

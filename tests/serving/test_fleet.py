@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from tests.plans import store_schedules
-from tests.runtimes.server.serving import LIMITS, Client, ServerError, connected, listening, vanish
-from tests.runtimes.server.watching import figures, get
 from tests.runtimes.toys import toy_program, written_artifact
+from tests.serving.serving import LIMITS, Client, ServerError, connected, listening, vanish
+from tests.serving.watching import figures, get
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
 from ttscompile.runtimes.executor.window import Array
-from ttscompile.runtimes.fleet.server import Answered, FleetServer, Plans
 from ttscompile.runtimes.instruct import Instruct
-from ttscompile.runtimes.server.lock import Lock, hashed
+from ttscompile.serving.fleet import Answered, FleetServer, Plans
+from ttscompile.serving.lock import Lock, hashed
 
 if importlib.util.find_spec("websockets") is None:
     pytest.skip("NO FLEET TESTS: websockets is not installed; pip install 'ttscompile[serve]'", allow_module_level=True)

@@ -20,12 +20,12 @@ import pytest
 from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.executor_server import ExecutorServer
-from ttscompile.runtimes.server.listener import Listener
-from ttscompile.runtimes.server.lock import Lock
+from ttscompile.serving.admission import ServerLimits
+from ttscompile.serving.executor_server import ExecutorServer
+from ttscompile.serving.listener import Listener
+from ttscompile.serving.lock import Lock
 
-CLIENT = Path(__file__).parents[3] / "examples" / "serve" / "client.py"
+CLIENT = Path(__file__).parents[2] / "examples" / "serve" / "client.py"
 spec = importlib.util.spec_from_file_location("serve_client", CLIENT)
 assert spec is not None
 assert spec.loader is not None

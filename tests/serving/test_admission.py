@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ttscompile import ObservationSpec
-from ttscompile.runtimes.server.admission import MOST_ADDRESSES, Admission, Pace, ServerLimits
+from ttscompile.serving.admission import MOST_ADDRESSES, Admission, Pace, ServerLimits
 
 
 def test_a_pace_lets_a_second_s_worth_through_at_once() -> None:

@@ -1,6 +1,6 @@
 """Send many small messages to a server: what do it and its answers become?
 
-    python -m tests.runtimes.server.served --messages 1000000
+    python -m tests.serving.served --messages 1000000
 
 Prints one JSON document, with the figures after each tenth, which has a connection of its own.
 """

@@ -28,8 +28,8 @@ from ttscompile.cli import main
 from ttscompile.cli.types import PathName
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor
-from ttscompile.runtimes.server.executor_server import ExecutorServer
-from ttscompile.runtimes.server.lock import Lock, hashed, read_token, tls_context
+from ttscompile.serving.executor_server import ExecutorServer
+from ttscompile.serving.lock import Lock, hashed, read_token, tls_context
 
 from .serving import (
     CLIENT,

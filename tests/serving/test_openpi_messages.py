@@ -16,9 +16,9 @@ import pytest
 
 import ttscompile
 from tests.hostile.mutate import damaged
-from tests.runtimes.server.serving import LIMITS
+from tests.serving.serving import LIMITS
 from ttscompile.artifact.load import load_artifact
-from ttscompile.runtimes.fleet import OpenPiServer
+from ttscompile.serving.openpi import OpenPiServer
 
 from .openpi_clients import GOOD, actions, as_map, ask, client, packed, raw_array, serving
 

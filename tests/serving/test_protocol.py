@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 from ttscompile import ObservationSpec
 from ttscompile.errors import ProtocolError
 from ttscompile.runtimes.executor.window import FrameSpec
-from ttscompile.runtimes.server.protocol import read_arrays, read_frame, read_request
+from ttscompile.serving.protocol import read_arrays, read_frame, read_request
 
 
 def test_requests_are_read_and_frames_converted() -> None:

@@ -24,8 +24,8 @@ from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.cli import main
 from ttscompile.errors import ExecutorError, RuntimeUnavailableError
 from ttscompile.runtimes.executor import AsyncExecutor
-from ttscompile.runtimes.server.admission import ServerLimits
-from ttscompile.runtimes.server.executor_server import ExecutorServer
+from ttscompile.serving.admission import ServerLimits
+from ttscompile.serving.executor_server import ExecutorServer
 
 from .serving import (
     CLIENT,
