@@ -69,7 +69,7 @@ def main(options: list[str]) -> None:
     import numpy as np
 
     import ttscompile
-    from tests.frontends.lerobot_tiny import save_policy
+    from tests.policies.lerobot_tiny import save_policy
     from tests.release import CALLS
     from tests.runtimes.toys import toy_program, written_artifact
     from ttscompile.measure.versions import VERSION

@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "lower": BASE | {"ir"},
     "passes": BASE | {"ir"},
     "frontends": BASE | {"hub", "samplers"},
-    "policies": BASE | {"frontends", "samplers"},
+    "policies": BASE | {"frontends", "hub", "samplers"},
     "capture": BASE | {"frontends", "ir"},
     "artifact": BASE | {"ir"},
     "runtimes": BELOW_ARTIFACT | {"hub"},

@@ -9,7 +9,7 @@ import pytest
 from tests.pages import ROOT, there
 from ttscompile.calibration.strategies import NAMES, STRATEGIES
 from ttscompile.frontends.families import FAMILIES
-from ttscompile.frontends.lerobot import TYPES
+from ttscompile.policies.lerobot.family import TYPES
 
 LINES = (ROOT / "docs" / "references.md").read_text().splitlines()
 ROWS = [

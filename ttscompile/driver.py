@@ -130,11 +130,11 @@ def convert(
             warnings.warn(one.told, stacklevel=2)
     spec = replace(spec, source={**spec.source, **origin})
     beside = files_beside(checkpoint, spec)
-    if spec.source.get("format") == "lerobot" and not beside:
+    if beside == {}:
         explain("files_beside", ("none for LeRobot: none of its steps makes the tokens that this policy reads",))
     loop = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL)
     return _compile(
-        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside, loop
+        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside or {}, loop
     )
 
 

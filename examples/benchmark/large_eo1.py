@@ -10,9 +10,9 @@ from large_evo1 import save_letters
 from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, save_drawn, write_json, write_processors
 
 from ttscompile.frontends.families import AS_SAVED
-from ttscompile.frontends.lerobot_processors import CONVERSATION, READ
 from ttscompile.frontends.settings import Settings, read_json
 from ttscompile.policies.lerobot.eo1 import read_config
+from ttscompile.policies.lerobot.processors import CONVERSATION, READ
 from ttscompile.policies.lerobot.qwen25_vl import DEVIATION, MEAN, read_qwen25
 from ttscompile.policies.lerobot.vla import read_vla_config
 from ttscompile.policies.networks.eo1 import EO1

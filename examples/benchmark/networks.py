@@ -17,9 +17,9 @@ from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import PlanArray, uniform_plan
 from ttscompile.core.spec import ORIGINAL, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.diffusion_policy_parts import TokensDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_sampler
+from ttscompile.policies.diffusion_policy.parts import TokensDenoiser
 from ttscompile.policies.networks.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
 
 PUSHT = Path(__file__).parents[1] / "pusht" / "pusht_dpt_ema_fp16.ckpt"

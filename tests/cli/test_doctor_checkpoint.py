@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.frontends.lerobot_tiny import DS, save_policy
+from tests.policies.lerobot_tiny import DS, save_policy
 from ttscompile import driver
 from ttscompile.cli import main
 from ttscompile.doctor.target import target_findings

@@ -17,7 +17,7 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.examined import examine
 
 from ..calibration import policies
-from .lerobot_tiny import DA, DS, change_json, save_policy, write_json
+from ..policies.lerobot_tiny import DA, DS, change_json, save_policy, write_json
 
 STATE, ACTION, FRONT = "observation.state", "action", "observation.images.front"
 Tensors = dict[str, torch.Tensor]

@@ -21,7 +21,7 @@ OPTIONS = {field.name for field in fields(LoadOptions)}
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
 def test_a_row_has_its_module_and_takes_options_that_there_are(family: Family) -> None:
-    load = import_module(f"ttscompile.{family.module}").load
+    load = import_module(f"ttscompile.policies.{family.module}").load
     assert len(inspect.signature(load).parameters) == 2
     assert family.options <= OPTIONS
     assert family.reads.split()[0] in ("a", "an")

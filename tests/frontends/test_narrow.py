@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import ttscompile
 from tests.families.heads import FAMILIES, loaded
-from tests.frontends.variants import VARIANTS, Build, Save
+from tests.policies.variants import VARIANTS, Build, Save
 from tests.rounding import Counted, assert_equal_but_for_rounding, bound
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.typed_json import to_json

@@ -53,8 +53,8 @@ def make(folder: Path) -> None:
 def _checkpoints(folder: Path) -> None:
     import torch
 
-    from tests.frontends.conftest import _config, _weights
     from tests.policies import unets
+    from tests.policies.conftest import _config, _weights
 
     folder.mkdir()
     for name, as_cond in {"conditioned": True, "inpainting": False}.items():
@@ -70,8 +70,8 @@ def _checkpoints(folder: Path) -> None:
 
 
 def _lerobot(folder: Path) -> None:
-    from tests.frontends.lerobot_tiny import save_policy
     from tests.policies import lerobot_unets
+    from tests.policies.lerobot_tiny import save_policy
 
     lerobot_unets.save("states", folder / "unet" / "policy")
     policies: dict[str, dict[str, Any]] = {

@@ -15,15 +15,15 @@ import torch
 
 import ttscompile
 from tests.artifact.tiny import write_tiny
-from tests.frontends.conftest import _config, _weights
 from tests.hostile.forged import forge
+from tests.policies.conftest import _config, _weights
 from ttscompile.artifact import load_artifact
 from ttscompile.calibration.state import StateFile
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, TrajectoryError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config
-from ttscompile.frontends.interpolation import Config
+from ttscompile.policies.diffusion_policy.interpolation import Config
 from ttscompile.trajectories import frames as trajectories_frames, load_trajectories
 
 

@@ -14,8 +14,8 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.frontends.lerobot_tiny import save_policy
 from tests.passes.modules import MODULES, spec
+from tests.policies.lerobot_tiny import save_policy
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
 from ttscompile.core.spec import PolicySpec

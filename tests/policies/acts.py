@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from ttscompile.frontends.lerobot_config import ENVIRONMENT, STATE
 from ttscompile.policies.lerobot.act import ACT, ACTConfig, as_saved, read_config
+from ttscompile.policies.lerobot.config import ENVIRONMENT, STATE
 
-from ..frontends.lerobot_tiny import write_json, write_processors
 from .hybrid import Array, fill
+from .lerobot_tiny import write_json, write_processors
 
 STREAMS, STATE_DIM, ACTION_DIM, CHUNK = 2, 4, 3, 6
 TOP, WRIST = "observation.images.top", "observation.images.wrist"

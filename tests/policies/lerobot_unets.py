@@ -13,8 +13,8 @@ from safetensors.torch import save_file
 
 from ttscompile.policies.lerobot.diffusion import DiffusionConfig, Network, as_saved, read_config
 
-from ..frontends.lerobot_tiny import write_json, write_processors
 from .hybrid import Array, fill
+from .lerobot_tiny import write_json, write_processors
 
 STREAMS, STEPS, STATE_DIM, ACTION_DIM = 2, 6, 4, 3
 STATE, ENVIRONMENT = "observation.state", "observation.environment_state"

@@ -14,8 +14,8 @@ from ttscompile.policies.networks.language_layers import LanguageConfig
 from ttscompile.policies.networks.pi import Pi, PiConfig
 from ttscompile.policies.networks.siglip import SiglipConfig
 
-from ..frontends.lerobot_tiny import write_json
 from .hybrid import fill
+from .lerobot_tiny import write_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 
 KINDS = ("pi0", "pi05")

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from ..frontends.lerobot_tiny import change_json, write_json
 from . import groots, pis, vla_jepas
+from .lerobot_tiny import change_json, write_json
 from .vlas import STATE, Array
 
 NAMES = ("pan.pos", "lift.pos", "Gripper.pos", "roll.pos", "left_gripper")

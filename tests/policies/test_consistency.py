@@ -14,10 +14,10 @@ import ttscompile
 from tests.rounding import PROMISED, assert_equal_but_for_rounding
 from ttscompile.core.spec import Noise, PolicySpec, SamplerTable
 from ttscompile.errors import CheckpointError, SpecError
-from ttscompile.frontends import diffusion_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.ir.program import Program
+from ttscompile.policies.diffusion_policy import family as diffusion_policy
 
 from ..families.support import record
 from . import consistency

@@ -17,13 +17,14 @@ from ttscompile.artifact import load_artifact
 from ttscompile.capture.export import capture
 from ttscompile.core.spec import ChunkSpec, Noise, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
+from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.ir.flops import frames_flops, graph_flops
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_graph
+from ttscompile.policies.diffusion_policy import family as diffusion_policy
 from ttscompile.policies.diffusion_policy.hybrid import SpatialSoftmax
 from ttscompile.policies.networks.resnet import ResidualBlock
 from ttscompile.runtimes import open_runtime

@@ -24,13 +24,13 @@ from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
-from ttscompile.frontends.lerobot_processors import Normalizer, Statistics, read_processors
 from ttscompile.policies.lerobot.multi_task_dit import Network, with_inputs
+from ttscompile.policies.lerobot.processors import Normalizer, Statistics, read_processors
 from ttscompile.policies.networks.clip import TextConfig
 from ttscompile.runtimes import open_runtime
 
-from ..frontends.lerobot_tiny import DA, DS, SIDE, TEXT, TO, VISION, change_json, dit_config, save_policy
 from ..runtimes.agreement import call_terms, largest_difference
+from .lerobot_tiny import DA, DS, SIDE, TEXT, TO, VISION, change_json, dit_config, save_policy
 
 STATE, TOKENS, MASK = "observation.state", "observation.language.tokens", "observation.language.attention_mask"
 PLAIN: dict[str, Any] = {"use_rope": False, "use_positional_encoding": True}

@@ -20,15 +20,15 @@ from ttscompile.errors import CheckpointError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.lerobot_config import ENVIRONMENT, STATE
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.program import Program
+from ttscompile.policies.lerobot.config import ENVIRONMENT, STATE
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from ..once import Once
 from . import acts
 from .acts import ACTION_DIM, CHUNK, STREAMS, TOP, WRIST
+from .lerobot_tiny import change_json
 from .originals import golden
 
 COMPILED = "two_cameras"

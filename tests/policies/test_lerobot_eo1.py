@@ -25,8 +25,8 @@ from ttscompile.passes.split_frames import SplitFrames
 from ttscompile.policies.lerobot.resized_bytes import Filter, resized
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from . import eo1s, originals
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 from .whole_vlas import (
     assert_a_task_alone_makes_files_of_lerobot,

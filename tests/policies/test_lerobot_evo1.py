@@ -17,8 +17,8 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from . import evo1s, originals
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 from .whole_vlas import assert_a_task_alone_makes_files_of_lerobot, assert_agreement_on_random_plans, eager_chunk
 

@@ -18,8 +18,8 @@ from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from . import groots, originals
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 from .whole_vlas import (
     assert_a_task_alone_makes_files_of_lerobot,

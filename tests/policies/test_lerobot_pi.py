@@ -16,12 +16,12 @@ from ttscompile.errors import CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
-from ttscompile.frontends.lerobot_files import lerobot_files
 from ttscompile.ir.program import Program
+from ttscompile.policies.lerobot.files import files_beside
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json, write_json
 from . import originals, pis
+from .lerobot_tiny import change_json, write_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, as_given
 
 
@@ -74,7 +74,7 @@ def test_a_policy_that_was_fine_tuned_from_a_base(
     spec = load_checkpoint_policy(directory)[1]
     if kind == "pi0":
         assert spec.observations[STATE].shape == (1, pis.STATE_DIM)
-        told = json.loads(lerobot_files(directory, spec)["config.json"])["input_features"]
+        told = json.loads(files_beside(directory, spec)["config.json"])["input_features"]
         assert told[STATE]["shape"] == [pis.STATE_DIM]
     assert np.abs(eager(directory, 0) - golden[f"{kind}.0"]).max() < 1e-4
     steps = json.loads((directory / "policy_preprocessor.json").read_text())["steps"]

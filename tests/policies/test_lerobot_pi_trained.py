@@ -19,8 +19,8 @@ from ttscompile.ir.program import Binding
 from ttscompile.policies.networks.pi import Expert, Pi
 from ttscompile.samplers.flow import flow_matching_table
 
-from ..frontends.lerobot_tiny import change_json
 from . import originals, pis
+from .lerobot_tiny import change_json
 from .vlas import Array
 
 DELAY = "rtc_training_max_delay"

@@ -16,8 +16,8 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED
 
-from ..frontends.lerobot_tiny import change_json
 from . import groots, originals, pis, relatives, vla_jepas
+from .lerobot_tiny import change_json
 from .vlas import STATE, Array
 from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
 

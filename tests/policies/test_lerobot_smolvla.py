@@ -22,9 +22,9 @@ from ttscompile.frontends.encoded import parts
 from ttscompile.frontends.families import LoadOptions
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from ..verification.broken import edited
 from . import originals
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
 
 pytestmark = pytest.mark.slow

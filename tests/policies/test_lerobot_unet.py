@@ -25,10 +25,10 @@ from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import write_json
 from ..once import Once
 from ..runtimes.agreement import call_terms, largest_difference
 from . import lerobot_unets
+from .lerobot_tiny import write_json
 from .lerobot_unets import ACTION_DIM, ENVIRONMENT, STATE, TOP, WRIST
 from .originals import golden
 

@@ -21,8 +21,8 @@ from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.passes.split_frames import SplitFrames
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from . import originals, vla_jepas
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 from .whole_vlas import (
     assert_a_task_alone_makes_files_of_lerobot,

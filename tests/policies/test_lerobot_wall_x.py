@@ -23,8 +23,8 @@ from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.policies.lerobot.resized_bytes import resized
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from . import originals, wall_xs
+from .lerobot_tiny import change_json
 from .vlas import MASK, STATE, TOKENS, Array
 from .whole_vlas import assert_a_task_alone_makes_files_of_lerobot, assert_agreement_on_random_plans, eager_chunk
 

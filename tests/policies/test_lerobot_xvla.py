@@ -17,12 +17,12 @@ from ttscompile.errors import CheckpointError, TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
-from ttscompile.frontends.lerobot_files import lerobot_files
 from ttscompile.passes.split_frames import SplitFrames
+from ttscompile.policies.lerobot.files import files_beside
 
 from ..families.support import record
-from ..frontends.lerobot_tiny import change_json
 from . import originals, xvlas
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
 
@@ -171,7 +171,7 @@ def test_doctor_tries_its_tokenizer(directory: Path) -> None:
 
 
 def test_lerobots_commands_take_it(directory: Path) -> None:
-    files = lerobot_files(directory, load_checkpoint_policy(directory)[1])
+    files = files_beside(directory, load_checkpoint_policy(directory)[1])
     steps = {step["registry_name"]: step["config"] for step in json.loads(files["policy_preprocessor.json"])["steps"]}
     assert steps["tokenizer_processor"]["max_length"] == 24
     assert not [name for name in steps if name.startswith("xvla")]

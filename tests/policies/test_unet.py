@@ -16,10 +16,11 @@ from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding, bou
 from ttscompile.artifact import load_artifact
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends import diffusion_policy, load_checkpoint_policy
+from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.ir.program import Program
+from ttscompile.policies.diffusion_policy import family as diffusion_policy
 from ttscompile.runtimes import open_runtime
 
 from ..families.support import record

@@ -10,8 +10,7 @@ from ttscompile.driver import transform
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.policies.networks.siglip import SiglipConfig
 
-from ..frontends import lerobot_tiny
-from . import pis
+from . import lerobot_tiny, pis
 
 
 def told(directory: Path) -> list[str]:

@@ -15,7 +15,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.lerobot_files import lerobot_files
+from ttscompile.policies.lerobot.files import files_beside
 from ttscompile.runtimes import open_runtime
 
 from ..rounding import bound
@@ -49,8 +49,8 @@ def assert_agreement_on_random_plans(compiled: Path, runtime: str) -> None:
 
 def assert_a_task_alone_makes_files_of_lerobot(directory: Path, cameras: Sequence[str] = CAMERAS) -> None:
     """None of lerobot's steps writes what is around the instruction."""
-    assert not lerobot_files(directory, load_checkpoint_policy(directory)[1])
-    beside = lerobot_files(directory, load_checkpoint_policy(directory, options=LoadOptions(task="go"))[1])
+    assert not files_beside(directory, load_checkpoint_policy(directory)[1])
+    beside = files_beside(directory, load_checkpoint_policy(directory, options=LoadOptions(task="go"))[1])
     assert set(json.loads(beside["config.json"])["input_features"]) == {STATE, *cameras}
 
 

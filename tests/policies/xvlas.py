@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from ..frontends.lerobot_tiny import change_json
 from .hybrid import fill
+from .lerobot_tiny import change_json
 from .vlas import CAMERAS, STATE, Array
 
 KINDS = ("ee6d", "auto", "so101")

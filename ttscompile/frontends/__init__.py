@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ..core.paths import require_free_or_path
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
-from .families import AS_SAVED, LoadOptions, find_family
+from .families import AS_SAVED, LoadOptions, family_of, find_family
 
 if TYPE_CHECKING:
     from torch import nn
@@ -41,10 +41,10 @@ def load_checkpoint_policy(
     return find_family(Path(path), format).load(Path(path), options)
 
 
-def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes]:
-    """Files by which the program that trained a policy takes the compiled one in its place; none where it cannot."""
-    if spec.source.get("format") != "lerobot":
-        return {}
-    from .lerobot_files import lerobot_files
+def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes] | None:
+    """Files by which the program that trained a policy takes the compiled one in its place.
 
-    return lerobot_files(Path(path), spec)
+    None where it never can; empty where it cannot take this one.
+    """
+    own = family_of(spec, "files_beside")
+    return None if own is None else own(Path(path), spec)

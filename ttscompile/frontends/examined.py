@@ -1,30 +1,19 @@
-"""What of a checkpoint goes wrong on a robot without an error: cameras, statistics, instruction, chunk."""
+"""What of a checkpoint goes wrong on a robot without an error: cameras, statistics, chunk; a family may say more."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from ..core.finding import Finding, Level
 from ..core.spec import PolicySpec
-from ..core.tokenizer import Tokenizer, find_tokenizer
-from ..errors import CheckpointError
-from .instruction import encoder_folders
-from .lerobot_config import ACTION, CONFIG
-from .lerobot_groot_steps import read_groot_processors
-from .lerobot_policy import TOKENS
-from .lerobot_processors import NORMALIZE, PREPROCESSOR, Features, Processors, Statistics, read_processors
-from .saved_weights import read_tensors
-from .settings import read_json
+from .families import family_of
 
-PART = "checkpoint"
-_MODELS = ("vlm_model_name", "qwen_model_name", "vlm_base", "pretrained_name_or_path")
+PART, ACTION = "checkpoint", "action"
+REPEAT = "Compute the statistics again on the data that the policy was trained with, and save it with them."
 _LEAST = 1e-6
 """A range or deviation below this share of its place is none: of a joint that never moved."""
-_REPEAT = "Compute the statistics again on the data that the policy was trained with, and save it with them."
 
 
 def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None = None) -> list[Finding]:
@@ -38,31 +27,39 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
         Finding(PART, "other inputs", ", ".join(others) or "none"),
         Finding.judged(PART, ACTION, chunk, executed == 1 < spec.sample[0], "Raise n_action_steps: it calls at each."),
     ]
-    if spec.source.get("format") != "lerobot":
-        affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
-        both = np.array([[-1], [1]], np.float32)
-        ends = {key: torch.from_numpy(one.unnormalize(both)) for key, one in affine.items() if one is not None}
-        return found + [_judged(key, Statistics("MIN_MAX", low, high, 1e-8)) for key, (low, high) in ends.items()]
-    try:
-        return found + _of_lerobot(path, spec, encoders)
-    except CheckpointError as error:  # of what the policy does not read
-        return [*found, Finding(PART, "files", str(error), Level.NOTE)]
+    own = family_of(spec, "examine")
+    if own is not None:
+        return [*found, *own(path, spec, encoders)]
+    affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
+    both = np.array([[-1], [1]], np.float32)
+    ends = {key: torch.from_numpy(one.unnormalize(both)) for key, one in affine.items() if one is not None}
+    return found + [judged(key, low, high) for key, (low, high) in ends.items()]
 
 
-def _judged(key: str, one: Statistics) -> Finding:
+def judged(
+    key: str, first: torch.Tensor, second: torch.Tensor, deviations: bool = False, unseen: bool = False
+) -> Finding:
+    """Look at the normaliser of one feature.
+
+    Args:
+        first: the lower ends of its numbers' ranges, or their means.
+        second: the upper ends, or the standard deviations.
+        deviations: whether they are means and deviations.
+        unseen: whether a number without a range is not shown to the policy.
+    """
     # Of a chunk's steps the last, whose actions are the furthest from the state that they are relative to.
-    first, second = (each[-1] if each.ndim == 2 else each.flatten() for each in (one.first, one.second))
+    first, second = (each[-1] if each.ndim == 2 else each.flatten() for each in (first, second))
     (of, width, place, size) = ("range", second - first, -1, 2)
-    if one.mode == "MEAN_STD":
+    if deviations:
         (of, width, place, size) = ("deviation", second, 0, 1)
     inert = width.abs() <= _LEAST * first.abs().clamp(min=1e-3)
     level, told, remedy = Level.OK, f"{of} of {len(width)} numbers", ""
     if (inverted := (width < 0) & ~inert).any():
         level, told = Level.PROBLEM, f"inverted: its {of} is below zero in {_columns(inverted)}"
-        remedy = f"Minimum and maximum are exchanged, or damaged. {_REPEAT}"
+        remedy = f"Minimum and maximum are exchanged, or damaged. {REPEAT}"
     elif inert.all():
-        level, told, remedy = Level.PROBLEM, f"inert: its {of} is 0 everywhere", _REPEAT
-    elif inert.any() and one.clipped and key != ACTION:
+        level, told, remedy = Level.PROBLEM, f"inert: its {of} is 0 everywhere", REPEAT
+    elif inert.any() and unseen and key != ACTION:
         level, told = Level.NOTE, f"its range is 0 in {_columns(inert)}, which the policy does not see"
     elif inert.any() and key == ACTION:
         level, told = Level.NOTE, f"the policy always gives the same in {_columns(inert)}"
@@ -71,88 +68,10 @@ def _judged(key: str, one: Statistics) -> Finding:
         remedy = "Hold these still, as in training; if the robot moves them, train on data in which they move."
     elif ((first == place) & (width == size)).all():
         level, told = Level.WARNING, f"the identity, for {told}"
-        remedy = f"Was the data of this size already? If not, these statistics are a placeholder. {_REPEAT}"
+        remedy = f"Was the data of this size already? If not, these statistics are a placeholder. {REPEAT}"
     return Finding(PART, f"normaliser of {key}", told, level, remedy)
 
 
 def _columns(which: torch.Tensor) -> str:
     found = which.nonzero().flatten().tolist()
     return f"column {', '.join(map(str, found[:8]))}{', ..' * (len(found) > 8)} of {len(which)}"
-
-
-def _of_lerobot(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
-    """What lerobot saves beside a network: what is absent of it, or belongs to something else."""
-    entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
-    both = {**entries["input_features"], **entries["output_features"]}
-    features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
-    how, own = (directory, features), (one for one in steps if one.get("registry_name") == NORMALIZE)
-    found = read_groot_processors(*how) if entries["type"] == "groot" else read_processors(*how, str(entries["type"]))
-    step: dict[str, Any] = {"config": {}} | next(own, {})
-    doubts, action = [], {} if found.action is None else {ACTION: found.action}
-    for key, (kind, _) in features.items():
-        mode, name = step["config"].get("norm_map", {}).get(kind, "IDENTITY"), found.renamed.get(key, key)
-        one = (action if key == ACTION else found.normalizers).get(key)
-        if key != ACTION and name not in spec.observations:
-            continue
-        if one is not None:
-            doubts.append(_judged(name, one))
-        elif mode != "IDENTITY" or kind in ("STATE", "ACTION"):
-            told = f"there are no statistics of {key}, so it is not normalised ({mode} is configured)"
-            level = Level.WARNING if mode == "IDENTITY" else Level.PROBLEM
-            remedy = f"Was it trained so? lerobot says nothing. {_REPEAT}"
-            doubts.append(Finding(PART, f"normaliser of {name}", told, level, remedy))
-    wanted, executed = entries.get("n_action_steps"), spec.chunk.stop - spec.chunk.start
-    if isinstance(wanted, int) and wanted > executed:
-        told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
-        remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
-        doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
-    model = next((entries[key] for key in _MODELS if key in entries), "none")
-    name = str(found.tokenizer.get("tokenizer_name", model))[:200]
-    return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, name, found, spec, encoders)]
-
-
-def _cameras(directory: Path, features: Features, step: Mapping[str, Any]) -> list[Finding]:
-    """Names and sizes in the data that are not the policy's: lerobot passes over a picture that it does not know."""
-    doubts, known = [], [key for key, (kind, _) in features.items() if kind == "VISUAL"]
-    file = step.get("state_file")
-    measured = {name.rpartition(".")[0] for name in read_tensors(directory / file)} if file else set()
-    foreign = sorted(key for key in measured if key.startswith("observation.images.") and key not in known)
-    if foreign:
-        told = (
-            f"the data had {', '.join(foreign)}, which the policy does not read; it reads {', '.join(known) or 'none'}"
-        )
-        pairs = ", ".join(f'"{a}": "{b}"' for a, b in zip(foreign, known, strict=False))
-        remedy = f"It may never have seen them. Train again with lerobot's rename_map, such as {{{pairs}}}."
-        doubts.append(Finding(PART, "names of cameras", told, Level.WARNING, remedy))
-    of_data = {key: one for key, one in step["config"].get("features", {}).items() if isinstance(one, dict)}
-    for key in known:
-        shape = of_data.get(key, {}).get("shape")
-        if not isinstance(shape, list) or tuple(shape) == features[key][1]:
-            continue
-        told = f"{list(features[key][1])} in {CONFIG}, and {shape} in the data"
-        doubts.append(Finding(PART, f"size of {key}", told, Level.WARNING, "Show the policy pictures of that size."))
-    return doubts
-
-
-def _tokenizer(
-    directory: Path, name: str, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
-) -> list[Finding]:
-    """Of a policy that reads an instruction: whether the tokenizer is of its language model."""
-    one = spec.observations.get(TOKENS)
-    if one is None or one.bounds is None:
-        return []
-    near = encoder_folders(encoders, directory)
-    places = [place for each in near for place in (each / name, each / Path(name).name, each)]
-    file = next((path for place in places if (path := find_tokenizer(place)) is not None), None)
-    level, told, remedy = Level.NOTE, f"{name:.100}, which is not on this machine, and so was not tried", ""
-    if (length := found.tokenizer.get("max_length", one.shape[0])) != one.shape[0]:
-        level, told = Level.WARNING, f"makes {length!s:.20} tokens of an instruction; {one.shape[0]} are read"
-        remedy = f"Correct max_length in {PREPROCESSOR}."
-    elif file is not None:
-        try:
-            size, known = Tokenizer(file, CheckpointError).size, round(one.bounds[1][0]) + 1  # type: ignore[index]
-            level, told = Level.PROBLEM if size > known else Level.OK, f"{file}: {size} tokens; {known} are known"
-            remedy = "It is of another model: take the policy's own." * (size > known)
-        except CheckpointError as error:
-            level, told, remedy = Level.WARNING, str(error), "Copy it again from the model's repository."
-    return [Finding(PART, "tokenizer", told, level, remedy)]

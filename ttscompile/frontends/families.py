@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..core.coercion import integer
 from ..core.spec import WITHOUT, PolicySpec
@@ -73,8 +73,10 @@ class Family:
         reads: what the user gives, for messages; begins with an article.
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
-        module: in ``ttscompile``. Its ``load(path, options)`` gives network and ``PolicySpec``, or a CheckpointError or
-            SpecError; imported then, with torch.
+        module: of ``policies``; imported when one of its functions is called, with torch. ``load(path, options)`` gives
+            network and ``PolicySpec``, or a CheckpointError or SpecError. If it has them, ``examine(path, spec,
+            encoders)`` gives what goes wrong without an error, and ``files_beside(path, spec)`` the files by which the
+            program that trained a policy takes the compiled one in its place: none where it cannot.
         options: names of ``LoadOptions`` that it takes; the others are refused.
     """
 
@@ -86,6 +88,10 @@ class Family:
     module: str
     options: frozenset[str] = DIFFUSION_OPTIONS
 
+    def function(self, name: str) -> Any:
+        """A function of its module; None where it has none of this name."""
+        return getattr(import_module(f"..policies.{self.module}", __package__), name, None)
+
     def load(self, path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
         """Load a checkpoint of this family."""
         for name in (field.name for field in fields(options) if getattr(options, field.name) is not None):
@@ -94,7 +100,13 @@ class Family:
                 raise CheckpointError(
                     f"{path}: the option {name} is for {takers} policies; this is one of {self.title}. Leave it out."
                 )
-        return import_module(f"..{self.module}", __package__).load(path, options)  # type: ignore[no-any-return]
+        return self.function("load")(path, options)  # type: ignore[no-any-return]
+
+
+def family_of(spec: PolicySpec, name: str) -> Callable[..., Any] | None:
+    """A function of the family that a policy is of; None where that has none, or no checkpoint was read."""
+    row = next((each for each in FAMILIES if each.name == spec.source.get("format")), None)
+    return None if row is None else row.function(name)
 
 
 def _config(path: Path) -> Mapping[str, object]:
@@ -116,7 +128,7 @@ FAMILIES = (
         reads="a directory that lerobot's save_pretrained wrote, with config.json and model.safetensors",
         kind="directory",
         detect=lambda path: "type" in _config(path),
-        module="frontends.lerobot",
+        module="lerobot.family",
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras", "base"},
     ),
     Family(
@@ -125,7 +137,7 @@ FAMILIES = (
         reads="a directory that DexVLA's training saved, with config.json and safetensors",
         kind="directory",
         detect=lambda path: "scale_dp_policy" in map(_config(path).get, ("policy_head_type", "model_type")),
-        module="policies.scaledp",
+        module="scaledp",
     ),
     Family(
         name="dit_policy",
@@ -133,7 +145,7 @@ FAMILIES = (
         reads="a .ckpt file of DiT-Policy with agent_config.yaml beside it",
         kind="file",
         detect=lambda path: path.is_file() and (path.parent / "agent_config.yaml").is_file(),
-        module="policies.dit_policy",
+        module="dit_policy",
     ),
     Family(
         name="dita",
@@ -141,7 +153,7 @@ FAMILIES = (
         reads="a .pth file of Dita with .hydra/config.yaml in its folder or in the one above",
         kind="file",
         detect=lambda at: at.suffix == ".pth" and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
-        module="policies.dita",
+        module="dita",
     ),
     Family(
         name="rdt",
@@ -149,7 +161,7 @@ FAMILIES = (
         reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
         kind="directory",
         detect=lambda path: "lang_adaptor" in _config(path),
-        module="policies.rdt",
+        module="rdt",
     ),
     Family(
         name="octo",
@@ -157,7 +169,7 @@ FAMILIES = (
         reads="a folder that Octo's save_pretrained wrote, with config.json and example_batch.msgpack",
         kind="directory",
         detect=lambda path: (path / "example_batch.msgpack").is_file(),
-        module="policies.octo",
+        module="octo",
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
     Family(
@@ -166,7 +178,7 @@ FAMILIES = (
         reads="a .pt file of CogACT",
         kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"action_model"),
-        module="policies.cogact",
+        module="cogact",
     ),
     Family(
         name="hybrid_vla",
@@ -174,7 +186,7 @@ FAMILIES = (
         reads="a .pt file of HybridVLA that was trained with use_diff",
         kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"proprio_embedder"),
-        module="policies.hybrid_vla",
+        module="hybrid_vla",
     ),
     Family(
         name="diffusion_bc",
@@ -182,7 +194,7 @@ FAMILIES = (
         reads="a state_dict of Diffusion BC, a Model_Cond_Diffusion's, in a file",
         kind="file",
         detect=lambda path: path.is_file() and _begins_with(path, b"mab_over_sqrtmab"),
-        module="policies.diffusion_bc",
+        module="diffusion_bc",
     ),
     Family(
         name="diffusion_policy",
@@ -191,7 +203,7 @@ FAMILIES = (
         kind="file",
         # Every file that no other family takes: its module names what a file is that is none of its own.
         detect=lambda path: not path.is_dir(),
-        module="frontends.diffusion_policy",
+        module="diffusion_policy.family",
     ),
 )
 

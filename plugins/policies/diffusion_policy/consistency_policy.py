@@ -20,14 +20,6 @@ from torch import nn
 
 from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import CheckpointError, SpecError
-from ttscompile.frontends.diffusion_policy_parts import (
-    COMMON_KEYS,
-    Rebuilt,
-    Saved,
-    network_weights,
-    observation_specs,
-    read_shape_meta,
-)
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import MOST_STEPS
@@ -36,6 +28,7 @@ from ttscompile.samplers.flow import deterministic_table
 
 from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from .hybrid import ENCODER_KEYS, build_encoder
+from .parts import COMMON_KEYS, Rebuilt, Saved, network_weights, observation_specs, read_shape_meta
 from .unet import DEFAULTS, denoiser
 
 _SCALE = 250.0

@@ -15,18 +15,10 @@ import torch
 from torch import nn
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.diffusion_policy_parts import (
-    COMMON_KEYS,
-    Observed,
-    Rebuilt,
-    Saved,
-    Weights,
-    read_shape_meta,
-    require_room,
-)
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
 
+from .parts import COMMON_KEYS, Observed, Rebuilt, Saved, Weights, read_shape_meta, require_room
 from .unet import DEFAULTS, behind_encoder
 
 POINTS, STATE, ROBOT = "point_cloud", "agent_pos", "imagin_robot"

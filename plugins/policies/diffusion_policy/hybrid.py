@@ -19,12 +19,12 @@ import torch
 from torch import nn
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.diffusion_policy_parts import Observed, Weights, image_normalizer
 from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.saved_weights import names_of, require_weights
 from ttscompile.frontends.settings import Settings
 
 from ..networks.resnet import CHANNELS, SHRINKS, Norm, group_norm, resnet
+from .parts import Observed, Weights, image_normalizer
 
 KEYPOINTS = 32
 FEATURES = 64

@@ -12,12 +12,12 @@ import torch
 from torch import nn
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.diffusion_policy_parts import MOST_PIXELS, Observed, Weights, image_normalizer
 from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
 
 from ..networks.resnet import CHANNELS, DEPTHS, Norm, group_norm, resnet
+from .parts import MOST_PIXELS, Observed, Weights, image_normalizer
 
 COLOURS = 3
 """Channels of an image, which torchvision's ResNets have."""

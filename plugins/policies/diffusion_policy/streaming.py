@@ -28,7 +28,15 @@ from torch.nn import functional
 
 from ttscompile.core.spec import ObservationSpec, SamplerTable
 from ttscompile.errors import CheckpointError, SpecError
-from ttscompile.frontends.diffusion_policy_parts import (
+from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.scheduler import MOST_STEPS
+from ttscompile.frontends.settings import Settings
+
+from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from ..networks.transformer_for_diffusion import SinusoidalEmbedding
+from .hybrid import ENCODER_KEYS, build_encoder
+from .parts import (
     COMMON_KEYS,
     Rebuilt,
     Saved,
@@ -41,14 +49,6 @@ from ttscompile.frontends.diffusion_policy_parts import (
     require_room,
     require_sizes,
 )
-from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.scheduler import MOST_STEPS
-from ttscompile.frontends.settings import Settings
-
-from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
-from ..networks.transformer_for_diffusion import SinusoidalEmbedding
-from .hybrid import ENCODER_KEYS, build_encoder
 from .unet import DEFAULTS
 
 _NETWORK, _SCHEDULER = "ConditionalUnet1D", "DDPMTEDiScheduler"

@@ -13,13 +13,12 @@ from torch import nn
 
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends import diffusion_policy_parts as parts
-from ttscompile.frontends.diffusion_policy_parts import Rebuilt, Saved, Weights
 from ttscompile.frontends.encoded import EncodedDenoiser
-from ttscompile.frontends.interpolation import Config
 
 from ..networks.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
-from . import hybrid
+from . import hybrid, parts
+from .interpolation import Config
+from .parts import Rebuilt, Saved, Weights
 
 _NETWORK = "TransformerForDiffusion"
 _SWITCHES = frozenset({"obs_as_cond", "pred_action_steps_only"})

@@ -11,13 +11,13 @@ from torch import nn
 
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends import diffusion_policy_parts as parts
-from ttscompile.frontends.diffusion_policy_parts import Observed, Rebuilt, Saved, Weights
 from ttscompile.frontends.encoded import EncodedDenoiser
 
 from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from . import parts
 from .hybrid import ENCODER_KEYS, build_encoder as build_robomimic_encoder
 from .images import build_encoder as build_image_encoder, encoder_settings
+from .parts import Observed, Rebuilt, Saved, Weights
 
 _NETWORK = "ConditionalUnet1D"
 _SETTINGS = frozenset({"input_dim", "local_cond_dim", "global_cond_dim", "diffusion_step_embed_dim", "down_dims"})

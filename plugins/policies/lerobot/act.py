@@ -24,14 +24,14 @@ from torch.nn import functional
 from ttscompile.core.spec import PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.lerobot_config import ENVIRONMENT, MOST, STATE, LeRobotConfig, read_lerobot_config
-from ttscompile.frontends.lerobot_policy import Measured, policy_spec, read_weights
-from ttscompile.frontends.lerobot_processors import Processors, read_processors
 from ttscompile.frontends.loops import Loops
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.samplers.table import DirectDenoiser, direct_table
 
 from ..networks.resnet import CHANNELS, DEPTHS, resnet
+from .config import ENVIRONMENT, MOST, STATE, LeRobotConfig, read_lerobot_config
+from .policy import Measured, policy_spec, read_weights
+from .processors import Processors, read_processors
 
 _PROJECTION = "encoder_{}_state_input_proj"
 

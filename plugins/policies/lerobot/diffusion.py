@@ -23,22 +23,15 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
-from ttscompile.frontends.lerobot_config import (
-    ENVIRONMENT,
-    MOST,
-    MOST_PIXELS,
-    STATE,
-    LeRobotConfig,
-    read_lerobot_config,
-)
-from ttscompile.frontends.lerobot_policy import Measured, diffusion_loops, policy_spec, read_weights
-from ttscompile.frontends.lerobot_processors import Processors, read_processors
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings, is_shape
 
 from ..diffusion_policy.hybrid import SpatialSoftmax
 from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from ..networks.resnet import DEPTHS, SHRINKS, Norm, group_norm, resnet
+from .config import ENVIRONMENT, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
+from .policy import Measured, diffusion_loops, policy_spec, read_weights
+from .processors import Processors, read_processors
 
 _MOST_LEVELS = 16
 _COUNTER = ".num_batches_tracked"

@@ -17,15 +17,15 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, language_model_folder
-from ttscompile.frontends.lerobot_config import CONFIG, MOST_LAYERS, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
-from ttscompile.frontends.lerobot_policy import MASK, TOKENS, integration_steps, read_weights
-from ttscompile.frontends.lerobot_processors import CONVERSATION, READ, Processors
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings
 
 from ..networks.eo1 import ACTIVATIONS, EO1, Denoiser, EO1Config, Prefix
 from ..networks.qwen25_vl import Piece, Qwen25VLConfig, rebuilt_weights
 from . import vla
+from .config import CONFIG, MOST_LAYERS, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
+from .policy import MASK, TOKENS, integration_steps, read_weights
+from .processors import CONVERSATION, READ, Processors
 from .qwen3_vl import END, IMAGE, TURN, Resizing, of_backbone, require_template
 from .qwen25_vl import DEVIATION, KIND, MEAN, pieces, read_pictures, read_qwen25
 from .resized_bytes import Filter, Shown

@@ -18,16 +18,6 @@ from ttscompile.core.spec import Affine, ChunkSpec, Instruction, PolicySpec
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens, told_after
-from ttscompile.frontends.lerobot_config import (
-    CONFIG,
-    MOST,
-    MOST_LAYERS,
-    MOST_LETTERS,
-    MOST_PIXELS,
-    MOST_VOCABULARY,
-    LeRobotConfig,
-)
-from ttscompile.frontends.lerobot_policy import MASK, TOKENS, read_weights
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings, read_json
 
@@ -35,6 +25,8 @@ from ..networks.clip import ACTIVATIONS
 from ..networks.evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from ..networks.internvl import InternVitConfig, InternVLConfig, Prompt
 from . import vla
+from .config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
+from .policy import MASK, TOKENS, read_weights
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
 _MOST_VIEWS, _MOST_KINDS = 64, 4096

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from ttscompile.frontends.lerobot_config import MOST
 from ttscompile.frontends.settings import Settings
 
 from ..networks.clip import ACTIVATIONS, TowerConfig
 from ..networks.florence import BartConfig, FlorenceConfig, Stage
+from .config import MOST
 from .vla import part_of, positive_number
 
 _MOST_VOCABULARY = 2**20

@@ -19,9 +19,6 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens, told_after
-from ttscompile.frontends.lerobot_config import ACTION, CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, STATE, LeRobotConfig
-from ttscompile.frontends.lerobot_groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
-from ttscompile.frontends.lerobot_policy import MASK, TOKENS, read_weights
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings, read_json
 
@@ -30,6 +27,9 @@ from ..networks.groot import Denoiser, Groot, GrootConfig, Prefix
 from ..networks.internvl import Prompt
 from ..networks.qwen3_vl import rebuilt_weights
 from . import qwen3_vl as qwen, vla
+from .config import ACTION, CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, STATE, LeRobotConfig
+from .groot_steps import OLD, GrootProcessors, Seen, read_groot_processors
+from .policy import MASK, TOKENS, read_weights
 
 _BASE, _BACKBONE = "nvidia/GR00T-N1.7-3B", "nvidia/Cosmos-Reason2-2B"
 _LENGTH = 64

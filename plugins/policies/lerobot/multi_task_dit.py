@@ -18,13 +18,10 @@ from torch import nn
 
 from ttscompile.core.spec import Instruction, PolicySpec, SamplerTable
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends import lerobot_policy as lerobot
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.instruction import NO_TASK, encoder_folders, find_encoder, task_tokens
-from ttscompile.frontends.lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
-from ttscompile.frontends.lerobot_processors import PREPROCESSOR, Processors, read_processors
 from ttscompile.frontends.loops import Loops, loops_of
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
@@ -32,6 +29,9 @@ from ttscompile.samplers.flow import METHODS, flow_matching_table
 
 from ..networks.clip import TextConfig, VisionConfig, encoder_config
 from ..networks.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
+from . import policy as lerobot
+from .config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
+from .processors import PREPROCESSOR, Processors, read_processors
 
 _CLIP = "openai/clip-vit-base-patch16"
 _MOST_LETTERS, _MOST_LAYERS = 200, 512

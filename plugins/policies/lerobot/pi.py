@@ -18,14 +18,14 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, find_encoder, task_tokens
-from ttscompile.frontends.lerobot_config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
-from ttscompile.frontends.lerobot_policy import read_weights
 from ttscompile.frontends.saved_weights import filled
 
 from ..networks.language_layers import LanguageConfig
 from ..networks.pi import Expert, Pi, PiConfig, Prefix
 from ..networks.siglip import SiglipConfig
 from . import vla
+from .config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
+from .policy import read_weights
 
 _VISION = "paligemma_with_expert.paligemma.model.vision_tower."
 _TEXT = "paligemma_with_expert.paligemma.model.language_model."

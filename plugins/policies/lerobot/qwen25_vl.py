@@ -5,12 +5,12 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
-from ttscompile.frontends.lerobot_config import MOST, MOST_LAYERS, MOST_VOCABULARY
 from ttscompile.frontends.settings import Settings
 
 from ..networks.language_layers import LanguageConfig
 from ..networks.qwen25_vl import Piece, Qwen25VLConfig
 from . import vla
+from .config import MOST, MOST_LAYERS, MOST_VOCABULARY
 from .qwen3_vl import image_processor
 
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.instruction import language_model_folder
-from ttscompile.frontends.lerobot_config import CONFIG, MOST, MOST_LAYERS, MOST_VOCABULARY
 from ttscompile.frontends.settings import Settings, read_json
 
 from ..networks.clip import ACTIVATIONS
 from ..networks.qwen3_vl import Qwen3VLConfig, QwenVisionConfig
 from . import vla
+from .config import CONFIG, MOST, MOST_LAYERS, MOST_VOCABULARY
 
 TURN, IMAGE, END = "<|im_start|>user", "<|vision_start|><|image_pad|><|vision_end|>", "<|im_end|>"
 """What the chat template of Qwen3-VL writes; of an image's tokens one stands for all."""

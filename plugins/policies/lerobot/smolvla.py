@@ -14,22 +14,14 @@ from ttscompile.core.spec import PolicySpec
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, find_encoder, language_model_folder, task_tokens
-from ttscompile.frontends.lerobot_config import (
-    CONFIG,
-    MOST,
-    MOST_LAYERS,
-    MOST_LETTERS,
-    MOST_PIXELS,
-    MOST_VOCABULARY,
-    LeRobotConfig,
-)
-from ttscompile.frontends.lerobot_policy import read_weights
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings, read_json
 
 from ..networks.siglip import SiglipConfig
 from ..networks.smolvla import Expert, Prefix, SmolVLA, SmolVLAConfig, expert_of
 from . import vla
+from .config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
+from .policy import read_weights
 
 _MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 RELEASED: Mapping[str, Mapping[str, Any]] = {

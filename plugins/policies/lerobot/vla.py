@@ -16,14 +16,14 @@ from torch.nn import functional
 from ttscompile.core.spec import COMMITTED, WITHOUT, Instruction, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.lerobot_config import MOST, STATE, LeRobotConfig, read_lerobot_config
-from ttscompile.frontends.lerobot_policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
-from ttscompile.frontends.lerobot_processors import Normalizer, Processors, read_processors
 from ttscompile.frontends.loops import Make, loops_of
 from ttscompile.frontends.settings import Settings
 from ttscompile.samplers.flow import METHODS, flow_matching_table
 
 from ..networks.language_layers import LanguageConfig
+from .config import MOST, STATE, LeRobotConfig, read_lerobot_config
+from .policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
+from .processors import Normalizer, Processors, read_processors
 
 _EMPTY = "observation.images.empty_camera_"
 """How lerobot calls a camera that the checkpoint knows and no robot has."""

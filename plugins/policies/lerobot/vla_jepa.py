@@ -22,9 +22,6 @@ from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.instruction import encoder_folders, task_tokens, told_after
-from ttscompile.frontends.lerobot_config import MOST, MOST_LAYERS, MOST_PIXELS, STATE, LeRobotConfig
-from ttscompile.frontends.lerobot_policy import MASK, TOKENS, read_weights
-from ttscompile.frontends.lerobot_processors import BINARIZE, CLIP, PREPARE, SNAP, Processors
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings
 
@@ -33,6 +30,9 @@ from ..networks.groot import Denoiser, Groot, GrootConfig, Prefix
 from ..networks.internvl import Prompt
 from ..networks.qwen3_vl import Qwen3VLConfig, rebuilt_weights
 from . import qwen3_vl as qwen, vla
+from .config import MOST, MOST_LAYERS, MOST_PIXELS, STATE, LeRobotConfig
+from .policy import MASK, TOKENS, read_weights
+from .processors import BINARIZE, CLIP, PREPARE, SNAP, Processors
 
 _MOST_LETTERS, _MOST_TOKENS = 4000, 4096
 _LENGTH = 64

@@ -19,9 +19,6 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, language_model_folder
-from ttscompile.frontends.lerobot_config import CONFIG, MOST, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
-from ttscompile.frontends.lerobot_policy import MASK, TOKENS, integration_steps, read_weights
-from ttscompile.frontends.lerobot_processors import SENTENCE
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings, is_shape, read_json
 
@@ -29,6 +26,9 @@ from ..networks.language_layers import LanguageConfig
 from ..networks.qwen25_vl import Piece, Qwen25VLConfig, rebuilt_weights
 from ..networks.wall_x import Denoiser, Prefix, WallX, WallXConfig
 from . import vla
+from .config import CONFIG, MOST, MOST_LETTERS, MOST_VOCABULARY, LeRobotConfig
+from .policy import MASK, TOKENS, integration_steps, read_weights
+from .processors import SENTENCE
 from .qwen3_vl import END, IMAGE, TURN, Resizing
 from .qwen25_vl import DEVIATION, KIND, MEAN, pieces, read_pictures, read_qwen25
 from .resized_bytes import Shown

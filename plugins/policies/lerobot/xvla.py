@@ -17,9 +17,6 @@ from ttscompile.errors import SpecError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, find_encoder, task_tokens
-from ttscompile.frontends.lerobot_config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
-from ttscompile.frontends.lerobot_policy import integration_steps, read_weights
-from ttscompile.frontends.lerobot_processors import DOMAIN, IMAGENET, OWN_STEPS, Processors
 from ttscompile.frontends.saved_weights import filled, renamed, separated
 from ttscompile.frontends.settings import Settings
 from ttscompile.samplers.flow import remixed_table
@@ -28,7 +25,10 @@ from ..networks.clip import TowerConfig
 from ..networks.florence import FlorenceConfig
 from ..networks.internvl import MEAN
 from ..networks.xvla import XVLA, Denoiser, Prefix, XVLAConfig
+from .config import ACTION, CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
 from .florence import read_florence
+from .policy import integration_steps, read_weights
+from .processors import DOMAIN, IMAGENET, OWN_STEPS, Processors
 from .vla import Gathered, part_of, positive_number, read_vla_config, read_vla_processors, seen_size, vla_spec
 
 _MOST_LETTERS, _MOST_VIEWS, _MOST_DOMAINS = 400, 64, 4096

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
-from ...frontends.lerobot_tiny import change_json
 from .. import pis
+from ..lerobot_tiny import change_json
 from .make_lerobot_pi import chunk, tiny
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import CheckpointError
+from ttscompile.errors import CheckpointError
 
 _REFERENCE = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+|\[\d+\])*)\}")
 _EVAL = re.compile(r"\$\{eval:\s*(?:'([^']*)'|\"([^\"]*)\"|([^'\"]*))\s*\}", re.DOTALL)

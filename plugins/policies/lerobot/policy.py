@@ -5,17 +5,18 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from ..core.spec import ChunkSpec, ObservationSpec, PolicySpec, Relative
-from ..errors import CheckpointError, SpecError
-from .families import LoadOptions
-from .image_geometry import ResizeCrop
-from .lerobot_config import ACTION, CONFIG, STATE, WEIGHTS, LeRobotConfig
-from .lerobot_processors import Normalizer, Processors
-from .loops import Loops
+from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, Relative
+from ttscompile.errors import CheckpointError, SpecError
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.image_geometry import ResizeCrop
+from ttscompile.frontends.loops import Loops
+from ttscompile.frontends.saved_weights import as_float32, left_out, read_tensors, require_memory
+from ttscompile.frontends.scheduler import MOST_STEPS, configured_loops
+from ttscompile.frontends.settings import Settings
+
+from .config import ACTION, CONFIG, STATE, WEIGHTS, LeRobotConfig
 from .lora import find_base, merged, read_adapter
-from .saved_weights import as_float32, left_out, read_tensors, require_memory
-from .scheduler import MOST_STEPS, configured_loops
-from .settings import Settings
+from .processors import Normalizer, Processors
 
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 _SCHEDULER_SETTINGS = {

@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..core.spec import PolicySpec
-from .lerobot_config import ACTION, CONFIG
-from .lerobot_processors import POSTPROCESSOR, PREPROCESSOR, PROMPT
-from .settings import read_json
+from ttscompile.core.spec import PolicySpec
+from ttscompile.frontends.settings import read_json
+
+from .config import ACTION, CONFIG
+from .processors import POSTPROCESSOR, PREPROCESSOR, PROMPT
 
 LANGUAGE = "observation.language."
 """Beginning of the keys that LeRobot's tokenizer makes of an instruction."""
@@ -26,7 +27,7 @@ _TEXT = {
 """Steps that work on the instruction, by the name that lerobot knows without the modules of their policies."""
 
 
-def lerobot_files(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
+def files_beside(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
     """The files of a compiled policy by name; the same policy gives the same bytes.
 
     None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original

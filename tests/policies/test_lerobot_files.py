@@ -13,10 +13,10 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import BESIDE
 from ttscompile.core.lattice import dense_plan
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends import files_beside, load_checkpoint_policy
-from ttscompile.frontends.lerobot_files import lerobot_files
+from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.policies.lerobot.files import files_beside
 
-from ..policies import lerobot_unets, pis
+from . import lerobot_unets, pis
 from .lerobot_tiny import DA, DS, SIDE, change_json, save_policy
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:normaliser of observation.state")]
@@ -85,7 +85,7 @@ def test_the_artifact_is_the_same_without_them(folder: Path, tmp_path: Path) -> 
 @pytest.mark.soak
 def test_they_are_the_same_bytes_again_and_go_with_an_artifact_that_is_replaced(folder: Path, tmp_path: Path) -> None:
     spec, again = load_artifact(folder / "compiled").manifest.spec, tmp_path / "again"
-    made = lerobot_files(folder / "policy", spec)
+    made = files_beside(folder / "policy", spec)
     assert {name: (folder / "compiled" / name).read_bytes() for name in BESIDE} == made
     shutil.copytree(folder / "compiled", again)
     ttscompile.convert(lerobot_unets.save("states", tmp_path / "states"), again)

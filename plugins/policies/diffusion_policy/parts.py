@@ -15,12 +15,13 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..core.spec import Affine, ObservationSpec
-from ..errors import CheckpointError
+from ttscompile.core.spec import Affine, ObservationSpec
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.loops import Make
+from ttscompile.frontends.saved_weights import as_float32, require_weights
+from ttscompile.frontends.settings import Settings, is_shape
+
 from .interpolation import Config
-from .loops import Make
-from .saved_weights import as_float32, require_weights
-from .settings import Settings, is_shape
 
 _OTHER_KEY = re.compile(
     r"(model\.)?_dummy_variable|mask_generator\..*|normalizer\.params_dict\.[^.]+\.(scale|offset|input_stats\.\w+)"

@@ -1,6 +1,6 @@
 """LeRobot: a directory that lerobot saved to module and ``PolicySpec``.
 
-A type of policy is a module of ``policies.lerobot`` and a row in ``TYPES``. Everything in the directory is JSON and
+A type of policy is a module beside this one and a row in ``TYPES``. Everything in the directory is JSON and
 safetensors; neither lerobot nor torchvision is needed.
 """
 
@@ -9,15 +9,20 @@ from pathlib import Path
 
 from torch import nn
 
-from ..core.spec import PolicySpec
-from .families import LoadOptions
-from .lerobot_config import CONFIG
-from .refusals import LEROBOT, refuse_policy
-from .settings import read_json
+from ttscompile.core.spec import PolicySpec
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.refusals import LEROBOT, refuse_policy
+from ttscompile.frontends.settings import read_json
+
+from .config import CONFIG
+from .examined import examine
+from .files import files_beside
+
+__all__ = ["TYPES", "examine", "files_beside", "load"]
 
 TYPES = {name: name for name in "act diffusion eo1 evo1 groot multi_task_dit smolvla vla_jepa wall_x xvla".split()}
 TYPES |= {"pi0": "pi", "pi05": "pi"}
-"""The module of ``policies.lerobot`` by ``type`` of ``config.json``, whose entries its ``load`` is given."""
+"""The module by ``type`` of ``config.json``, whose entries its ``load`` is given."""
 
 
 def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
@@ -26,5 +31,5 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     kind = str(entries.get("type"))
     if kind not in TYPES:
         refuse_policy(f"{kind:.80}", LEROBOT, f"{directory}: ")
-    module = import_module(f"..policies.lerobot.{TYPES[kind]}", __package__)
+    module = import_module(f".{TYPES[kind]}", __package__)
     return module.load(directory, entries, options)  # type: ignore[no-any-return]

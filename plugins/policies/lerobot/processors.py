@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..core.poses import Pose
-from ..core.spec import Affine
-from ..errors import CheckpointError
-from .saved_weights import read_tensors
-from .settings import Settings, read_json
+from ttscompile.core.poses import Pose
+from ttscompile.core.spec import Affine
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.saved_weights import read_tensors
+from ttscompile.frontends.settings import Settings, read_json
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 

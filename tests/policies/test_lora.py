@@ -23,7 +23,7 @@ from ttscompile.policies.networks.clip import TextConfig
 
 from ..hub.conftest import hub as hub
 from ..hub.served import Hub
-from ..policies import lerobot_unets, vla_jepas
+from . import lerobot_unets, vla_jepas
 from .lerobot_tiny import TEXT, change_json, dit_config, save_policy, write_json
 
 Tensors = dict[str, torch.Tensor]

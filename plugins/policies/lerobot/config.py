@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .lerobot_processors import STATE as STATE, Features
-from .settings import Settings, is_shape
+from ttscompile.frontends.settings import Settings, is_shape
+
+from .processors import STATE as STATE, Features
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ENVIRONMENT, ACTION = "observation.environment_state", "action"

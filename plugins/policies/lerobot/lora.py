@@ -8,13 +8,14 @@ from typing import Any
 
 import torch
 
-from ..core.paths import HUB, on_hub
-from ..errors import CheckpointError, HubError
-from ..hub import fetch_checkpoint
-from .lerobot_config import WEIGHTS
-from .refusals import MERGE
-from .saved_weights import as_float32, left_out, read_tensors
-from .settings import Settings, read_json
+from ttscompile.core.paths import HUB, on_hub
+from ttscompile.errors import CheckpointError, HubError
+from ttscompile.frontends.refusals import MERGE
+from ttscompile.frontends.saved_weights import as_float32, left_out, read_tensors
+from ttscompile.frontends.settings import Settings, read_json
+from ttscompile.hub import fetch_checkpoint
+
+from .config import WEIGHTS
 
 Tensors = dict[str, torch.Tensor]
 ADAPTER, CHANGES = "adapter_config.json", "adapter_model.safetensors"

@@ -11,8 +11,8 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from tests.rounding import Counted, allowed, assert_equal_but_for_rounding
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.diffusion_policy_parts import choose_weights
 from ttscompile.frontends.families import LoadOptions
+from ttscompile.policies.diffusion_policy.parts import choose_weights
 from ttscompile.samplers.table import sampler_table
 
 from .variants import VARIANTS, Build, Save

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.poses import NUMBERS, Pose
-from ..core.tokenizer import TASK
-from ..errors import CheckpointError
-from . import lerobot_processors as lerobot
-from .image_geometry import ResizeCrop
-from .lerobot_config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
-from .settings import Settings
+from ttscompile.core.poses import NUMBERS, Pose
+from ttscompile.core.tokenizer import TASK
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.image_geometry import ResizeCrop
+from ttscompile.frontends.settings import Settings
+
+from . import processors as lerobot
+from .config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 
 (_PACK, _UNPACK, _DECODE), _ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.interpolation import Config, evaluate_expression
+from ttscompile.policies.diffusion_policy.interpolation import Config, evaluate_expression
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from tests.hostile.forged import forge
 from ttscompile.artifact import load_artifact
 from ttscompile.errors import ArtifactError, CheckpointError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.lerobot_processors import Normalizer, Statistics
+from ttscompile.policies.lerobot.processors import Normalizer, Statistics
 
 from .lerobot_tiny import save_policy
 

@@ -12,23 +12,24 @@ from typing import Any
 
 from torch import nn
 
-from ..core.spec import ChunkSpec, PolicySpec
-from ..errors import CheckpointError
-from .checkpoint import plain_config, read_checkpoint
-from .diffusion_policy_parts import COMMON_KEYS, Rebuilt, Saved, affine, choose_weights
-from .families import LoadOptions
+from ttscompile.core.spec import ChunkSpec, PolicySpec
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.checkpoint import plain_config, read_checkpoint
+from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.loops import loops_of
+from ttscompile.frontends.refusals import refuse_file, refuse_payload, refuse_policy
+from ttscompile.frontends.scheduler import configured_loops
+from ttscompile.frontends.settings import Settings
+
 from .interpolation import Config
-from .loops import loops_of
-from .refusals import refuse_file, refuse_payload, refuse_policy
-from .scheduler import configured_loops
-from .settings import Settings
+from .parts import COMMON_KEYS, Rebuilt, Saved, affine, choose_weights
 
 _STUDENT = "CTMPPUnetHybridImagePolicy"
 
 
 def _row(module: str, which: str) -> Callable[[Saved], Rebuilt]:
-    """A function of a module of ``policies.diffusion_policy``, which is imported when it is called."""
-    return lambda saved: getattr(import_module(f"..policies.diffusion_policy.{module}", __package__), which)(saved)
+    """A function of a module beside this one, which is imported when it is called."""
+    return lambda saved: getattr(import_module(f".{module}", __package__), which)(saved)
 
 
 _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {

@@ -1,0 +1,107 @@
+"""What of a checkpoint of LeRobot goes wrong on a robot without an error: statistics, names of cameras, instruction."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ttscompile.core.finding import Finding, Level
+from ttscompile.core.spec import PolicySpec
+from ttscompile.core.tokenizer import Tokenizer, find_tokenizer
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.examined import PART, REPEAT, judged
+from ttscompile.frontends.instruction import encoder_folders
+from ttscompile.frontends.saved_weights import read_tensors
+from ttscompile.frontends.settings import read_json
+
+from .config import ACTION, CONFIG
+from .groot_steps import read_groot_processors
+from .policy import TOKENS
+from .processors import NORMALIZE, PREPROCESSOR, Features, Processors, read_processors
+
+_MODELS = ("vlm_model_name", "qwen_model_name", "vlm_base", "pretrained_name_or_path")
+
+
+def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
+    """What lerobot saves beside a network: what is absent of it, or belongs to something else."""
+    try:
+        return _examined(path, spec, encoders)
+    except CheckpointError as error:  # of what the policy does not read
+        return [Finding(PART, "files", str(error), Level.NOTE)]
+
+
+def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
+    entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
+    both = {**entries["input_features"], **entries["output_features"]}
+    features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
+    how, own = (directory, features), (one for one in steps if one.get("registry_name") == NORMALIZE)
+    found = read_groot_processors(*how) if entries["type"] == "groot" else read_processors(*how, str(entries["type"]))
+    step: dict[str, Any] = {"config": {}} | next(own, {})
+    doubts, action = [], {} if found.action is None else {ACTION: found.action}
+    for key, (kind, _) in features.items():
+        mode, name = step["config"].get("norm_map", {}).get(kind, "IDENTITY"), found.renamed.get(key, key)
+        one = (action if key == ACTION else found.normalizers).get(key)
+        if key != ACTION and name not in spec.observations:
+            continue
+        if one is not None:
+            doubts.append(judged(name, one.first, one.second, one.mode == "MEAN_STD", one.clipped))
+        elif mode != "IDENTITY" or kind in ("STATE", "ACTION"):
+            told = f"there are no statistics of {key}, so it is not normalised ({mode} is configured)"
+            level = Level.WARNING if mode == "IDENTITY" else Level.PROBLEM
+            remedy = f"Was it trained so? lerobot says nothing. {REPEAT}"
+            doubts.append(Finding(PART, f"normaliser of {name}", told, level, remedy))
+    wanted, executed = entries.get("n_action_steps"), spec.chunk.stop - spec.chunk.start
+    if isinstance(wanted, int) and wanted > executed:
+        told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
+        remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
+        doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
+    model = next((entries[key] for key in _MODELS if key in entries), "none")
+    name = str(found.tokenizer.get("tokenizer_name", model))[:200]
+    return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, name, found, spec, encoders)]
+
+
+def _cameras(directory: Path, features: Features, step: Mapping[str, Any]) -> list[Finding]:
+    """Names and sizes in the data that are not the policy's: lerobot passes over a picture that it does not know."""
+    doubts, known = [], [key for key, (kind, _) in features.items() if kind == "VISUAL"]
+    file = step.get("state_file")
+    measured = {name.rpartition(".")[0] for name in read_tensors(directory / file)} if file else set()
+    foreign = sorted(key for key in measured if key.startswith("observation.images.") and key not in known)
+    if foreign:
+        told = (
+            f"the data had {', '.join(foreign)}, which the policy does not read; it reads {', '.join(known) or 'none'}"
+        )
+        pairs = ", ".join(f'"{a}": "{b}"' for a, b in zip(foreign, known, strict=False))
+        remedy = f"It may never have seen them. Train again with lerobot's rename_map, such as {{{pairs}}}."
+        doubts.append(Finding(PART, "names of cameras", told, Level.WARNING, remedy))
+    of_data = {key: one for key, one in step["config"].get("features", {}).items() if isinstance(one, dict)}
+    for key in known:
+        shape = of_data.get(key, {}).get("shape")
+        if not isinstance(shape, list) or tuple(shape) == features[key][1]:
+            continue
+        told = f"{list(features[key][1])} in {CONFIG}, and {shape} in the data"
+        doubts.append(Finding(PART, f"size of {key}", told, Level.WARNING, "Show the policy pictures of that size."))
+    return doubts
+
+
+def _tokenizer(
+    directory: Path, name: str, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
+) -> list[Finding]:
+    """Of a policy that reads an instruction: whether the tokenizer is of its language model."""
+    one = spec.observations.get(TOKENS)
+    if one is None or one.bounds is None:
+        return []
+    near = encoder_folders(encoders, directory)
+    places = [place for each in near for place in (each / name, each / Path(name).name, each)]
+    file = next((path for place in places if (path := find_tokenizer(place)) is not None), None)
+    level, told, remedy = Level.NOTE, f"{name:.100}, which is not on this machine, and so was not tried", ""
+    if (length := found.tokenizer.get("max_length", one.shape[0])) != one.shape[0]:
+        level, told = Level.WARNING, f"makes {length!s:.20} tokens of an instruction; {one.shape[0]} are read"
+        remedy = f"Correct max_length in {PREPROCESSOR}."
+    elif file is not None:
+        try:
+            size, known = Tokenizer(file, CheckpointError).size, round(one.bounds[1][0]) + 1  # type: ignore[index]
+            level, told = Level.PROBLEM if size > known else Level.OK, f"{file}: {size} tokens; {known} are known"
+            remedy = "It is of another model: take the policy's own." * (size > known)
+        except CheckpointError as error:
+            level, told, remedy = Level.WARNING, str(error), "Copy it again from the model's repository."
+    return [Finding(PART, "tokenizer", told, level, remedy)]
