@@ -24,6 +24,7 @@ from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.correction import FEATURES, Correction
 from ttscompile.core.lattice import check_plan
+from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError
 from ttscompile.pool import Work, opened_pool
 
@@ -119,6 +120,9 @@ class Searches:
 class Searching:
     """Has each strategy find a plan for each sparsity, and lets these take part: see ``calibration.compare.Joining``.
 
+    Attributes:
+        plans: those that took part, by ``STRATEGY-SHARE``, or ``STRATEGY-corrected-SHARE``.
+
     Args:
         path: the artifact; what is done is kept in its directory until ``forget``.
         strategies: names.
@@ -152,6 +156,7 @@ class Searching:
         self._strategies, self._sparsities = [strategy_of(name) for name in strategies], sparsities
         self._learned, self._minutes, self._how = learned, max_minutes, (intervals, 60 * max_minutes, correct)
         self._state: ComparisonState | None = None
+        self.plans: dict[str, Plan] = {}
 
     def forget(self) -> None:
         """Keep nothing any more: the comparison is done."""
@@ -205,6 +210,7 @@ class Searching:
                 plan, short = found
                 made = replace(trials.base, cells=plan.schedule, correction=plan.correction)
                 entrants.append(Entrant(series, f"{sparsity:g}", trials, made))
+                self.plans[f"{series.replace(', ', '-')}-{sparsity:g}"] = made
                 cut += [f"{series} {sparsity:g}"] * short
         warnings = [f"nothing was kept for --resume: {state.warning}."] if missing and state.warning else []
         if cut:

@@ -4,11 +4,12 @@
 
 Their plans take part beside those of the artifact, and of other artifacts, in what ``ttscompile bench -t`` measures:
 held-out action error and latency. Until the end, what searches found is kept in a file beside the artifact's own, for
-``--resume``; nothing else is written there.
+``--resume``; nothing else is written there. ``--into`` writes the plans into a copy, so that they can be driven.
 """
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import click
 from searches import LEARNED, Searching
 
 from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.write import require_replaceable, update_plans
 from ttscompile.calibration.strategies import NAMES
 from ttscompile.cli.contestants import compare, draw_comparison, print_comparison
 from ttscompile.cli.options import (
@@ -89,6 +91,12 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
 @count_option("--seed", "Seed of the split, the noise and the searches.", default=0, least=0, most=MOST_SEED)
 @ray_option
 @click.option("--resume", is_flag=True, help="Go on after the searches that an interrupted run had done.")
+@click.option(
+    "--into",
+    type=PATH,
+    metavar="DIR",
+    help="Write a copy of the artifact with the plans that were found: bac-0.95, bac-corrected-0.95 and so on.",
+)
 @click.option("--plot", "picture", type=PICTURE, help="Draw into this file (.png, .svg, .pdf).")
 @json_option
 def main(
@@ -102,11 +110,14 @@ def main(
     learned_calls: int,
     threads: int,
     seed: int,
+    into: Path | None,
     picture: Path | None,
     as_json: bool,
     **search: Any,  # Searching takes them by the same names
 ) -> None:
     """Hold plans that strategies find now against those of the artifact DIRECTORY."""
+    if into is not None:
+        require_replaceable(into)
     artifacts = {str(path): load_artifact(path) for path in (directory, *others)}
     of = artifacts[str(directory)].manifest
     wished = (sparsities or default_sparsities(of.steps)) if strategies else ()
@@ -114,6 +125,10 @@ def main(
     how: dict[str, Any] = {"observation": sources, "calls": calls, "threads": threads, "seed": seed}
     found = compare(directory, artifacts, others, trajectories, joining=joining, **how)
     joining.forget()
+    if into is not None and joining.plans:
+        shutil.rmtree(into, ignore_errors=True)
+        shutil.copytree(directory, into)
+        update_plans(into, artifacts[str(directory)].plans | joining.plans, next(iter(joining.plans)))
     if as_json:
         compared = [{"path": str(path), "identity": artifacts[str(path)].manifest.identity} for path in others]
         machine = fingerprint()

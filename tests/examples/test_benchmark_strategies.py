@@ -29,14 +29,20 @@ def run(*words: str) -> Any:
 @pytest.mark.slow
 def test_it_prints_the_same_as_a_table_and_as_json(arguments: list[str], tmp_path: Path) -> None:
     asked = [*arguments, "--strategies", "interval", "--sparsities", "0.5,0.8"]
-    told = run(*asked, "--json", "--plot", str(tmp_path / "f.svg"))
+    told = run(*asked, "--correct", "--json", "--plot", str(tmp_path / "f.svg"), "--into", str(tmp_path / "found"))
     record = json.loads(told.stdout)
     points = record["comparison"]["points"]
-    assert [point["series"] for point in points] == ["this artifact"] + ["interval"] * 2
+    assert [point["series"] for point in points] == ["this artifact"] + ["interval", "interval, corrected"] * 2
+    found = load_artifact(tmp_path / "found").plans
+    assert {name for name in found if name.startswith("interval")} == {
+        *("interval-0.5", "interval-corrected-0.5", "interval-0.8", "interval-corrected-0.8")
+    }
+    assert found["interval-0.5"].correction is None
+    assert found["interval-corrected-0.5"].correction is not None
     assert record["identity"] == load_artifact(Path(arguments[0])).manifest.identity
     assert "held-out calls" in (tmp_path / "f.svg").read_text()
     assert told.stderr.count("search: interval 0.8: ") == 1  # a log has a line for each part of the work, and no bar
-    shown = run(*asked).stdout
+    shown = run(*asked, "--correct").stdout
     assert "in which two calls of the original are" in " ".join(shown.split())
     assert all(f"{point['sparsity']:.1%}" in shown for point in points)
 
