@@ -128,7 +128,8 @@ def main(
     if into is not None and joining.plans:
         shutil.rmtree(into, ignore_errors=True)
         shutil.copytree(directory, into)
-        update_plans(into, artifacts[str(directory)].plans | joining.plans, next(iter(joining.plans)))
+        plans = {**artifacts[str(directory)].plans, **joining.plans}
+        update_plans(into, plans, next(iter(joining.plans)))
     if as_json:
         compared = [{"path": str(path), "identity": artifacts[str(path)].manifest.identity} for path in others]
         machine = fingerprint()

@@ -1,0 +1,312 @@
+"""What do rules gain that decide about whole calls: where a call begins (Falcon), and whether there is one (SP-VLA)?
+
+    ttscompile convert examples/pusht/pusht_dpt_ema_fp16.ckpt -o DIR --sampler ddim --steps 16
+    python examples/evaluation/whole_calls.py DIR --falcon 0.02,0.05 --light 2,4 --environment pusht --episodes 96
+
+All drive the same loop on paired episodes, and plans of DIR beside them. What counts is how many evaluations of the
+network a call takes on average: a rule that leaves some out has to beat a plan with as few.
+
+**Falcon** (arXiv 2503.00339) keeps the samples of the call before at every noise level, moved by what was executed. It
+makes a clean chunk of each in one evaluation, with the new observation, and begins with the least noisy one whose chunk
+is nearer than a threshold to what the call before planned; with none, or by chance, with noise. The paper's buffer has
+samples of several calls; here it has those of the last one. On a GPU the buffer is one evaluation. On a core it is one
+for each sample, and both are counted.
+
+**SP-VLA** (arXiv 2506.12723) leaves out the call where the last action was fast, and extrapolates: a ridge regression
+of the last actions on time. At most as many calls in a row are left out as the paper's share of real actions allows.
+Its tokens are another matter (``--learn tokens``).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import numpy.typing as npt
+import torch
+from environments import environment_class, environment_option
+from evaluate import Evaluation, evaluate
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from variants import (
+    Variant,
+    batch_option,
+    first_seed_option,
+    full_plan,
+    json_option,
+    open_variant,
+    results_console,
+    run,
+)
+
+import ttscompile
+from ttscompile.artifact.load import load_artifact
+from ttscompile.artifact.view import view_of
+from ttscompile.core.spec import FloatArray
+from ttscompile.errors import TtscompileError
+from ttscompile.runtimes.info import PolicyInfo
+from ttscompile.runtimes.inpainting import noise_levels
+from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
+from ttscompile.runtimes.reference.sampler import TorchSampler
+
+EXPLORED = 0.1
+"""Share of Falcon's calls that begin with noise whatever the threshold says."""
+
+MEMORY, RIDGE = 8, 1e-3
+"""SP-VLA's actions to extrapolate from, and the ridge of the regression."""
+
+Array = npt.NDArray[Any]
+
+
+@dataclass
+class Count:
+    """What calls took so far, of all streams.
+
+    Attributes:
+        calls: that there were, left out or not.
+        steps: evaluations that were steps of the loop.
+        checks: evaluations that looked for where to begin.
+    """
+
+    calls: int = 0
+    steps: int = 0
+    checks: int = 0
+
+
+class Falcon:
+    """A policy whose calls begin with samples of the call before, where those are near enough.
+
+    Args:
+        directory: of an artifact.
+        plan: that computes every cell.
+        threshold: mean absolute difference of normalised actions.
+        seed: of which calls begin with noise.
+    """
+
+    def __init__(self, directory: Path, plan: str, threshold: float, seed: int = 0) -> None:
+        artifact = load_artifact(directory)
+        view = view_of(artifact, artifact.plan(plan))
+        self._spec, levels = view.manifest.spec, noise_levels(view.manifest.spec.sampler)
+        if levels is None or self._spec.sampler.memories or self._spec.sampler.stochastic:
+            raise TtscompileError(f"{directory}: its loop is no deterministic one of one step. Use --sampler ddim.")
+        self._model, self._sampler = ReferenceModel.from_view(view), TorchSampler(self._spec.sampler)
+        self._signal, self._deviation = (torch.from_numpy(one.astype(np.float32)) for one in levels)
+        self._threshold, self._seed, self.count = threshold, seed, Count()
+        self.info: PolicyInfo = ttscompile.load(directory, plan=plan).info
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode."""
+        self._samples: list[torch.Tensor] = []
+        self._rng = np.random.default_rng(self._seed)
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: object = None
+    ) -> Mapping[str, Any]:
+        """One call."""
+        specs, chunk = self._spec.observations, self._spec.chunk
+        obs = {key: torch.from_numpy(spec.normalized(np.asarray(obs_dict[key]))) for key, spec in specs.items()}
+        assert noise is not None
+        with torch.no_grad():
+            contexts, initial = self._model.prologue(obs), torch.from_numpy(noise.initial)
+            begins, begun = self._beginnings(contexts, initial)
+            samples, following, streams = list[torch.Tensor](), initial, len(initial)
+            for k in range(self._model.steps):
+                samples.append(torch.where((begins >= k)[:, None, None], begun[k], following))
+                output = self._output(samples[k], k, contexts)
+                following = self._sampler.advance(self._sampler.begin(samples[k]), output, None, k).sample
+            samples.append(following)
+        self._samples = samples
+        self.count.calls += streams
+        self.count.steps += int((self._model.steps - begins).sum())
+        actions = chunk.unnormalized(samples[-1].numpy(), chunk.reference(dict(obs_dict)))
+        return {"action": actions[:, chunk.start : chunk.stop]}
+
+    def _beginnings(self, contexts: Contexts, initial: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """At which step each stream begins; and the samples to begin with, by step."""
+        steps, chunk = self._model.steps, self._spec.chunk
+        begun, begins = [initial] * steps, torch.zeros(len(initial), dtype=torch.int64)
+        if not self._samples:
+            return begins, begun
+        moved = chunk.stop - chunk.start
+        planned = self._samples[-1]
+        ahead = torch.cat([planned[:, moved:], planned[:, -1:].expand(-1, moved, -1)], 1)
+        free = torch.from_numpy(self._rng.random(len(initial)) >= EXPLORED)
+        for k in range(1, steps):
+            tail = self._signal[k] * ahead[:, -moved:] + self._deviation[k] * initial[:, -moved:]
+            begun[k] = torch.cat([self._samples[k][:, moved:], tail], 1)
+            clean = self._clean(begun[k], k, contexts)
+            near = (clean - ahead)[:, :-moved].abs().mean((1, 2)) < self._threshold
+            begins = torch.where(near & free, k, begins)
+        self.count.checks += (steps - 1) * len(initial)
+        return begins, begun
+
+    def _output(self, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
+        def blocks(k: int, stream: torch.Tensor) -> torch.Tensor:
+            for b in range(self._model.blocks):
+                stream = stream + self._model.block(b, k, stream, contexts)
+            return stream
+
+        return self._model.predict(sample, k, contexts, blocks)
+
+    def _clean(self, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
+        table = self._spec.sampler
+        clean = table.sample_to_x0[k] * sample + table.out_to_x0[k] * self._output(sample, k, contexts)
+        return clean if table.clip is None else clean.clamp(-table.clip, table.clip)
+
+
+def extrapolated(actions: FloatArray, count: int) -> FloatArray:
+    """The next actions ``[count, Da]`` by a ridge regression of those before ``[M, Da]`` on time."""
+    times = np.arange(-len(actions), count, dtype=np.float64)
+    design = np.stack([np.ones_like(times), times / len(actions)], 1)
+    past = design[: len(actions)]
+    weights = np.linalg.solve(past.T @ past + RIDGE * np.diag([0, 1]), past.T @ actions)
+    return (design[len(actions) :] @ weights).astype(np.float32)
+
+
+class Light:
+    """A policy whose calls are left out where the robot is fast.
+
+    Args:
+        variant: the policy, and its plan.
+        steps: evaluations of one of its calls.
+        fast: how far an action is from the one before, or, where actions are displacements, from 0.
+        displacements: whether they are.
+        most: calls in a row that are left out.
+    """
+
+    def __init__(self, variant: Variant, steps: int, fast: float, displacements: bool, most: int = 1) -> None:
+        self._variant, self._steps, self._fast, self._most = variant, steps, fast, most
+        self._displacements, self.info, self.count = displacements, variant.policy.info, Count()
+        self._past: list[FloatArray] = []
+
+    def reset(self) -> None:
+        """A new episode."""
+        self._variant.policy.reset()
+        self._past = []
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: object = None
+    ) -> Mapping[str, Any]:
+        """One call. All streams are answered by the policy, but only those that are not left out are counted."""
+        made = np.asarray(self._variant.policy.predict_action(obs_dict, noise=noise, plan=self._variant.plan)["action"])
+        if not self._past:
+            self._past, self._left = [made[i] for i in range(len(made))], [0] * len(made)
+            self.count = replace(
+                self.count, calls=self.count.calls + len(made), steps=self.count.steps + self._steps * len(made)
+            )
+            return {"action": made}
+        actions = made.copy()
+        for i, past in enumerate(self._past):
+            easy = self._left[i] < self._most and _speed(past, self._displacements) > self._fast
+            self._left[i] = self._left[i] + 1 if easy else 0
+            if easy:
+                actions[i] = extrapolated(past[-MEMORY:], len(made[i]))
+            self._past[i] = np.concatenate([past, actions[i]])[-MEMORY:]
+            self.count.calls += 1
+            self.count.steps += 0 if easy else self._steps
+        return {"action": actions}
+
+
+def _speed(actions: FloatArray, displacements: bool) -> float:
+    moved = actions[-1] if displacements else actions[-1] - actions[-2]
+    return float(np.linalg.norm(moved[:3]))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to drive; evaluations are of one call, on average.
+
+    Attributes:
+        steps: evaluations that are steps of the loop.
+        checks: those that look for where to begin.
+    """
+
+    label: str
+    steps: float
+    checks: float
+    evaluation: Evaluation
+
+    def cells(self) -> list[str]:
+        """For the table."""
+        own = self.evaluation
+        differences = ["" if one is None else str(one) for one in (own.score_difference, own.success_difference)]
+        return [self.label, f"{self.steps:.1f}", f"{self.checks:.1f}", str(own.score), str(own.success), *differences]
+
+
+def _thresholds(_: click.Context, __: click.Parameter, value: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in value.split(",") if word.strip())
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; expected numbers, such as 0.02,0.05.") from error
+
+
+@click.command()
+@click.argument("variants", nargs=-1, required=True, metavar="DIR [DIR:PLAN...]")
+@click.option("--falcon", default="", callback=_thresholds, help="Begin where chunks differ by less, normalised.")
+@click.option("--light", default="", callback=_thresholds, help="Leave out calls after faster actions.")
+@click.option("--displacements", is_flag=True, help="Actions say how far to move.")
+@environment_option
+@click.option("--episodes", default=96, show_default=True, type=click.IntRange(1))
+@first_seed_option
+@batch_option
+@json_option
+def main(
+    variants: tuple[str, ...],
+    falcon: tuple[float, ...],
+    light: tuple[float, ...],
+    displacements: bool,
+    environment: str,
+    episodes: int,
+    first_seed: int,
+    batch: int,
+    as_json: bool,
+) -> None:
+    """Drive every step of DIR, the rules on it, and other plans: DIR:NAME."""
+    directory = Path(variants[0])
+    plan = full_plan(directory)
+    whole = open_variant(f"{directory}:{plan}", "onnxruntime", 1)
+    counted: dict[str, Falcon | Light] = {}
+    for threshold in falcon:
+        counted[f"Falcon, {threshold:g}"] = Falcon(directory, plan, threshold)
+    for fast in light:
+        own = open_variant(f"{directory}:{plan}", "onnxruntime", 1)
+        counted[f"SP-VLA, {fast:g}"] = Light(own, own.policy.info.K, fast, displacements)
+    rules = [Variant(label, policy, None, whole.noise) for label, policy in counted.items()]
+    driven = [whole, *(open_variant(text, "onnxruntime", 1) for text in variants[1:]), *rules]
+    with Progress(console=Console(stderr=True)) as progress:
+        tasks = {one.label: progress.add_task(one.label, total=episodes) for one in driven}
+        found = evaluate(
+            environment_class(environment),
+            driven,
+            range(first_seed, first_seed + episodes),
+            batch,
+            lambda label, done: progress.update(tasks[label], completed=done),
+        )
+    rows = [_row(variant, own, counted.get(variant.label)) for variant, own in zip(driven, found, strict=True)]
+    if as_json:
+        told = [asdict(replace(row, evaluation=None)) | row.evaluation.to_json() for row in rows]  # type: ignore[arg-type]
+        click.echo(json.dumps(told))
+        return
+    table = Table(title=f"{environment}: {episodes} paired episodes; evaluations of the network in a call")
+    for column in ("", "steps", "checks", "score", "success", "score, difference", "success, difference"):
+        table.add_column(column, justify="right" if column else "left")
+    for row in rows:
+        table.add_row(*row.cells())
+    results_console().print(table)
+
+
+def _row(variant: Variant, own: Evaluation, rule: Falcon | Light | None) -> Row:
+    if rule is None:
+        return Row(variant.label, variant.policy.info.K * (1 - (own.sparsity or 0)), 0, own)
+    return Row(variant.label, rule.count.steps / rule.count.calls, rule.count.checks / rule.count.calls, own)
+
+
+if __name__ == "__main__":
+    run(main)

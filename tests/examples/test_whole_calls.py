@@ -1,0 +1,88 @@
+"""Rules about whole calls: what they leave out, and that without a threshold they are the original."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import whole_calls
+from click.testing import CliRunner
+from variants import Variant, open_variant, seeded_noise
+
+import ttscompile
+from tests.once import Once
+
+CALLS, STREAMS = 4, 3
+
+
+@pytest.fixture(scope="module")
+def directory(once: Once, one_layer_checkpoint: Path) -> Path:
+    path, _ = once.compiled(
+        "one layer, ddim 4", lambda at: ttscompile.convert(one_layer_checkpoint, at, sampler="ddim", steps=4)
+    )
+    return path
+
+
+@pytest.fixture
+def whole(directory: Path) -> Variant:
+    return open_variant(f"{directory}:full", "onnxruntime", 1)
+
+
+def answers(policy: whole_calls.Falcon | whole_calls.Light, variant: Variant) -> list[whole_calls.Array]:
+    """Calls of an episode whose observations move a little."""
+    policy.reset()
+    (key, spec), given = next(iter(variant.policy.info.observation.items())), np.random.default_rng(0)
+    first = given.uniform(100, 400, (STREAMS, *spec.shape)).astype(np.float32)
+    noise = [seeded_noise(variant.noise, range(STREAMS), call) for call in range(CALLS)]
+    return [np.asarray(policy.predict_action({key: first + i}, noise=one)["action"]) for i, one in enumerate(noise)]
+
+
+def test_what_is_on_a_line_stays_on_it() -> None:
+    past = np.stack([np.arange(8.0), 5 - 2 * np.arange(8.0)], 1).astype(np.float32)
+    np.testing.assert_allclose(whole_calls.extrapolated(past, 2), [[8, -11], [9, -13]], atol=0.05)
+
+
+def test_without_a_threshold_falcon_is_the_original(directory: Path, whole: Variant) -> None:
+    falcon = whole_calls.Falcon(directory, "full", 0.0)
+    light = whole_calls.Light(whole, 4, np.inf, displacements=False)  # nothing is that fast
+    for mine, own in zip(answers(falcon, whole), answers(light, whole), strict=True):
+        np.testing.assert_allclose(mine, own, rtol=1e-4, atol=1e-2)  # of 0..512
+    assert (falcon.count.steps, falcon.count.checks) == (4 * CALLS * STREAMS, 3 * (CALLS - 1) * STREAMS)
+    assert light.count == whole_calls.Count(CALLS * STREAMS, 4 * CALLS * STREAMS)
+
+
+def test_a_chunk_that_is_near_enough_is_begun_with(
+    directory: Path, whole: Variant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole_calls, "EXPLORED", 0.0)
+    falcon = whole_calls.Falcon(directory, "full", np.inf)
+    answers(falcon, whole)
+    assert falcon.count.steps == (4 + CALLS - 1) * STREAMS  # the last step alone, but for the first call
+
+
+def test_every_other_call_is_left_out_where_all_are_fast(whole: Variant) -> None:
+    light = whole_calls.Light(whole, 4, -1.0, displacements=False)
+    made = answers(light, whole)
+    assert light.count == whole_calls.Count(CALLS * STREAMS, 2 * 4 * STREAMS)
+    expected = whole_calls.extrapolated(made[0][1][-whole_calls.MEMORY :], made[0].shape[1])
+    np.testing.assert_array_equal(made[1][1], expected)
+
+
+@pytest.mark.slow
+def test_they_drive_beside_plans(directory: Path) -> None:
+    words = [str(directory), "--falcon", "0,9", "--light", "1", "--episodes", "2", "--json"]
+    result = CliRunner().invoke(whole_calls.main, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    rows = {row["label"].rpartition(":")[2]: row for row in json.loads(result.stdout)}
+    assert list(rows) == ["full", "Falcon, 0", "Falcon, 9", "SP-VLA, 1"]
+    assert rows["Falcon, 0"]["steps"] == rows["full"]["steps"] == 4
+    assert rows["Falcon, 9"]["steps"] < 2
+    assert rows["SP-VLA, 1"]["steps"] < 4
+    assert rows["Falcon, 0"]["score"] == pytest.approx(rows["full"]["score"], abs=1e-3)
+
+
+def test_a_loop_that_draws_noise_is_refused(compiled_layer: Path) -> None:
+    with pytest.raises(ttscompile.errors.TtscompileError, match="--sampler ddim"):
+        whole_calls.Falcon(compiled_layer, "dense", 0.1)
