@@ -2,6 +2,6 @@
 
 ``networks`` has what is computed, under the names of the original's weights. ``diffusion_policy`` and ``lerobot`` read
 what these two projects save; a module beside them reads what the authors of one policy save. Each is found by a row: in
-``frontends/families.py``, for a class of Diffusion Policy's kind in ``diffusion_policy.py``, or for a type of LeRobot's
-in ``lerobot.py``. Of an action head the observations are what the rest of its model gives it.
+``frontends/families.py``, or, for a class of Diffusion Policy's kind or a type of LeRobot's, in their ``family.py``. Of
+an action head the observations are what the rest of its model gives it.
 """
