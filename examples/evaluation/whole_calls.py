@@ -1,4 +1,4 @@
-"""What do rules gain that decide about whole calls: where a call begins (Falcon), and whether there is one (SP-VLA)?
+"""What do rules gain that decide about whole calls: where one begins, whether there is one, and what it looks at?
 
     ttscompile convert examples/pusht/pusht_dpt_ema_fp16.ckpt -o DIR --sampler ddim --steps 16
     python examples/evaluation/whole_calls.py DIR --falcon 0.02,0.05 --light 2,4 --environment pusht --episodes 96
@@ -15,6 +15,9 @@ for each sample, and both are counted.
 **SP-VLA** (arXiv 2506.12723) leaves out the call where the last action was fast, and extrapolates: a ridge regression
 of the last actions on time. At most as many calls in a row are left out as the paper's share of real actions allows.
 Its tokens are another matter (``--learn tokens``).
+
+**Kept pictures**, as FLASH (arXiv 2605.13778) keeps them between two looks: with ``--look 2`` every second call has the
+pictures of the call before, whose features are known, and the state of now.
 """
 
 from __future__ import annotations
@@ -214,6 +217,37 @@ class Light:
         return {"action": actions}
 
 
+class Kept:
+    """A policy that looks at every so many calls, and has the newest state at all of them.
+
+    Args:
+        variant: the policy, and its plan.
+        steps: evaluations of one of its calls.
+        look: at the first of so many calls.
+    """
+
+    def __init__(self, variant: Variant, steps: int, look: int) -> None:
+        self._variant, self._steps, self._look = variant, steps, look
+        self.info, self.count, self._pictures, self._number = variant.policy.info, Count(), dict[str, Array](), 0
+
+    def reset(self) -> None:
+        """A new episode."""
+        self._variant.policy.reset()
+        self._number = 0
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: object = None
+    ) -> Mapping[str, Any]:
+        """One call."""
+        if self._number % self._look == 0:
+            self._pictures = {key: np.array(obs_dict[key]) for key, one in self.info.observation.items() if one.image}
+        self._number += 1
+        streams = len(next(iter(obs_dict.values())))
+        self.count.calls += streams
+        self.count.steps += self._steps * streams
+        return self._variant.policy.predict_action({**obs_dict, **self._pictures}, noise=noise, plan=self._variant.plan)
+
+
 def _speed(actions: FloatArray, displacements: bool) -> float:
     moved = actions[-1] if displacements else actions[-1] - actions[-2]
     return float(np.linalg.norm(moved[:3]))
@@ -251,6 +285,7 @@ def _thresholds(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
 @click.argument("variants", nargs=-1, required=True, metavar="DIR [DIR:PLAN...]")
 @click.option("--falcon", default="", callback=_thresholds, help="Begin where chunks differ by less, normalised.")
 @click.option("--light", default="", callback=_thresholds, help="Leave out calls after faster actions.")
+@click.option("--look", default="", callback=_thresholds, help="Look at the first of so many calls.")
 @click.option("--displacements", is_flag=True, help="Actions say how far to move.")
 @environment_option
 @click.option("--episodes", default=96, show_default=True, type=click.IntRange(1))
@@ -261,6 +296,7 @@ def main(
     variants: tuple[str, ...],
     falcon: tuple[float, ...],
     light: tuple[float, ...],
+    look: tuple[float, ...],
     displacements: bool,
     environment: str,
     episodes: int,
@@ -271,13 +307,18 @@ def main(
     """Drive every step of DIR, the rules on it, and other plans: DIR:NAME."""
     directory = Path(variants[0])
     plan = full_plan(directory)
-    whole = open_variant(f"{directory}:{plan}", "onnxruntime", 1)
-    counted: dict[str, Falcon | Light] = {}
+
+    def opened() -> Variant:
+        return open_variant(f"{directory}:{plan}", "onnxruntime", 1)
+
+    whole = opened()
+    counted: dict[str, Falcon | Light | Kept] = {}
     for threshold in falcon:
         counted[f"Falcon, {threshold:g}"] = Falcon(directory, plan, threshold)
     for fast in light:
-        own = open_variant(f"{directory}:{plan}", "onnxruntime", 1)
-        counted[f"SP-VLA, {fast:g}"] = Light(own, own.policy.info.K, fast, displacements)
+        counted[f"SP-VLA, {fast:g}"] = Light(opened(), whole.policy.info.K, fast, displacements)
+    for every in look:
+        counted[f"a look in {every:g} calls"] = Kept(opened(), whole.policy.info.K, int(every))
     rules = [Variant(label, policy, None, whole.noise) for label, policy in counted.items()]
     driven = [whole, *(open_variant(text, "onnxruntime", 1) for text in variants[1:]), *rules]
     with Progress(console=Console(stderr=True)) as progress:
@@ -302,7 +343,7 @@ def main(
     results_console().print(table)
 
 
-def _row(variant: Variant, own: Evaluation, rule: Falcon | Light | None) -> Row:
+def _row(variant: Variant, own: Evaluation, rule: Falcon | Light | Kept | None) -> Row:
     if rule is None:
         return Row(variant.label, variant.policy.info.K * (1 - (own.sparsity or 0)), 0, own)
     return Row(variant.label, rule.count.steps / rule.count.calls, rule.count.checks / rule.count.calls, own)

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,6 +72,34 @@ def test_every_other_call_is_left_out_where_all_are_fast(whole: Variant) -> None
     assert light.count == whole_calls.Count(CALLS * STREAMS, 2 * 4 * STREAMS)
     expected = whole_calls.extrapolated(made[0][1][-whole_calls.MEMORY :], made[0].shape[1])
     np.testing.assert_array_equal(made[1][1], expected)
+
+
+class Seen:
+    """A policy that notes the number that its pictures and its state show."""
+
+    def __init__(self) -> None:
+        shown = {"camera": SimpleNamespace(image=True), "state": SimpleNamespace(image=False)}
+        self.info, self.calls = SimpleNamespace(observation=shown), list[tuple[int, int]]()
+
+    def reset(self) -> None:
+        """A new episode."""
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], noise: object = None, plan: object = None
+    ) -> Mapping[str, Any]:
+        self.calls.append((int(obs_dict["camera"][0]), int(obs_dict["state"][0])))
+        return {}
+
+
+def test_pictures_are_kept_between_two_looks_and_the_state_is_new(whole: Variant) -> None:
+    seen: Any = Seen()
+    kept = whole_calls.Kept(replace(whole, policy=seen), 4, 2)
+    for _ in range(2):
+        kept.reset()
+        for number in range(3):
+            kept.predict_action({"camera": np.array([number]), "state": np.array([number])})
+    assert seen.calls == [(0, 0), (0, 1), (2, 2)] * 2
+    assert kept.count == whole_calls.Count(6, 24)
 
 
 @pytest.mark.slow
