@@ -11,6 +11,7 @@ COPY passes passes
 COPY runtimes runtimes
 COPY plugins/policies plugins/policies
 COPY plugins/rivals plugins/rivals
+COPY plugins/serving plugins/serving
 ARG PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 RUN python3 -m venv /opt/ttscompile \
     && /opt/ttscompile/bin/python -m pip install --no-cache-dir $PIP_FLAGS -c constraints.txt \

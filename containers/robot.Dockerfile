@@ -10,6 +10,7 @@ COPY passes passes
 COPY runtimes runtimes
 COPY plugins/policies plugins/policies
 COPY plugins/rivals plugins/rivals
+COPY plugins/serving plugins/serving
 ARG PIP_FLAGS=""
 RUN python3 -m venv /opt/ttscompile \
     && /opt/ttscompile/bin/python -m pip install --no-cache-dir $PIP_FLAGS -c constraints.txt '.[hub,serve]'
