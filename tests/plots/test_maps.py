@@ -75,3 +75,13 @@ def test_the_frontier_of_one_point_is_no_line_and_the_dense_plan_is_told() -> No
     figure = frontier_of([Point("s", "quick", 2.0, 5.0), Point("s", "dense", 0.0, 99.0)])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["s"]
     assert "dense of s, 99 ms" in figure.axes[0].get_title(loc="left")
+
+
+def test_many_series_are_told_apart_and_the_original_but_for_rounding_takes_no_room() -> None:
+    points = [Point(f"rule {i}", "0.95", 0.5 + 0.05 * i, 5.0 + i) for i in range(9)]
+    axes = frontier_of([*points, Point("s", "dense", 2e-7, 99.0)]).axes[0]
+    looks = [(str(line.get_color()), str(line.get_marker())) for line in axes.lines[:9]]
+    assert len(set(looks)) == 9
+    assert {"rule 0 0.95", "rule 8 0.95"} <= {text.get_text() for text in axes.texts}
+    assert axes.get_ylim()[0] > 0.1
+    assert "dense of s, 99 ms" in axes.get_title(loc="left")

@@ -24,6 +24,9 @@ MARKERS = "osD^vP*"
 MOST_NAMES = 12
 """Of more points only those that no other beats have their names beside them: the others would cover each other."""
 
+ROUNDING = 1e-4
+"""A plan that is nearer is the original but for rounding: drawn, it would take the axis from all others."""
+
 _TITLE_WIDTH = 105
 """Characters."""
 
@@ -32,18 +35,18 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     """The points, and a line along those that no other beats.
 
     Args:
-        points: of all series; those at no distance (the dense policy) are told in the title: the axis is logarithmic.
+        points: of all series; those at no distance but rounding (the dense policy) are told in the title.
         efficient: points that no other beats, fastest first.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()
-    shown = [point for point in points if point.distance > 0]
+    shown = [point for point in points if point.distance > ROUNDING]
     for i, series in enumerate(dict.fromkeys(point.series for point in shown)):
         own = sorted((p for p in shown if p.series == series), key=lambda p: p.latency_ms)
         axes.plot(
             [p.latency_ms for p in own],
             [p.distance for p in own],
-            marker=MARKERS[i % len(MARKERS)],
+            marker=MARKERS[(i + i // len(COLOURS)) % len(MARKERS)],  # of a colour that comes again, another
             linestyle="none" if len({p.name.strip("0123456789.") for p in own}) > 1 else "-",
             linewidth=1,
             color=COLOURS[i % len(COLOURS)],
@@ -51,12 +54,14 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
         )
     first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))
     told = shown if len(shown) <= MOST_NAMES else [p for p in shown if p in efficient]
+    several = len({p.name for p in told}) < len(told)  # strategies have a plan of the same name each
     for i, p in enumerate(told):
         apart = [(log(p.latency_ms / other.latency_ms), log(p.distance / other.distance)) for other in told[:i]]
         above = 4 + 8 * sum(abs(x) < 0.15 and abs(y) < 0.2 for x, y in apart)
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
-        axes.annotate(p.name, (p.latency_ms, p.distance), fontsize=8, **beside(place, p.name, above))
-    best = [point for point in efficient if point.distance > 0]
+        name = f"{p.series} {p.name}" if several else p.name
+        axes.annotate(name, (p.latency_ms, p.distance), fontsize=8, **beside(place, name, above))
+    best = [point for point in efficient if point.distance > ROUNDING]
     if len(best) > 1:  # of one point there is no line
         line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
         axes.step([p.latency_ms for p in best], [p.distance for p in best], where="post", label="frontier", **line)
@@ -65,7 +70,7 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
-    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.distance <= 0)
+    exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.distance <= ROUNDING)
     parts = [*title.splitlines(), *([f"not drawn, with no distance: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
