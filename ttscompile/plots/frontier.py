@@ -75,7 +75,8 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
     with_grid(axes)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    if shown:  # else there is nothing to explain
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     return figure
 
 
