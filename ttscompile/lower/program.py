@@ -28,6 +28,7 @@ from .advance import advances, lower_idle
 from .joint import lower_all_blocks
 from .layout import sink_layout
 from .onnx_model import name_model, only
+from .promotion import beside_floats, may_promote, summed_as
 from .simplify import simplify
 from .translations import TRANSLATIONS
 
@@ -199,6 +200,9 @@ def _write(program: torch.export.ExportedProgram, graphs: list[Graph]) -> None:
     outputs = [OutputSpec(OutputKind.USER_OUTPUT, TensorArgument(node.name), None) for node in results]
     program.graph_signature.output_specs[:] = outputs
     program.__class__ = _Written
+    if not any(may_promote(graph) for graph in graphs):
+        # The exporter looks through these for types that are promoted, and for assertions: there are none of either.
+        program.graph_module.modules = list  # type: ignore[method-assign,assignment]
 
 
 class _Writer:
@@ -226,7 +230,13 @@ class _Writer:
         """Write all of them; the graph's outputs."""
         types = self._graph.types()
         for node in self._graph.nodes:
-            args = [self._argument(node, each) for each in _without_symbols(node, types)]
+            given = [beside_floats(node, each, types) for each in _without_symbols(node, types)]
+            args = [self._argument(node, each) for each in given]
+            if (dtype := summed_as(node, types)) is not None:
+                kind = getattr(torch, dtype)
+                args[0] = self._call(
+                    torch.ops.aten._to_copy.default, (args[0],), args[0].meta["val"].to(kind), {"dtype": kind}
+                )
             named = {name: self._argument(node, each) for name, each in node.kwargs}
             function: Any = resolve_op(node)
             function = _EQUAL.get(function, function)
