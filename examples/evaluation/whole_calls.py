@@ -1,14 +1,16 @@
 """What do rules gain that decide about whole calls: where one begins, whether there is one, and what it looks at?
 
     ttscompile convert examples/pusht/pusht_dpt_ema_fp16.ckpt -o DIR --sampler ddim --steps 16
-    python examples/evaluation/whole_calls.py DIR --falcon 0.02,0.05 --light 2,4 --environment pusht --episodes 96
+    python examples/evaluation/whole_calls.py DIR --falcon 0.02:8,0.02:4 --light 2,4 --environment pusht --episodes 96
 
 All drive the same loop on paired episodes, and plans of DIR beside them. What counts is how many evaluations of the
 network a call takes on average: a rule that leaves some out has to beat a plan with as few.
 
 **Falcon** (arXiv 2503.00339) keeps the samples of the call before at every noise level, moved by what was executed. It
 makes a clean chunk of each in one evaluation, with the new observation, and begins with the least noisy one whose chunk
-is nearer than a threshold to what the call before planned; with none, or by chance, with noise. The paper's buffer has
+is nearer than a threshold to what the call before planned; with none, or by chance, with noise. ``0.02:8`` is that
+threshold, and how many steps are left at least, the paper's k_min: without it the last step alone would be, since a
+sample that is hardly noisy is its own chunk. The paper's buffer has
 samples of several calls; here it has those of the last one. On a GPU the buffer is one evaluation. On a core it is one
 for each sample, and both are counted.
 
@@ -89,10 +91,11 @@ class Falcon:
         directory: of an artifact.
         plan: that computes every cell.
         threshold: mean absolute difference of normalised actions.
+        least: steps of a call.
         seed: of which calls begin with noise.
     """
 
-    def __init__(self, directory: Path, plan: str, threshold: float, seed: int = 0) -> None:
+    def __init__(self, directory: Path, plan: str, threshold: float, least: int = 1, seed: int = 0) -> None:
         artifact = load_artifact(directory)
         view = view_of(artifact, artifact.plan(plan))
         self._spec, levels = view.manifest.spec, noise_levels(view.manifest.spec.sampler)
@@ -100,7 +103,7 @@ class Falcon:
             raise TtscompileError(f"{directory}: its loop is no deterministic one of one step. Use --sampler ddim.")
         self._model, self._sampler = ReferenceModel.from_view(view), TorchSampler(self._spec.sampler)
         self._signal, self._deviation = (torch.from_numpy(one.astype(np.float32)) for one in levels)
-        self._threshold, self._seed, self.count = threshold, seed, Count()
+        self._threshold, self._least, self._seed, self.count = threshold, least, seed, Count()
         self.info: PolicyInfo = ttscompile.load(directory, plan=plan).info
         self.reset()
 
@@ -141,13 +144,13 @@ class Falcon:
         planned = self._samples[-1]
         ahead = torch.cat([planned[:, moved:], planned[:, -1:].expand(-1, moved, -1)], 1)
         free = torch.from_numpy(self._rng.random(len(initial)) >= EXPLORED)
-        for k in range(1, steps):
+        for k in range(1, steps - self._least + 1):
             tail = self._signal[k] * ahead[:, -moved:] + self._deviation[k] * initial[:, -moved:]
             begun[k] = torch.cat([self._samples[k][:, moved:], tail], 1)
             clean = self._clean(begun[k], k, contexts)
             near = (clean - ahead)[:, :-moved].abs().mean((1, 2)) < self._threshold
             begins = torch.where(near & free, k, begins)
-        self.count.checks += (steps - 1) * len(initial)
+        self.count.checks += (steps - self._least) * len(initial)
         return begins, begun
 
     def _output(self, sample: torch.Tensor, k: int, contexts: Contexts) -> torch.Tensor:
@@ -281,9 +284,17 @@ def _thresholds(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
         raise click.BadParameter(f"{error}; expected numbers, such as 0.02,0.05.") from error
 
 
+def _beginnings(_: click.Context, __: click.Parameter, value: str) -> tuple[tuple[float, int], ...]:
+    try:
+        pairs = [word.partition(":") for word in value.split(",") if word.strip()]
+        return tuple((float(threshold), int(least or 1)) for threshold, _, least in pairs)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; expected thresholds and least steps, such as 0.02:8.") from error
+
+
 @click.command()
 @click.argument("variants", nargs=-1, required=True, metavar="DIR [DIR:PLAN...]")
-@click.option("--falcon", default="", callback=_thresholds, help="Begin where chunks differ by less, normalised.")
+@click.option("--falcon", default="", callback=_beginnings, help="Begin where chunks differ by less; at least N steps.")
 @click.option("--light", default="", callback=_thresholds, help="Leave out calls after faster actions.")
 @click.option("--look", default="", callback=_thresholds, help="Look at the first of so many calls.")
 @click.option("--displacements", is_flag=True, help="Actions say how far to move.")
@@ -294,7 +305,7 @@ def _thresholds(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
 @json_option
 def main(
     variants: tuple[str, ...],
-    falcon: tuple[float, ...],
+    falcon: tuple[tuple[float, int], ...],
     light: tuple[float, ...],
     look: tuple[float, ...],
     displacements: bool,
@@ -313,8 +324,8 @@ def main(
 
     whole = opened()
     counted: dict[str, Falcon | Light | Kept] = {}
-    for threshold in falcon:
-        counted[f"Falcon, {threshold:g}"] = Falcon(directory, plan, threshold)
+    for threshold, least in falcon:
+        counted[f"Falcon, {threshold:g}:{least}"] = Falcon(directory, plan, threshold, least)
     for fast in light:
         counted[f"SP-VLA, {fast:g}"] = Light(opened(), whole.policy.info.K, fast, displacements)
     for every in look:

@@ -104,15 +104,15 @@ def test_pictures_are_kept_between_two_looks_and_the_state_is_new(whole: Variant
 
 @pytest.mark.slow
 def test_they_drive_beside_plans(directory: Path) -> None:
-    words = [str(directory), "--falcon", "0,9", "--light", "1", "--episodes", "2", "--json"]
+    words = [str(directory), "--falcon", "0,9:2", "--light", "1", "--episodes", "2", "--json"]
     result = CliRunner().invoke(whole_calls.main, words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     rows = {row["label"].rpartition(":")[2]: row for row in json.loads(result.stdout)}
-    assert list(rows) == ["full", "Falcon, 0", "Falcon, 9", "SP-VLA, 1"]
-    assert rows["Falcon, 0"]["steps"] == rows["full"]["steps"] == 4
-    assert rows["Falcon, 9"]["steps"] < 2
+    assert list(rows) == ["full", "Falcon, 0:1", "Falcon, 9:2", "SP-VLA, 1"]
+    assert rows["Falcon, 0:1"]["steps"] == rows["full"]["steps"] == 4
+    assert 2 <= rows["Falcon, 9:2"]["steps"] < 3
     assert rows["SP-VLA, 1"]["steps"] < 4
-    assert rows["Falcon, 0"]["score"] == pytest.approx(rows["full"]["score"], abs=1e-3)
+    assert rows["Falcon, 0:1"]["score"] == pytest.approx(rows["full"]["score"], abs=1e-3)
 
 
 def test_a_loop_that_draws_noise_is_refused(compiled_layer: Path) -> None:

@@ -57,7 +57,7 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     several = len({p.name for p in told}) < len(told)  # strategies have a plan of the same name each
     for i, p in enumerate(told):
         apart = [(log(p.latency_ms / other.latency_ms), log(p.distance / other.distance)) for other in told[:i]]
-        above = 4 + 8 * sum(abs(x) < 0.15 and abs(y) < 0.2 for x, y in apart)
+        above = 4 + 12 * sum(abs(x) < 0.15 and abs(y) < 0.2 for x, y in apart)
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
         name = f"{p.series} {p.name}" if several else p.name
         axes.annotate(name, (p.latency_ms, p.distance), fontsize=8, **beside(place, name, above))
