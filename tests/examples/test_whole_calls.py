@@ -107,7 +107,7 @@ def test_they_drive_beside_plans(directory: Path) -> None:
     words = [str(directory), "--falcon", "0,9:2", "--light", "1", "--episodes", "2", "--json"]
     result = CliRunner().invoke(whole_calls.main, words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    rows = {row["label"].rpartition(":")[2]: row for row in json.loads(result.stdout)}
+    rows = {row["label"].removeprefix(f"{directory}:"): row for row in json.loads(result.stdout)}
     assert list(rows) == ["full", "Falcon, 0:1", "Falcon, 9:2", "SP-VLA, 1"]
     assert rows["Falcon, 0:1"]["steps"] == rows["full"]["steps"] == 4
     assert 2 <= rows["Falcon, 9:2"]["steps"] < 3

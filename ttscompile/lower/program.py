@@ -202,7 +202,7 @@ def _write(program: torch.export.ExportedProgram, graphs: list[Graph]) -> None:
     program.__class__ = _Written
     if not any(may_promote(graph) for graph in graphs):
         # The exporter looks through these for types that are promoted, and for assertions: there are none of either.
-        program.graph_module.modules = list  # type: ignore[method-assign,assignment]
+        program.graph_module.modules = list
 
 
 class _Writer:
