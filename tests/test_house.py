@@ -263,6 +263,11 @@ def test_every_public_name_can_be_had_and_an_unknown_one_is_explained() -> None:
         ttscompile.compile  # noqa: B018
 
 
+def test_a_command_that_is_attached_can_be_imported_first() -> None:
+    code = "import ttscompile.serving.command as one, ttscompile.cli as cli; print(cli.main.commands[one.serve.name])"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT.parent)
+
+
 def test_importing_the_package_loads_neither_numpy_nor_torch() -> None:
     code = "import sys, ttscompile; print(sorted({'numpy', 'torch', 'onnx', 'onnxruntime'} & set(sys.modules)))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT.parent)

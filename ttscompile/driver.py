@@ -131,7 +131,7 @@ def convert(
     spec = replace(spec, source={**spec.source, **origin})
     beside = files_beside(checkpoint, spec)
     if beside == {}:
-        explain("files_beside", ("none for LeRobot: none of its steps makes the tokens that this policy reads",))
+        explain("files_beside", ("none: no step of its program makes the tokens that this policy reads",))
     loop = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL)
     return _compile(
         module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside or {}, loop

@@ -118,18 +118,14 @@ def main(
     """Hold plans that strategies find now against those of the artifact DIRECTORY."""
     if into is not None:
         require_replaceable(into)
+        if into.resolve() in [path.resolve() for path in (directory, *others)]:
+            raise click.BadParameter(f"{into} takes part. Give another folder for the plans that are found.")
     artifacts = {str(path): load_artifact(path) for path in (directory, *others)}
     of = artifacts[str(directory)].manifest
     wished = (sparsities or default_sparsities(of.steps)) if strategies else ()
     joining = Searching(directory, strategies, wished, learned=learned_calls, **search)
     how: dict[str, Any] = {"observation": sources, "calls": calls, "threads": threads, "seed": seed}
     found = compare(directory, artifacts, others, trajectories, joining=joining, **how)
-    joining.forget()
-    if into is not None and joining.plans:
-        shutil.rmtree(into, ignore_errors=True)
-        shutil.copytree(directory, into)
-        plans = {**artifacts[str(directory)].plans, **joining.plans}
-        update_plans(into, plans, next(iter(joining.plans)))
     if as_json:
         compared = [{"path": str(path), "identity": artifacts[str(path)].manifest.identity} for path in others]
         machine = fingerprint()
@@ -141,6 +137,13 @@ def main(
         say(output, *(f"{path}: identity {one.manifest.short_identity}" for path, one in artifacts.items()))
     if picture is not None:
         say(progress(), draw_comparison(found, directory, picture))
+    if into is not None and joining.plans:
+        shutil.rmtree(into, ignore_errors=True)
+        shutil.copytree(directory, into)
+        update_plans(into, {**artifacts[str(directory)].plans, **joining.plans}, next(iter(joining.plans)))
+    elif into is not None:
+        say(progress(), f"warning: no plan was found, so {into} was not written.")
+    joining.forget()  # last, so that --resume goes on after what failed before
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ network a call takes on average: a rule that leaves some out has to beat a plan 
 **Falcon** (arXiv 2503.00339) keeps the samples of the call before at every noise level, moved by what was executed. It
 makes a clean chunk of each in one evaluation, with the new observation, and begins with the least noisy one whose chunk
 is nearer than a threshold to what the call before planned; with none, or by chance, with noise. ``0.02:8`` is that
-threshold, and how many steps are left at least, the paper's k_min: without it the last step alone would be, since a
-sample that is hardly noisy is its own chunk. The paper's buffer has
-samples of several calls; here it has those of the last one. On a GPU the buffer is one evaluation. On a core it is one
-for each sample, and both are counted.
+threshold, and how many steps a call has at least, the paper's k_min. Without it the last step alone would be left: a
+sample that is hardly noisy is its own chunk. The paper's buffer has samples of several calls; here it has those of
+the last one. On a GPU the buffer is one evaluation. On a core it is one for each sample, and both are counted.
 
 **SP-VLA** (arXiv 2506.12723) leaves out the call where the last action was fast, and extrapolates: a ridge regression
-of the last actions on time. At most as many calls in a row are left out as the paper's share of real actions allows.
-Its tokens are another matter (``--learn tokens``).
+of the last actions on time. The call after it is always made, where the paper has a share of real actions. Its tokens
+are another matter (``--learn tokens``).
 
 **Kept pictures**, as FLASH (arXiv 2605.13778) keeps them between two looks: with ``--look 2`` every second call has the
 pictures of the call before, whose features are known, and the state of now.
@@ -26,7 +25,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +102,8 @@ class Falcon:
             raise TtscompileError(f"{directory}: its loop is no deterministic one of one step. Use --sampler ddim.")
         self._model, self._sampler = ReferenceModel.from_view(view), TorchSampler(self._spec.sampler)
         self._signal, self._deviation = (torch.from_numpy(one.astype(np.float32)) for one in levels)
+        if least > (steps := self._spec.sampler.steps):
+            raise TtscompileError(f"{directory}: its loop has {steps} steps; {least} cannot be left.")
         self._threshold, self._least, self._seed, self.count = threshold, least, seed, Count()
         self.info: PolicyInfo = ttscompile.load(directory, plan=plan).info
         self.reset()
@@ -287,16 +288,29 @@ def _thresholds(_: click.Context, __: click.Parameter, value: str) -> tuple[floa
 def _beginnings(_: click.Context, __: click.Parameter, value: str) -> tuple[tuple[float, int], ...]:
     try:
         pairs = [word.partition(":") for word in value.split(",") if word.strip()]
-        return tuple((float(threshold), int(least or 1)) for threshold, _, least in pairs)
+        found = tuple((float(threshold), int(least or 1)) for threshold, _, least in pairs)
     except ValueError as error:
         raise click.BadParameter(f"{error}; expected thresholds and least steps, such as 0.02:8.") from error
+    if any(least < 1 for _, least in found):
+        raise click.BadParameter("a call has one step at least.")
+    return found
+
+
+def _looks(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ...]:
+    try:
+        found = tuple(int(word) for word in value.split(",") if word.strip())
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; expected numbers of calls, such as 2,3.") from error
+    if any(each < 1 for each in found):
+        raise click.BadParameter("expected numbers of at least 1.")
+    return found
 
 
 @click.command()
 @click.argument("variants", nargs=-1, required=True, metavar="DIR [DIR:PLAN...]")
 @click.option("--falcon", default="", callback=_beginnings, help="Begin where chunks differ by less; at least N steps.")
 @click.option("--light", default="", callback=_thresholds, help="Leave out calls after faster actions.")
-@click.option("--look", default="", callback=_thresholds, help="Look at the first of so many calls.")
+@click.option("--look", default="", callback=_looks, help="Look at the first of so many calls.")
 @click.option("--displacements", is_flag=True, help="Actions say how far to move.")
 @environment_option
 @click.option("--episodes", default=96, show_default=True, type=click.IntRange(1))
@@ -307,7 +321,7 @@ def main(
     variants: tuple[str, ...],
     falcon: tuple[tuple[float, int], ...],
     light: tuple[float, ...],
-    look: tuple[float, ...],
+    look: tuple[int, ...],
     displacements: bool,
     environment: str,
     episodes: int,
@@ -329,7 +343,7 @@ def main(
     for fast in light:
         counted[f"SP-VLA, {fast:g}"] = Light(opened(), whole.policy.info.K, fast, displacements)
     for every in look:
-        counted[f"a look in {every:g} calls"] = Kept(opened(), whole.policy.info.K, int(every))
+        counted[f"a look in {every} calls"] = Kept(opened(), whole.policy.info.K, every)
     rules = [Variant(label, policy, None, whole.noise) for label, policy in counted.items()]
     driven = [whole, *(open_variant(text, "onnxruntime", 1) for text in variants[1:]), *rules]
     with Progress(console=Console(stderr=True)) as progress:
@@ -343,7 +357,7 @@ def main(
         )
     rows = [_row(variant, own, counted.get(variant.label)) for variant, own in zip(driven, found, strict=True)]
     if as_json:
-        told = [asdict(replace(row, evaluation=None)) | row.evaluation.to_json() for row in rows]  # type: ignore[arg-type]
+        told = [{"steps": row.steps, "checks": row.checks} | row.evaluation.to_json() for row in rows]
         click.echo(json.dumps(told))
         return
     table = Table(title=f"{environment}: {episodes} paired episodes; evaluations of the network in a call")

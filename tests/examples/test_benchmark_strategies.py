@@ -58,6 +58,13 @@ def test_without_sparsities_those_are_taken_that_the_steps_allow(arguments: list
     assert {point["series"] for point in json.loads(alone.stdout)["comparison"]["points"]} == {"this artifact"}
 
 
+def test_plans_are_not_written_over_what_takes_part(arguments: list[str]) -> None:
+    result = CliRunner().invoke(main, [*arguments, "--into", arguments[0]])
+    assert result.exit_code == 2
+    assert "takes part" in result.stderr
+    assert load_artifact(Path(arguments[0])).path.is_dir()
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [

@@ -118,3 +118,13 @@ def test_they_drive_beside_plans(directory: Path) -> None:
 def test_a_loop_that_draws_noise_is_refused(compiled_layer: Path) -> None:
     with pytest.raises(ttscompile.errors.TtscompileError, match="--sampler ddim"):
         whole_calls.Falcon(compiled_layer, "dense", 0.1)
+
+
+@pytest.mark.parametrize("words", [["--falcon", "0.1:0"], ["--falcon", "x"], ["--look", "0"], ["--look", "0.5"]])
+def test_rules_that_mean_nothing_are_refused(words: list[str]) -> None:
+    assert CliRunner().invoke(whole_calls.main, ["DIR", *words]).exit_code == 2
+
+
+def test_more_steps_than_the_loop_has_cannot_be_left(directory: Path) -> None:
+    with pytest.raises(ttscompile.errors.TtscompileError, match="has 4 steps; 5 cannot"):
+        whole_calls.Falcon(directory, "full", 0.1, 5)

@@ -106,7 +106,7 @@ def test_there_are_none_where_the_instruction_holds_the_state(tmp_path: Path, ki
 def test_convert_says_that_there_are_none(tmp_path: Path) -> None:
     said: dict[str, tuple[str, ...]] = {}
     ttscompile.convert(pis.save("pi05", tmp_path / "policy"), tmp_path / "compiled", explain=said.__setitem__)
-    assert said["files_beside"] == ("none for LeRobot: none of its steps makes the tokens that this policy reads",)
+    assert said["files_beside"] == ("none: no step of its program makes the tokens that this policy reads",)
     assert not {path.name for path in (tmp_path / "compiled").iterdir()} & set(BESIDE)
 
 

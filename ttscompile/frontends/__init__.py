@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ..core.paths import require_free_or_path
 from ..core.spec import PolicySpec
 from ..errors import CheckpointError
-from .families import AS_SAVED, LoadOptions, family_of, find_family
+from .families import AS_SAVED, LoadOptions, find_family, function_of
 
 if TYPE_CHECKING:
     from torch import nn
@@ -46,5 +46,5 @@ def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, by
 
     None where it never can; empty where it cannot take this one.
     """
-    own = family_of(spec, "files_beside")
+    own = function_of(spec, "files_beside")
     return None if own is None else own(Path(path), spec)

@@ -1,4 +1,4 @@
-"""What of a checkpoint goes wrong on a robot without an error: cameras, statistics, chunk; a family may say more."""
+"""What of a checkpoint goes wrong on a robot without an error: cameras, chunk, and statistics if no family looks."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ import torch
 
 from ..core.finding import Finding, Level
 from ..core.spec import PolicySpec
-from .families import family_of
+from .families import function_of
 
 PART, ACTION = "checkpoint", "action"
 REPEAT = "Compute the statistics again on the data that the policy was trained with, and save it with them."
@@ -27,7 +27,7 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
         Finding(PART, "other inputs", ", ".join(others) or "none"),
         Finding.judged(PART, ACTION, chunk, executed == 1 < spec.sample[0], "Raise n_action_steps: it calls at each."),
     ]
-    own = family_of(spec, "examine")
+    own = function_of(spec, "examine")
     if own is not None:
         return [*found, *own(path, spec, encoders)]
     affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}

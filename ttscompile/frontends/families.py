@@ -74,9 +74,10 @@ class Family:
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
         module: of ``policies``; imported when one of its functions is called, with torch. ``load(path, options)`` gives
-            network and ``PolicySpec``, or a CheckpointError or SpecError. If it has them, ``examine(path, spec,
-            encoders)`` gives what goes wrong without an error, and ``files_beside(path, spec)`` the files by which the
-            program that trained a policy takes the compiled one in its place: none where it cannot.
+            network and ``PolicySpec``, or a CheckpointError or SpecError. It may have two more. ``examine(path, spec,
+            encoders)`` says what goes wrong without an error, in place of the look at normalisers.
+            ``files_beside(path, spec)`` gives the files by which the program that trained a policy takes the compiled
+            one in its place; none where it cannot take this one.
         options: names of ``LoadOptions`` that it takes; the others are refused.
     """
 
@@ -103,7 +104,7 @@ class Family:
         return self.function("load")(path, options)  # type: ignore[no-any-return]
 
 
-def family_of(spec: PolicySpec, name: str) -> Callable[..., Any] | None:
+def function_of(spec: PolicySpec, name: str) -> Callable[..., Any] | None:
     """A function of the family that a policy is of; None where that has none, or no checkpoint was read."""
     row = next((each for each in FAMILIES if each.name == spec.source.get("format")), None)
     return None if row is None else row.function(name)

@@ -71,7 +71,7 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
     exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.distance <= ROUNDING)
-    parts = [*title.splitlines(), *([f"not drawn, with no distance: {exact}"] if exact else [])]
+    parts = [*title.splitlines(), *([f"not drawn, at no distance but rounding: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]
     axes.set_title("\n".join(lines), fontsize=8, loc="left")
     with_grid(axes)

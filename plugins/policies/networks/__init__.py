@@ -1,1 +1,1 @@
-"""Networks and their parts, as their authors compute them, under the names of their weights; nothing is read here."""
+"""Networks and their parts, as their authors compute them, under the names of their weights."""
