@@ -1,7 +1,7 @@
 """What do rules gain that decide about whole calls: where one begins, whether there is one, and what it looks at?
 
     ttscompile convert examples/pusht/pusht_dpt_ema_fp16.ckpt -o DIR --sampler ddim --steps 16
-    python examples/evaluation/whole_calls.py DIR --falcon 0.02:8,0.02:4 --light 2,4 --environment pusht --episodes 96
+    python examples/evaluation/whole_calls.py DIR --falcon 0.3:8,0.1:8 --light 4,8 --environment pusht --episodes 32
 
 All drive the same loop on paired episodes, and plans of DIR beside them. What counts is how many evaluations of the
 network a call takes on average: a rule that leaves some out has to beat a plan with as few.
@@ -24,8 +24,8 @@ pictures of the call before, whose features are known, and the state of now.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -185,39 +185,33 @@ class Light:
         steps: evaluations of one of its calls.
         fast: how far an action is from the one before, or, where actions are displacements, from 0.
         displacements: whether they are.
-        most: calls in a row that are left out.
     """
 
-    def __init__(self, variant: Variant, steps: int, fast: float, displacements: bool, most: int = 1) -> None:
-        self._variant, self._steps, self._fast, self._most = variant, steps, fast, most
-        self._displacements, self.info, self.count = displacements, variant.policy.info, Count()
-        self._past: list[FloatArray] = []
+    def __init__(self, variant: Variant, steps: int, fast: float, displacements: bool) -> None:
+        self._variant, self._steps, self._fast, self._displacements = variant, steps, fast, displacements
+        self.info, self.count = variant.policy.info, Count()
+        self.reset()
 
     def reset(self) -> None:
         """A new episode."""
         self._variant.policy.reset()
-        self._past = []
+        self._past: dict[int, FloatArray] = {}  # by stream
+        self._left_out: set[int] = set()  # the streams whose last call was
 
     def predict_action(
         self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: object = None
     ) -> Mapping[str, Any]:
         """One call. All streams are answered by the policy, but only those that are not left out are counted."""
-        made = np.asarray(self._variant.policy.predict_action(obs_dict, noise=noise, plan=self._variant.plan)["action"])
-        if not self._past:
-            self._past, self._left = [made[i] for i in range(len(made))], [0] * len(made)
-            self.count = replace(
-                self.count, calls=self.count.calls + len(made), steps=self.count.steps + self._steps * len(made)
-            )
-            return {"action": made}
-        actions = made.copy()
-        for i, past in enumerate(self._past):
-            easy = self._left[i] < self._most and _speed(past, self._displacements) > self._fast
-            self._left[i] = self._left[i] + 1 if easy else 0
-            if easy:
-                actions[i] = extrapolated(past[-MEMORY:], len(made[i]))
-            self._past[i] = np.concatenate([past, actions[i]])[-MEMORY:]
-            self.count.calls += 1
-            self.count.steps += 0 if easy else self._steps
+        made = self._variant.policy.predict_action(obs_dict, noise=noise, plan=self._variant.plan)["action"]
+        actions = np.array(made)
+        known = {i: past for i, past in self._past.items() if i not in self._left_out}
+        self._left_out = {i for i, past in known.items() if _speed(past, self._displacements) > self._fast}
+        for i in range(len(actions)):
+            if i in self._left_out:
+                actions[i] = extrapolated(self._past[i], len(actions[i]))
+            self._past[i] = np.concatenate([self._past.get(i, actions[i][:0]), actions[i]])[-MEMORY:]
+        self.count.calls += len(actions)
+        self.count.steps += self._steps * (len(actions) - len(self._left_out))
         return {"action": actions}
 
 
@@ -278,39 +272,39 @@ class Row:
         return [self.label, f"{self.steps:.1f}", f"{self.checks:.1f}", str(own.score), str(own.success), *differences]
 
 
-def _thresholds(_: click.Context, __: click.Parameter, value: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(word) for word in value.split(",") if word.strip())
-    except ValueError as error:
-        raise click.BadParameter(f"{error}; expected numbers, such as 0.02,0.05.") from error
+def _several(read: Callable[[str], Any], example: str) -> Callable[..., tuple[Any, ...]]:
+    """The callback of an option with commas between its values."""
+
+    def parsed(_: click.Context, __: click.Parameter, value: str) -> tuple[Any, ...]:
+        try:
+            return tuple(read(word) for word in value.split(",") if word.strip())
+        except ValueError as error:
+            raise click.BadParameter(f"{error}; expected such as {example}.") from error
+
+    return parsed
 
 
-def _beginnings(_: click.Context, __: click.Parameter, value: str) -> tuple[tuple[float, int], ...]:
-    try:
-        pairs = [word.partition(":") for word in value.split(",") if word.strip()]
-        found = tuple((float(threshold), int(least or 1)) for threshold, _, least in pairs)
-    except ValueError as error:
-        raise click.BadParameter(f"{error}; expected thresholds and least steps, such as 0.02:8.") from error
-    if any(least < 1 for _, least in found):
-        raise click.BadParameter("a call has one step at least.")
-    return found
+def _count(word: str) -> int:
+    if (count := int(word)) < 1:
+        raise ValueError(f"{count} is below 1")
+    return count
 
 
-def _looks(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ...]:
-    try:
-        found = tuple(int(word) for word in value.split(",") if word.strip())
-    except ValueError as error:
-        raise click.BadParameter(f"{error}; expected numbers of calls, such as 2,3.") from error
-    if any(each < 1 for each in found):
-        raise click.BadParameter("expected numbers of at least 1.")
-    return found
+def _beginning(word: str) -> tuple[float, int]:
+    threshold, _, least = word.partition(":")
+    return float(threshold), _count(least or "1")
 
 
 @click.command()
 @click.argument("variants", nargs=-1, required=True, metavar="DIR [DIR:PLAN...]")
-@click.option("--falcon", default="", callback=_beginnings, help="Begin where chunks differ by less; at least N steps.")
-@click.option("--light", default="", callback=_thresholds, help="Leave out calls after faster actions.")
-@click.option("--look", default="", callback=_looks, help="Look at the first of so many calls.")
+@click.option(
+    "--falcon",
+    default="",
+    callback=_several(_beginning, "0.02:8"),
+    help="Begin where chunks differ by less; at least N steps.",
+)
+@click.option("--light", default="", callback=_several(float, "4,8"), help="Leave out calls after faster actions.")
+@click.option("--look", default="", callback=_several(_count, "2,3"), help="Look at the first of so many calls.")
 @click.option("--displacements", is_flag=True, help="Actions say how far to move.")
 @environment_option
 @click.option("--episodes", default=96, show_default=True, type=click.IntRange(1))

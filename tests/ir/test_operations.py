@@ -25,6 +25,7 @@ from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, TensorType
 from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, axis_after, operation, permutation
 from ttscompile.lower.program import lower_graph
+from ttscompile.lower.promotion import may_promote
 
 
 def of(name: str | Node) -> Callable[[str], str]:
@@ -39,8 +40,13 @@ UNLOWERED = """
 """.split()
 """What torch's exporter has no ONNX form for: it can stand only in what is computed at compile time."""
 
-LOWERED = [name for name in OPERATIONS if name not in UNLOWERED]
-CHUNKS = [LOWERED[i : i + 50] for i in range(0, len(LOWERED), 50)]
+PROMOTED = """
+    float_power arange any all argsort bucketize index_put index_add index_fill scatter scatter_add count_nonzero
+""".split()
+"""In whose examples types may be promoted: torch's exporter looks through them once more (``lower.promotion``)."""
+
+LOWERED = [name for name in OPERATIONS if name not in (*UNLOWERED, *PROMOTED)]
+CHUNKS = [*(LOWERED[i : i + 50] for i in range(0, len(LOWERED), 50)), PROMOTED]
 
 
 class Uses(nn.Module):
@@ -99,6 +105,7 @@ def test_every_row_is_exercised_and_has_the_types_of_meta_tensors(names: list[st
 @pytest.mark.parametrize("names", first_quick(CHUNKS), ids=lambda names: f"{names[0]} to {names[-1]}")
 def test_a_row_with_an_onnx_form_computes_the_same_in_onnxruntime(names: list[str]) -> None:
     graph, weights, numbers = _captured(tuple(names))
+    assert may_promote(graph) == (names == PROMOTED)
     inputs = values(dict(graph.inputs), 3)
     (expected,) = evaluate(graph, weights, inputs)
     (found,) = run(lower_graph(graph, "examples"), weights, inputs)
