@@ -1,7 +1,7 @@
 """Where torch would promote types: where it computes with another type than it is given.
 
-To find that out its exporter evaluates every operation once more, which takes two fifths of an export. The types of our
-graphs are known. So the usual places are written out, and the exporter looks for others only where there may be some.
+To find that out its exporter evaluates every operation once more. The types of our graphs are known, so the usual
+places are written out, and the exporter looks for others only where there may be some.
 """
 
 from collections.abc import Mapping
