@@ -67,7 +67,7 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.collect()
         gc.freeze()
         gc.enable()
-        gc.set_threshold(700, 10, 100)
+        gc.set_threshold(50_000, 20, 100)
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:

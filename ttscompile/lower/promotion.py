@@ -58,7 +58,7 @@ def _may_promote(node: Node, types: Types) -> bool:
         given.remove("bool")
     if made == "bool" and _elementwise(node) and given:  # a comparison
         made = given[0]
-    fractions = made != "float32" and any(isinstance(each, float) for each in node.leaves())
+    fractions = not made.startswith("float") and any(isinstance(each, float) for each in node.leaves())
     return fractions or not {*given} <= {made}
 
 
