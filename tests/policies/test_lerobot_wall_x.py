@@ -16,38 +16,33 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise
 from ttscompile.core.tokenizer import Tokenizer
-from ttscompile.errors import CheckpointError, ObservationError
+from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.examined import examine
-from ttscompile.frontends.families import AS_SAVED, LoadOptions
+from ttscompile.frontends.families import LoadOptions
 from ttscompile.policies.lerobot.resized_bytes import resized
 
-from ..families.support import record
-from . import originals, wall_xs
+from . import wall_xs
 from .lerobot_tiny import change_json
-from .vlas import MASK, STATE, TOKENS, Array
-from .whole_vlas import assert_a_task_alone_makes_files_of_lerobot, assert_agreement_on_random_plans, eager_chunk
+from .vlas import STATE, Array
+from .whole_vlas import WALL_X, Refusals, assert_refused, refusals
 
 EMBEDDING, HEAD = "model.model.embed_tokens.weight", "model.lm_head.weight"
 TOKENIZER = wall_xs.SAVED / "flow" / wall_xs.BASE
-CLOSE = 6e-5
-"""Of actions up to 7; rounding alone makes half of it."""
 
 
 @pytest.fixture(scope="module")
 def golden() -> Mapping[str, Array]:
-    return originals.golden("lerobot_wall_x")
+    return WALL_X.golden()
+
+
+@pytest.fixture(scope="module")
+def compiled(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return WALL_X.compiled(once, tmp_path_factory.mktemp("saved"))[0]
 
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
     return wall_xs.save("flow", tmp_path)
-
-
-def eager(directory: Path, kind: str, call: int, options: LoadOptions = AS_SAVED) -> Array:
-    """The whole chunk of the rebuilt network, not compiled."""
-    told = directory.parent / wall_xs.BASE, wall_xs.TASKS[call]
-    return eager_chunk(directory, options, wall_xs.observation(kind, call), wall_xs.noise(kind), *told)[1]
 
 
 def change_base(directory: Path, **changes: Any) -> None:
@@ -60,27 +55,6 @@ def change_weights(directory: Path, **changes: torch.Tensor | None) -> None:
     weights = {**load_file(path), **changes}
     path.unlink()  # it is mapped
     save_file({name: value for name, value in weights.items() if value is not None}, path)
-
-
-@pytest.mark.parametrize("kind", wall_xs.KINDS)
-@pytest.mark.parametrize("compiled_in", [False, True])
-def test_the_rebuilt_network_gives_lerobots_actions(
-    tmp_path: Path, kind: str, compiled_in: bool, golden: Mapping[str, Array]
-) -> None:
-    """Two instructions, states and sets of image sizes; and a policy without one of the cameras."""
-    for call in (0, 1):
-        directory = wall_xs.save(kind, tmp_path / str(call), call)
-        options = LoadOptions(task=wall_xs.TASKS[call] if compiled_in else None)
-        found = eager(directory, kind, call, options)
-        assert found.shape == golden[f"{kind}.{call}"].shape
-        assert np.abs(found - golden[f"{kind}.{call}"]).max() < CLOSE
-        assert np.abs(found - golden[f"{kind}.{1 - call}"]).max() > 0.01
-    directory = wall_xs.save(kind, tmp_path / "missing")
-    absent = wall_xs.CAMERAS[kind][wall_xs.MISSING[kind]]
-    without = LoadOptions(task=wall_xs.TASKS[0] if compiled_in else None, without_cameras=(absent,))
-    found = eager(directory, kind, 0, without)
-    assert np.abs(found - golden[f"{kind}.missing"]).max() < CLOSE
-    assert np.abs(found - golden[f"{kind}.0"]).max() > 0.01
 
 
 @pytest.mark.parametrize(
@@ -97,51 +71,6 @@ def test_bytes_are_resized_as_on_a_graphics_card(sizes: tuple[tuple[int, int], t
     assert (found - floats).abs().max() < 0.5003
     halves = torch.tensor([10.0, 10.0, 11.0, 11.0]).expand(4, 4)
     assert resized((4, 4), (4, 3), "card")(halves).tolist() == [[10, 11, 11]] * 4
-
-
-@pytest.fixture(scope="module")
-def compiled(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wall_x")
-    artifact, program = once.compiled("whole wall_x", lambda to: ttscompile.convert(wall_xs.save("flow", folder), to))
-    told = "actions that lerobot 0.6.1 gave, raw observation to action, 1e-4"
-    record("LeRobot wall_x", told, "euler 10", program)
-    return artifact
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
-def test_what_is_compiled_gives_them_too(compiled: Path, golden: Mapping[str, Array], runtime: str) -> None:
-    """The text of the task is an observation, whose tokens the policy makes."""
-    policy, cameras = ttscompile.load(compiled, runtime=runtime, tokenizer=TOKENIZER), wall_xs.CAMERAS["flow"]
-    assert set(policy.info.observation) == {STATE, *cameras, TOKENS, MASK}
-    given = {key: value[None] for key, value in wall_xs.observation("flow", 0).items()}
-    found = policy.predict_action_chunk(
-        given | {"task": wall_xs.TASKS[0]}, noise=Noise(wall_xs.noise("flow")), plan="dense"
-    )
-    assert found.shape == (1, 4, wall_xs.ACTION_DIM["flow"])
-    assert np.abs(found - golden["flow.0"][:, :4]).max() < 1e-4
-    with pytest.raises(ObservationError, match=r"has 81 tokens, and the policy reads 80\. Use fewer words"):
-        policy.predict_action_chunk(given | {"task": "x" * 65})
-    with pytest.raises(ObservationError, match=r"'to <point>3, 4</point>' holds <point>, no text to this"):
-        policy.predict_action_chunk(given | {"task": "to <point>3, 4</point>"})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("runtime", ["onnxruntime", "torch"])
-def test_runtimes_agree_on_random_plans(compiled: Path, runtime: str) -> None:
-    assert_agreement_on_random_plans(compiled, runtime)
-
-
-@pytest.mark.slow
-@pytest.mark.soak
-def test_in_eight_bits_its_actions_are_near(tmp_path: Path, golden: Mapping[str, Array]) -> None:
-    ttscompile.convert(wall_xs.save("flow", tmp_path / "saved"), tmp_path / "compiled", precision="int8")
-    policy = ttscompile.load(tmp_path / "compiled", tokenizer=TOKENIZER)
-    assert (policy.info.default_plan, policy.info.precision) == ("full", "int8")
-    given = {key: value[None] for key, value in wall_xs.observation("flow", 0).items()}
-    found = policy.predict_action_chunk(given | {"task": wall_xs.TASKS[0]}, noise=Noise(wall_xs.noise("flow")))
-    assert 1e-4 < np.abs(found - golden["flow.0"][:, :4]).max() < 1
-    assert ttscompile.verify(tmp_path / "compiled", calls=1).passed
 
 
 @pytest.mark.slow
@@ -167,17 +96,14 @@ def test_attention_that_reads_the_prompt_reads_the_actions_too(compiled: Path) -
         assert len(names) == count, names
 
 
-@pytest.mark.slow
-def test_every_rung_of_verify_holds(compiled: Path) -> None:
-    assert ttscompile.verify(compiled, calls=1).passed
-
-
 def test_an_instruction_is_a_sentence(directory: Path) -> None:
     """One that is none becomes one; what is around it in its lines is part of the observation."""
     told, tokenizer = load_checkpoint_policy(directory)[1].instruction, Tokenizer(TOKENIZER, CheckpointError)
     assert told is not None
     lines = [told.line(text) for text in ("go", "go.", "go!", "")]
     assert lines == [f"\nInstruction: {each}\n" for each in ("go.", "go.", "go!.", ".")]
+    with pytest.raises(CheckpointError, match=r"'to <point>3, 4</point>' holds <point>, no text to this"):
+        tokenizer.of_task("to <point>3, 4</point>", told, 80)
     for text in ("see <|image_pad|>", "<|action|>"):
         with pytest.raises(CheckpointError, match=r"holds <\|, no text to this policy"):
             tokenizer.of_task(text, told, 80)
@@ -193,26 +119,26 @@ def test_one_feed_forward_layer_for_all_is_what_equal_experts_do(directory: Path
     second = {name: None for name in saved if ".experts.1." in name}
     change_json(path, experts=[experts[0], experts[0]])
     change_weights(directory, **second | {name.replace("experts.0", "experts.1"): first[name] for name in first})
-    expected = eager(directory, "flow", 0)
+    expected = WALL_X.eager(directory, "flow", 0)
     change_json(path, mlp_moe=False)
     dense = {name.replace("moe.experts.0", "mlp"): value for name, value in first.items()}
     none = {name: None for name in saved if ".experts." in name}
     change_weights(directory, **none, **dense)
-    np.testing.assert_allclose(eager(directory, "flow", 0), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(WALL_X.eager(directory, "flow", 0), expected, rtol=0, atol=1e-6)
 
 
 def test_the_statistics_say_how_wide_the_state_is(directory: Path, golden: Mapping[str, Array]) -> None:
     """A policy that was trained from another has that one's width in its configuration."""
     features = json.loads((directory / "config.json").read_text())["input_features"]
     change_json(directory / "config.json", input_features=features | {STATE: {"type": "STATE", "shape": [6]}})
-    assert np.abs(eager(directory, "flow", 0) - golden["flow.0"]).max() < CLOSE
+    assert np.abs(WALL_X.eager(directory, "flow", 0) - golden["flow.0"]).max() < WALL_X.close
 
 
 def test_tied_embeddings_are_one(tmp_path: Path, golden: Mapping[str, Array]) -> None:
     directory = wall_xs.save("nested", tmp_path)
     head = load_file(directory / "model.safetensors")[HEAD]
     change_weights(directory, **{EMBEDDING: head.clone()})
-    assert np.abs(eager(directory, "nested", 0) - golden["nested.0"]).max() < CLOSE
+    assert np.abs(WALL_X.eager(directory, "nested", 0) - golden["nested.0"]).max() < WALL_X.close
     change_weights(directory, **{EMBEDDING: head + 1})
     with pytest.raises(CheckpointError, match="lm_head.weight and model.embed_tokens.weight, which differ"):
         load_checkpoint_policy(directory)
@@ -228,24 +154,14 @@ def test_sizes_of_images_may_have_their_older_names(tmp_path: Path, golden: Mapp
     path = directory.parent / wall_xs.BASE / "processor_config.json"
     own = json.loads(path.read_text())["image_processor"]
     change_json(path, image_processor=own | {"size": None, "min_pixels": 3136, "max_pixels": 40_000})
-    assert np.abs(eager(directory, "nested", 0) - golden["nested.0"]).max() < CLOSE
+    assert np.abs(WALL_X.eager(directory, "nested", 0) - golden["nested.0"]).max() < WALL_X.close
     change_json(path, image_processor=own | {"size": None})
-    assert np.abs(eager(directory, "nested", 0) - golden["nested.0"]).max() > 0.01
+    assert np.abs(WALL_X.eager(directory, "nested", 0) - golden["nested.0"]).max() > 0.01
 
 
-def test_lerobots_commands_take_it_with_its_task_alone(directory: Path) -> None:
-    assert_a_task_alone_makes_files_of_lerobot(directory, wall_xs.CAMERAS["flow"])
-
-
-def test_doctor_knows_statistics_and_tokenizer(directory: Path) -> None:
-    found = {one.what: one for one in examine(directory, load_checkpoint_policy(directory)[1])}
-    assert "266 tokens; 266 are known" in found["tokenizer"].found
-    assert "5 numbers" in found["normaliser of action"].found
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+EXPERT = {"hidden_size": 32, "intermediate_size": 44, "hidden_act": "silu"}
+REFUSED: Refusals = {
+    "config.json": [
         ({"prediction_mode": "fast"}, "prediction_mode is 'fast'; expected diffusion"),
         ({"max_action_dim": 4}, "max_action_dim is 4; expected at least the 5 numbers"),
         ({"max_action_dim": 8}, r"has shape .*; expected .*8, 32\)|expected \(32, 16\)"),
@@ -253,38 +169,12 @@ def test_doctor_knows_statistics_and_tokenizer(directory: Path) -> None:
         ({"max_state_dim": 8}, r"propri_proj.weight has shape \(32, 12\); expected"),
         ({"n_action_steps": 7}, "n_action_steps is 7; expected chunk_size = 6 at most"),
         ({"chunk_size": 500}, "has 8.. tokens, 126 of images and 500 of actions among them; expected 768 at most"),
-        ({"pretrained_name_or_path": "x-square-robot/other"}, "the language model 'x-square-robot/other' is not on"),
     ],
-)
-def test_what_is_not_rebuilt_is_named(directory: Path, changes: dict[str, Any], message: str) -> None:
-    if "pretrained_name_or_path" in changes:
-        change_base(directory, model_type="other")
-    change_json(directory / "config.json", **changes)
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(directory)
-
-
-def test_an_image_that_lerobot_does_not_take_is_named(directory: Path) -> None:
-    key = wall_xs.CAMERAS["flow"][1]
-    features = json.loads((directory / "config.json").read_text())["input_features"]
-    change_json(directory / "config.json", input_features=features | {key: {"type": "VISUAL", "shape": [3, 9, 2000]}})
-    with pytest.raises(CheckpointError, match="wrist have 9 x 2000 pixels, of which lerobot makes 1 x 256; exp"):
-        load_checkpoint_policy(directory)
-
-
-EXPERT = {"hidden_size": 32, "intermediate_size": 44, "hidden_act": "silu"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+    "../wall-oss-tiny/config.json": [
         ({"use_sliding_window": True}, "use_sliding_window is True; expected false"),
         ({"use_lora": True}, "use_lora is True; expected false"),
         ({"head_dim": 16}, "head_dim is 16; expected 8"),
-        (
-            {"num_attention_heads": 5},
-            "hidden_size is 32; expected a multiple of num_attention_heads, 5, and 4 at least",
-        ),
+        ({"num_attention_heads": 5}, "hidden_size is 32; expected a multiple of num_attention_heads, 5, and 4"),
         ({"hidden_size": 2, "num_attention_heads": 1}, "hidden_size is 2; expected .* 4 at least"),
         ({"hidden_act": "gelu"}, "hidden_act is 'gelu'; expected silu"),
         ({"num_hidden_layers": 2}, "unexpected .*experts.2."),
@@ -302,16 +192,7 @@ EXPERT = {"hidden_size": 32, "intermediate_size": 44, "hidden_act": "silu"}
         ({"vision_start_token_id": 5}, r"expected 5 \(vision_start_token_id\) and 261 \(image_token_id\)"),
         ({"vision_config": None}, "vision_config is None; expected its entries"),
     ],
-)
-def test_a_base_that_is_not_rebuilt_is_named(directory: Path, changes: dict[str, Any], message: str) -> None:
-    change_base(directory, **changes)
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(directory)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+    "../wall-oss-tiny/preprocessor_config.json": [
         ({"do_resize": False}, "do_resize is False; expected true"),
         ({"resample": 2}, "resample is 2; expected 3"),
         ({"merge_size": 1}, "merge_size is 1; expected 2"),
@@ -320,10 +201,19 @@ def test_a_base_that_is_not_rebuilt_is_named(directory: Path, changes: dict[str,
         ({"image_std": [0.5, 0.5, 0]}, "image_std is .*; expected three numbers from 1e-06 to 1"),
         ({"min_pixels": 0}, "shortest_edge is 0; expected a positive whole number"),
     ],
-)
-def test_images_that_reach_the_backbone_otherwise(directory: Path, changes: dict[str, Any], message: str) -> None:
-    change_json(directory.parent / wall_xs.BASE / "preprocessor_config.json", **changes)
-    with pytest.raises(CheckpointError, match=message):
+}
+
+
+@pytest.mark.parametrize(("place", "changes", "message"), refusals(REFUSED))
+def test_what_is_not_rebuilt_is_named(directory: Path, place: str, changes: dict[str, Any], message: str) -> None:
+    assert_refused(directory, place, changes, message)
+
+
+def test_an_image_that_lerobot_does_not_take_is_named(directory: Path) -> None:
+    key = wall_xs.CAMERAS["flow"][1]
+    features = json.loads((directory / "config.json").read_text())["input_features"]
+    change_json(directory / "config.json", input_features=features | {key: {"type": "VISUAL", "shape": [3, 9, 2000]}})
+    with pytest.raises(CheckpointError, match="wrist have 9 x 2000 pixels, of which lerobot makes 1 x 256; exp"):
         load_checkpoint_policy(directory)
 
 
