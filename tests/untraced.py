@@ -23,11 +23,18 @@ def untraced() -> Iterator[None]:
         threading.settrace(tracers[1])
 
 
+_measured = set[str]()
+"""Tests of which a case was measured."""
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Coverage is that of the quick tests: measuring all of them would cost a quarter more time.
+    """Coverage is that of the first case of each quick test: measuring all of them would cost a quarter more time.
 
     ``no_cover`` of pytest-cov says this, too, but does nothing in the processes of pytest-xdist.
     """
-    with untraced() if item.get_closest_marker("slow") else nullcontext():
+    test = item.nodeid.partition("[")[0]
+    left_out = item.get_closest_marker("slow") is not None or test in _measured
+    _measured.add(test)
+    with untraced() if left_out else nullcontext():
         return (yield)

@@ -111,9 +111,8 @@ class Tokenizer:
     def with_words(self, words: Sequence[str]) -> list[int]:
         """The token of each of these words; those that are none yet become one, as transformers adds them."""
         known = self._tokenizer
-        for word in words:
-            if known.token_to_id(word) is None:
-                known.add_special_tokens([word])
+        missing = dict.fromkeys(word for word in words if known.token_to_id(word) is None)
+        known.add_special_tokens(list(missing))  # at once: it reads all of them again each time
         return [known.token_to_id(word) for word in words]
 
     def __call__(self, text: str, most: int | None = None) -> list[int]:
