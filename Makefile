@@ -49,8 +49,8 @@ types: $(READY)
 	mv $(TYPED)/examples/policies/*.py $(TYPED)/recipes
 	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 
-# On all cores, each with a file at a time; then, one by one, what takes times. The tests of make quick are measured on
-# the way: what share of the core's lines they run.
+# On all cores, each with a file at a time; then, one by one, what takes times. The first case of each test of make
+# quick is measured on the way: what share of the core's lines they run.
 TOGETHER := -n logical --dist loadfile --benchmark-disable
 pytest: together
 	$(MAKE) alone

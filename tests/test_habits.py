@@ -71,12 +71,15 @@ def test_coverage_is_told_by_room_and_the_worst_comes_first() -> None:
 
 
 @pytest.mark.slow
-def test_slow_tests_are_not_measured(tmp_path: Path) -> None:
+def test_the_first_case_of_each_quick_test_is_measured(tmp_path: Path) -> None:
     """With the hook of the tree's own conftest, in processes of its own, as ``make test`` has them."""
     assert conftest.pytest_runtest_protocol is untraced.pytest_runtest_protocol
-    (tmp_path / "measured.py").write_text("def quick():\n    return 1\n\n\ndef slow():\n    return 2\n")
+    (tmp_path / "measured.py").write_text(
+        "def quick(first):\n    if first:\n        return 1\n    return 0\n\n\ndef slow():\n    return 2\n"
+    )
     (tmp_path / "test_it.py").write_text(
-        "import pytest, measured\n\n\ndef test_a():\n    assert measured.quick() == 1\n\n\n"
+        "import pytest, measured\n\n\n"
+        "@pytest.mark.parametrize('first', [1, 0])\ndef test_a(first):\n    assert measured.quick(first) == first\n\n\n"
         "@pytest.mark.slow\ndef test_b():\n    assert measured.slow() == 2\n"
     )
     words = ["-m", "pytest", "-q", "-n", "1", "-p", "tests.untraced", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml"]
@@ -93,4 +96,4 @@ def test_slow_tests_are_not_measured(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)})
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = [line for line in done.stdout.splitlines() if line.startswith("measured.py")]
-    assert row.split()[-1] == "6", "the body of slow() alone was not seen to run"
+    assert "".join(row.split("%")[1].split()) == "4,8", "what the second case and slow() run is not seen"
