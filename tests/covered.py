@@ -1,4 +1,4 @@
-"""What share of the core's lines quick tests run, the first case of each; a row a room. ``make test`` ends with this table.
+"""What share of the core's lines the first cases of quick tests run, a row a room. ``make test`` ends with this table.
 
     python tests/covered.py
 

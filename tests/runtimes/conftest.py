@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from tests.once import Once
+from tests.plans import store_schedules
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.ir.program import Program
 
@@ -14,20 +17,48 @@ from .toys import pencil_program, toy_program, written_artifact
 MakeArtifact = Callable[[Program], Artifact]
 
 
-@pytest.fixture(scope="session")
-def toy_artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
-    return written_artifact(toy_program(), tmp_path_factory.mktemp("toy") / "artifact")
+class Failure(Exception):
+    """Raised by the tests."""
+
+
+@contextmanager
+def failing_prologue(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Every runtime fails where a call begins."""
+    from ttscompile.runtimes.onnxruntime.workspace import Workspace
+    from ttscompile.runtimes.reference.model import ReferenceModel
+    from ttscompile.runtimes.torch.network import StreamsNetwork
+
+    def fail(*_: object) -> None:
+        raise Failure
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Workspace, "start", fail)
+        patched.setattr(ReferenceModel, "prologue", fail)
+        patched.setattr(StreamsNetwork, "prologue", fail)
+        yield
 
 
 @pytest.fixture(scope="session")
-def pencil_artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
-    return written_artifact(pencil_program(), tmp_path_factory.mktemp("pencil") / "artifact")
+def toy_artifact(once: Once) -> Artifact:
+    return load_artifact(once.folder("toy", lambda directory: written_artifact(toy_program(), directory)))
+
+
+@pytest.fixture(scope="session")
+def pencil_artifact(once: Once) -> Artifact:
+    return load_artifact(once.folder("pencil", lambda directory: written_artifact(pencil_program(), directory)))
 
 
 @pytest.fixture
 def own_artifact(toy_artifact: Artifact, tmp_path: Path) -> Artifact:
     """A copy of the toy, for tests that change it."""
     return load_artifact(shutil.copytree(toy_artifact.path, tmp_path / "toy"))
+
+
+@pytest.fixture
+def pruned(own_artifact: Artifact) -> Artifact:
+    """A toy whose default plan is its pruner's, which has a thread and reads earlier calls."""
+    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+    return load_artifact(own_artifact.path)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Artifacts whose pruner wants other things of other observations."""
+"""Artifacts that are calibrated by chance: schedules, and pruners that want other things of other observations."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from tests.plans import store_schedules
-from ttscompile.artifact import load_artifact
+from ttscompile import Source
+from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.ir.program import Program
 
-from .plans import random_correction
+from .plans import random_correction, random_plan
 
 
 def random_pruner(program: Program, seed: int) -> dict[str, np.ndarray]:
@@ -30,3 +31,14 @@ def calibrated(folder: Path, program: Program, corrected: bool = True) -> Path:
     schedules = {"evenly": uniform_plan(*shape, 2)}
     store_schedules(folder, random_pruner(program, 2), schedules, "pruner", {}, corrections=corrections)
     return folder
+
+
+def scheduled(made: Artifact) -> Artifact:
+    """With its pruner, and two schedules, of which one reads the rollout cache, and has a correction with jumps."""
+    manifest, rng = made.manifest, np.random.default_rng(3)
+    evenly = uniform_plan(manifest.steps, len(manifest.groups), 2)
+    mixed = random_plan(rng, manifest.steps, manifest.groups, np.ones_like(evenly, np.bool_))
+    assert (mixed == Source.ROLLOUT).any()
+    plans, corrections = {"evenly": evenly, "mixed": mixed}, {"mixed": random_correction(made, rng)}
+    store_schedules(made.path, dict(made.pruner), plans, "evenly", {}, corrections=corrections)
+    return load_artifact(made.path)

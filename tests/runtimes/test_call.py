@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from tests.plans import store_schedules
-from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.manifest import WeightsRecord
@@ -25,12 +24,10 @@ from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
-from ttscompile.runtimes.reference.model import ReferenceModel
-from ttscompile.runtimes.torch.network import StreamsNetwork
 
-from .agreement import call_terms, random_inputs
+from .agreement import assert_alike, random_inputs
 from .buffers import nbytes, rollout_nbytes
-from .conftest import MakeArtifact
+from .conftest import Failure, MakeArtifact, failing_prologue
 from .toys import toy_program
 
 HELPER = "ttscompile-pruner"
@@ -38,13 +35,6 @@ HELPER = "ttscompile-pruner"
 
 def helpers() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name.startswith(HELPER)]
-
-
-@pytest.fixture
-def pruned(own_artifact: Artifact) -> Artifact:
-    """A toy whose default plan is its pruner's."""
-    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
-    return load_artifact(own_artifact.path)
 
 
 def call(runtime: Runtime, artifact: Artifact, seed: int, plan: np.ndarray | None = None) -> np.ndarray:
@@ -99,10 +89,6 @@ def test_step_0_does_not_wait_for_the_pruner(pruned: Artifact, monkeypatch: pyte
     assert timings.total == pytest.approx(timings.prologue + timings.wait_pruner + timings.decode)
 
 
-class Failure(Exception):
-    """Raised by the tests."""
-
-
 @pytest.mark.parametrize("thread", ["helper", "caller"])
 def test_a_failure_on_either_thread_comes_to_the_caller_and_ends_the_episode(
     pruned: Artifact, monkeypatch: pytest.MonkeyPatch, thread: str
@@ -141,16 +127,8 @@ def test_a_prologue_that_fails_ends_the_episode(
     with pytest.raises(IllegalPlanError):
         call(runtime, toy_artifact, 0, dense[:, :4])
     call(runtime, toy_artifact, 0, reuse)  # what was refused before it began changed nothing
-
-    def fail(*_: object) -> None:
-        raise Failure
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Workspace, "start", fail)
-        patched.setattr(ReferenceModel, "prologue", fail)
-        patched.setattr(StreamsNetwork, "prologue", fail)
-        with pytest.raises((Failure, ArtifactError)) as caught:
-            call(runtime, toy_artifact, 0, dense)
+    with failing_prologue(monkeypatch), pytest.raises((Failure, ArtifactError)) as caught:
+        call(runtime, toy_artifact, 0, dense)
     assert isinstance(caught.value, Failure) or isinstance(caught.value.__cause__, Failure)
     assert runtime.streams is None
     with pytest.raises(IllegalPlanError, match="never computed"):
@@ -238,24 +216,20 @@ def test_a_first_call_with_a_schedule_binds_nothing(
 def test_single_blocks_are_opened_by_the_first_plan_that_needs_them(toy_artifact: Artifact) -> None:
     runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
     assert isinstance(runtime.backend, OnnxBackend)
-    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
-    runtime.predict(obs, noise, Plan(cells=uniform_plan(5, 5, 3)))
+    runtime.predict(*random_inputs(toy_artifact, np.random.default_rng(0), 1), Plan(cells=uniform_plan(5, 5, 3)))
     assert "block_00" not in runtime.backend.sessions
     runtime.reset()
     partial = uniform_plan(5, 5, 3)
     partial[4, 2] = Source.COMPUTE
-    found, expected = (each.predict(obs, noise, Plan(cells=partial))[0] for each in (runtime, other))
-    assert_equal_but_for_rounding(found, expected, call_terms(toy_artifact))
+    assert_alike(toy_artifact, (runtime, other), Plan(cells=partial), np.random.default_rng(0))
     assert "block_00" in runtime.backend.sessions
 
 
 def test_streams_that_compute_whole_steps_need_no_single_blocks(toy_artifact: Artifact) -> None:
     runtime, other = open_runtime(toy_artifact), open_runtime(toy_artifact, "reference")
     assert isinstance(runtime.backend, OnnxBackend)
-    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 3)
     plans = np.stack([uniform_plan(5, 5, n) for n in (1, 2, 3)])
-    found, expected = (each.predict(obs, noise, Plan(cells=plans))[0] for each in (runtime, other))
-    assert_equal_but_for_rounding(found, expected, call_terms(toy_artifact))
+    assert_alike(toy_artifact, (runtime, other), Plan(cells=plans), np.random.default_rng(0), 3)
     assert "block_00" not in runtime.backend.sessions
 
 

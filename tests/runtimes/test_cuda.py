@@ -17,19 +17,17 @@ import torch
 
 import ttscompile
 from tests.families import cameras
-from tests.plans import store_schedules
 from tests.rounding import FLOAT32, assert_equal_but_for_rounding, bound
 from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.core.lattice import Source, uniform_plan
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import DENSE, Plan
 from ttscompile.runtimes import Runtime, open_runtime
 from ttscompile.runtimes.random_calls import normalized, random_call
 from ttscompile.samplers.flow import flow_matching_table
 
-from .agreement import call_terms, largest_difference, random_inputs
+from .agreement import assert_alike, call_terms, largest_difference, random_inputs
 from .conftest import MakeArtifact
-from .plans import random_correction, random_plan
-from .pruners import calibrated as with_pruner
+from .pruners import calibrated as with_pruner, scheduled
 from .toys import toy_program, written_artifact
 
 DEVICE = "cuda"
@@ -55,15 +53,7 @@ def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict
 
 @pytest.fixture(scope="module")
 def artifact(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
-    """The toy with two schedules, one of which reads the rollout cache, and has a correction with jumps."""
-    made = written_artifact(toy_program(normed=True), tmp_path_factory.mktemp("cuda") / "artifact")
-    manifest, rng = made.manifest, np.random.default_rng(3)
-    evenly = uniform_plan(manifest.steps, len(manifest.groups), 2)
-    mixed = random_plan(rng, manifest.steps, manifest.groups, np.ones_like(evenly, np.bool_))
-    assert (mixed == Source.ROLLOUT).any()
-    plans, corrections = {"evenly": evenly, "mixed": mixed}, {"mixed": random_correction(made, rng)}
-    store_schedules(made.path, dict(made.pruner), plans, "evenly", {}, corrections=corrections)
-    return load_artifact(made.path)
+    return scheduled(written_artifact(toy_program(normed=True), tmp_path_factory.mktemp("cuda") / "artifact"))
 
 
 @pytest.mark.parametrize("name", ["evenly", "mixed", DENSE])
@@ -73,9 +63,7 @@ def test_a_call_is_replayed_on_other_inputs_and_batches(artifact: Artifact, name
         for runtime in runtimes:
             runtime.reset()
         for called in (DENSE, name, name, name):
-            obs, noise = random_inputs(artifact, rng, streams)
-            ours, theirs = (runtime.predict(obs, noise, artifact.plans[called])[0] for runtime in runtimes)
-            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+            assert_alike(artifact, runtimes, artifact.plans[called], rng, streams, times=2)
 
 
 def test_what_was_committed_is_kept(make_artifact: MakeArtifact) -> None:
@@ -84,10 +72,8 @@ def test_what_was_committed_is_kept(make_artifact: MakeArtifact) -> None:
     runtimes, rng = both(artifact), np.random.default_rng(0)
     sparse = Plan(cells=uniform_plan(8, 4, 3))
     for plan, length in ((artifact.plans[DENSE], 1), (sparse, 3), (artifact.plans[DENSE], 3)):
-        obs, noise = random_inputs(artifact, rng, 1)
         prefix = rng.standard_normal((1, length, artifact.manifest.spec.chunk.action_dim), dtype=np.float32)
-        ours, theirs = (runtime.predict(obs, noise, plan, prefix)[0] for runtime in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+        assert_alike(artifact, runtimes, plan, rng, times=2, prefix=prefix)
 
 
 def test_the_pruner_decides(tmp_path: Path) -> None:
@@ -167,9 +153,7 @@ def test_a_call_is_captured_while_another_thread_computes(artifact: Artifact) ->
     try:
         runtimes, rng = both(artifact), np.random.default_rng(0)
         for name in (DENSE, "evenly", "mixed", DENSE):
-            obs, noise = random_inputs(artifact, rng, 2)
-            ours, theirs = (runtime.predict(obs, noise, artifact.plans[name])[0] for runtime in runtimes)
-            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+            assert_alike(artifact, runtimes, artifact.plans[name], rng, 2, times=2)
     finally:
         stop.set()
         thread.join()
@@ -181,12 +165,8 @@ def test_a_policy_goes_and_another_comes(artifact: Artifact, make_artifact: Make
     other = make_artifact(toy_program(8, 4, normed=True))
     for one in (artifact, other, artifact, other):
         runtimes, rng = both(one), np.random.default_rng(0)
-        for name in (DENSE, DENSE, f"{DENSE}@bf16"):
-            obs, noise = random_inputs(one, rng, 2)
-            ours = runtimes[0].predict(obs, noise, one.plan(name))[0]
-            theirs = runtimes[1].predict(obs, noise, one.plan(DENSE))[0]
-            unit = 2.0**-8 if "@" in name else FLOAT32
-            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(one), unit=unit)
+        for name, unit in ((DENSE, FLOAT32), (DENSE, FLOAT32), (f"{DENSE}@bf16", 2.0**-8)):
+            assert_alike(one, runtimes, one.plan(name), rng, 2, times=2, unit=unit)
         del runtimes
         gc.collect()
 
@@ -196,10 +176,8 @@ def test_what_comes_again_is_replayed(artifact: Artifact) -> None:
     runtimes, rng = both(artifact), np.random.default_rng(0)
     matrix = Plan(cells=uniform_plan(artifact.manifest.steps, len(artifact.manifest.groups), 3))
     for _ in range(4):
-        obs, noise = random_inputs(artifact, rng, 1)
         for plan, unit in ((matrix, FLOAT32), (artifact.plan("evenly@bf16"), 2.0**-8)):
-            ours, theirs = runtimes[0].predict(obs, noise, plan)[0], runtimes[1].predict(obs, noise, plan.exact)[0]
-            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact), unit=unit)
+            assert_alike(artifact, runtimes, plan, rng, times=2, unit=unit)
 
 
 def test_scratch_memory_that_somebody_frees_is_not_the_graphs(artifact: Artifact) -> None:
@@ -212,7 +190,5 @@ def test_scratch_memory_that_somebody_frees_is_not_the_graphs(artifact: Artifact
             torch._C._cuda_clearCublasWorkspaces()
             torch.cuda.empty_cache()
             taken = torch.full((2**22,), np.nan, device=DEVICE)  # where that memory was
-            obs, noise = random_inputs(artifact, rng, streams)
-            ours, theirs = (runtime.predict(obs, noise, artifact.plans["evenly"])[0] for runtime in runtimes)
-            assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(artifact))
+            assert_alike(artifact, runtimes, artifact.plans["evenly"], rng, streams, times=2)
             assert bool(taken.isnan().all())

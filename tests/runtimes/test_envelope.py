@@ -32,7 +32,7 @@ from .plans import random_correction, random_plan
 from .pruners import random_pruner
 from .toys import toy_program
 
-BLOCKS = 5
+STEPS, BLOCKS = 4, 3
 
 NEAR, OUTSIDE = 1.4, 1.6
 """Distances of two observations, on either side of ``FAR``."""
@@ -55,12 +55,14 @@ def between(condition: np.ndarray) -> Envelope:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
     """An artifact with the plan ``fast``, whose correction has jumps, one of the pruner, and an envelope; the file."""
-    folder, program = tmp_path_factory.mktemp("envelope") / "artifact", toy_program(normed=True)
+    folder, program = tmp_path_factory.mktemp("envelope") / "artifact", toy_program(STEPS, BLOCKS, normed=True)
     models = lower_program(program)
     write_artifact(program, models, folder)
     model = lower_single_file(program, models, program.weights).SerializeToString()
     artifact, rng = load_artifact(folder), np.random.default_rng(4)
-    cells = random_plan(rng, artifact.manifest.steps, artifact.manifest.groups, np.zeros((5, BLOCKS), np.bool_), 0.3)
+    cells = random_plan(
+        rng, artifact.manifest.steps, artifact.manifest.groups, np.zeros((STEPS, BLOCKS), np.bool_), 0.3
+    )
     cells[cells == 3] = 2
     correction = random_correction(artifact, rng)
     envelope = between(conditions(artifact, *two_calls(artifact)))
@@ -80,13 +82,27 @@ def some(given: tuple[dict[str, np.ndarray], Noise], streams: list[int]) -> tupl
     return {key: one[streams] for key, one in obs.items()}, Noise(noise.initial[streams], noise.steps[:, streams])
 
 
+def raw(artifact: Artifact, streams: list[int]) -> tuple[dict[str, np.ndarray], Noise]:
+    """These of the two calls, as a robot gives them."""
+    obs, noise = some(two_calls(artifact), streams)
+    normalizer = artifact.manifest.spec.observations["obs"].normalizer
+    assert normalizer is not None
+    return {"obs": normalizer.unnormalize(obs["obs"])}, noise
+
+
+def tensors(obs: dict[str, np.ndarray], noise: Noise) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
+    assert noise.steps is not None
+    made = {key: torch.from_numpy(one) for key, one in obs.items()}
+    return made, torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
+
+
 def by_hand(artifact: Artifact) -> np.ndarray:
     """Samples of the two calls: of the first with its plan, of the second with even steps and no correction."""
     plan, given = artifact.plans["fast"], two_calls(artifact)
     assert plan.correction is not None
     count = max(1, int(plan.correction.anchors.sum()))
-    even = np.full((5, BLOCKS), 2, np.int8)
-    even[[step * 5 // count for step in range(count)]] = 0
+    even = np.full((STEPS, BLOCKS), 2, np.int8)
+    even[[step * STEPS // count for step in range(count)]] = 0
     whole = open_runtime(replace(artifact, envelope=None), "reference")
     near, _ = whole.predict(*some(given, [0]), Plan(cells=plan.cells, correction=plan.correction))
     whole.reset()
@@ -187,29 +203,26 @@ def test_others_are_as_they_would_be_without(made: tuple[Path, bytes]) -> None:
 def test_after_a_call_in_which_some_were_far_no_residual_is_read(made: tuple[Path, bytes]) -> None:
     artifact = load_artifact(made[0])
     opened, given, plan = open_runtime(artifact), two_calls(artifact), artifact.plans["fast"]
-    again = np.full((5, BLOCKS), 3, np.int8)
+    again = np.full((STEPS, BLOCKS), 3, np.int8)
     again[0] = 0
     reads = Plan(cells=again, repair=True)
     opened.predict(*given, artifact.plans["dense"])
     assert opened.predict(*given, reads)[1].legalised == (0, 0)
     opened.predict(*given, plan)
-    assert opened.predict(*given, reads)[1].legalised == (4 * BLOCKS,) * 2
+    assert opened.predict(*given, reads)[1].legalised == ((STEPS - 1) * BLOCKS,) * 2
 
 
 def test_a_module_does_the_same(made: tuple[Path, bytes]) -> None:
     artifact = load_artifact(made[0])
-    policy, given = CompiledPolicy(artifact, open_runtime(artifact), seed=0), two_calls(artifact)
+    policy = CompiledPolicy(artifact, open_runtime(artifact), seed=0)
     terms = 4 * call_terms(artifact)
     for name in ("fast", "pruner"):
         module = ttscompile.to_module(made[0], name)
         for streams in ([0], [1], [0, 1]):
-            obs, noise = some(given, streams)
-            raw = {key: unnormalized(artifact, key, one) for key, one in obs.items()}
+            obs, noise = raw(artifact, streams)
             policy.reset()
-            wanted = policy.predict_action(raw, noise=noise, plan=name)["action_pred"]
-            assert noise.steps is not None
-            tensors = {key: torch.from_numpy(one) for key, one in raw.items()}
-            found = module(tensors, torch.from_numpy(noise.initial), torch.from_numpy(noise.steps))
+            wanted = policy.predict_action(obs, noise=noise, plan=name)["action_pred"]
+            found = module(*tensors(obs, noise))
             assert_equal_but_for_rounding(found[0] if name == "pruner" else found, wanted, terms)
 
 
@@ -217,14 +230,11 @@ def test_a_module_does_the_same(made: tuple[Path, bytes]) -> None:
 @pytest.mark.parametrize("name", ["fast", "pruner"])
 def test_so_does_what_is_exported(made: tuple[Path, bytes], name: str) -> None:
     artifact = load_artifact(made[0])
-    module, given = ttscompile.to_module(made[0], name), two_calls(artifact)
+    module = ttscompile.to_module(made[0], name)
     with torch.no_grad():
         exported = None
         for streams in ([0], [1]):
-            obs, noise = some(given, streams)
-            assert noise.steps is not None
-            raw = {key: torch.from_numpy(unnormalized(artifact, key, one)) for key, one in obs.items()}
-            inputs = raw, torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
+            inputs = tensors(*raw(artifact, streams))
             exported = exported or torch.export.export(module, inputs)
             found, wanted = (one(*inputs) for one in (exported.module(), module))
             if name == "pruner":
@@ -235,26 +245,15 @@ def test_so_does_what_is_exported(made: tuple[Path, bytes], name: str) -> None:
 
 def test_the_single_file_does_the_same(made: tuple[Path, bytes]) -> None:
     artifact = load_artifact(made[0])
-    given, wanted, chunk = two_calls(artifact), by_hand(artifact), artifact.manifest.spec.chunk
+    wanted, chunk = by_hand(artifact), artifact.manifest.spec.chunk
     known = inputs_of(made[0], "fast")
     plan = known.pop("plan")[0]
     known.pop("rollout_keep")
     for streams in ([0], [1], [0, 1, 1]):
-        obs, noise = some(given, streams)
-        raw = {key: unnormalized(artifact, key, one) for key, one in obs.items()}
-        out = Episode(made[1], len(streams)).call(raw, noise, plan, **known)
+        obs, noise = raw(artifact, streams)
+        out = Episode(made[1], len(streams)).call(obs, noise, plan, **known)
         expected = chunk.unnormalized(wanted[streams])
         assert_equal_but_for_rounding(out["action_pred"], expected, 4 * call_terms(artifact))
         np.testing.assert_allclose(out["outside"], np.array([NEAR, OUTSIDE])[streams], rtol=1e-4)
-    nothing = Episode(made[1], 1).call(*_raw(artifact, given), plan)
+    nothing = Episode(made[1], 1).call(*raw(artifact, [1]), plan)
     assert nothing["outside"].tolist() == [0]
-
-
-def _raw(artifact: Artifact, given: tuple[dict[str, np.ndarray], Noise]) -> tuple[dict[str, np.ndarray], Noise]:
-    obs, noise = some(given, [1])
-    return {key: unnormalized(artifact, key, one) for key, one in obs.items()}, noise
-
-
-def unnormalized(artifact: Artifact, key: str, value: np.ndarray) -> np.ndarray:
-    normalizer = artifact.manifest.spec.observations[key].normalizer
-    return value if normalizer is None else normalizer.unnormalize(value)

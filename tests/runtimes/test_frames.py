@@ -13,6 +13,7 @@ import pytest
 
 import ttscompile
 from tests.families import cameras
+from tests.lower.whole_call import Episode
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import ArtifactError, ObservationError
@@ -102,22 +103,9 @@ def test_the_other_runtimes_compute_every_frame_and_agree(compiled: Path, runtim
 
 
 def test_the_single_file_computes_them_inside(compiled: Path, policy: CompiledPolicy) -> None:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(compiled / "whole.onnx", options, ["CPUExecutionProvider"])
-    shapes = {one.name: one for one in session.get_inputs()}
-    cells = (cameras.STEPS, len(policy.info.blocks))
-    feed: Obs = {**window(frame(0), frame(1)), "initial_noise": np.asarray(noise().initial)}
-    feed |= {
-        "plan": np.zeros((1, *cells), np.int8),
-        "rollout_index": np.full((1, *cells), -1),
-        "rollout_keep": np.zeros(cells, bool),
-    }
-    feed["rollout_rows"] = np.zeros((0, *shapes["rollout_rows"].shape[1:]), "f4")
-    found = session.run(["action_pred"], feed)[0]
-    np.testing.assert_allclose(found, act(policy, window(frame(0), frame(1))), rtol=0, atol=1e-5)
+    obs, cells = window(frame(0), frame(1)), np.zeros((cameras.STEPS, len(policy.info.blocks)), np.int8)
+    found = Episode((compiled / "whole.onnx").read_bytes(), 1).call(obs, noise(), cells)["action_pred"]
+    np.testing.assert_allclose(found, act(policy, obs), rtol=0, atol=1e-5)
 
 
 def test_several_streams(policy: CompiledPolicy) -> None:
@@ -262,7 +250,7 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
 
 
 @pytest.mark.slow
-def test_towers_in_eight_bits(compiled: Path, tmp_path: Path) -> None:
+def test_towers_in_eight_bits(tmp_path: Path) -> None:
     """A tower has a precision of its own; a remembered frame has the bits that it would have again."""
     ttscompile.compile_denoiser(*cameras.policy("shared", told=True), tmp_path / "int8", precision="int8")
     policy, exact = ttscompile.load(tmp_path / "int8"), ttscompile.load(tmp_path / "int8", plan="dense")

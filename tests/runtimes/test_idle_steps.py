@@ -10,7 +10,6 @@ import pytest
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Source
 from ttscompile.artifact import Artifact
-from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import legalize, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.ir.graph import Node, Ref
@@ -19,7 +18,7 @@ from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.idle_steps import IdleSteps
 
-from .agreement import call_terms, random_inputs
+from .agreement import assert_alike, call_terms, random_inputs
 from .conftest import MakeArtifact
 from .plans import random_correction
 from .toys import random_sampler, toy_program
@@ -115,18 +114,5 @@ def test_a_network_of_another_form_has_no_such_steps(make_artifact: MakeArtifact
     assert isinstance(runtime.backend, OnnxBackend)
     assert runtime.backend.workspace is not None
     assert runtime.backend.workspace.idle is None
-    obs, noise = random_inputs(toy_artifact, np.random.default_rng(0), 1)
-    theirs = open_runtime(toy_artifact, "reference").predict(obs, noise, Plan(cells=uniform_plan(5, 5, 1)))[0]
-    ours = runtime.predict(obs, noise, Plan(cells=uniform_plan(5, 5, 1)))[0]
-    assert_equal_but_for_rounding(ours, theirs, call_terms(toy_artifact))
-
-
-def test_a_call_does_not_see_the_history_of_the_one_before(make_artifact: MakeArtifact) -> None:
-    artifact = make_artifact(toy_program(STEPS, BLOCKS, pruner=False, normed=True))
-    runtime = open_runtime(artifact)
-    plan, rng = uniform_plan(STEPS, BLOCKS, 2), np.random.default_rng(0)
-    obs, noise = random_inputs(artifact, rng, 1)
-    correction: Correction = random_correction(artifact, rng)
-    first, _ = runtime.predict(obs, noise, Plan(cells=plan, correction=correction))
-    again, _ = runtime.predict(obs, noise, Plan(cells=plan, correction=correction))
-    np.testing.assert_array_equal(first, again)
+    both = runtime, open_runtime(toy_artifact, "reference")
+    assert_alike(toy_artifact, both, Plan(cells=uniform_plan(5, 5, 1)), np.random.default_rng(0))

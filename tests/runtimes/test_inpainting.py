@@ -16,7 +16,7 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 
 import ttscompile
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile import Affine, ChunkSpec, SamplerTable, Source
+from ttscompile import Affine, ChunkSpec, SamplerTable
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import write_artifact
@@ -31,9 +31,9 @@ from ttscompile.runtimes.reference.model import ReferenceModel
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table, set_timesteps
 
-from .agreement import call_terms, random_inputs
+from .agreement import call_terms, corrected_episode, random_inputs
 from .conftest import MakeArtifact
-from .plans import random_correction, random_plan
+from .plans import random_correction
 from .toys import toy_program
 
 STEPS, BLOCKS, HORIZON, START = 8, 4, 6, 1
@@ -136,25 +136,12 @@ def test_a_table_without_noise_levels_is_seen(made: Callable[[], SamplerTable]) 
 @pytest.mark.parametrize("name", ["ddpm", "ddim"])
 def test_runtimes_agree_on_prefixes(artifacts: dict[str, Artifact], name: str, streams: int) -> None:
     """Lengths go up and down, with calls without a prefix and corrections in between."""
-    artifact = artifacts[name]
-    runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "torch", "reference")]
-    rng = np.random.default_rng(streams)
+    artifact, rng = artifacts[name], np.random.default_rng(streams)
     corrections = [None, random_correction(artifact, rng), random_correction(artifact, rng)]
-    written = np.zeros((streams, STEPS, BLOCKS), np.bool_)
-    terms = call_terms(artifact) + STEPS * 6 * HORIZON  # a correction adds six numbers for each action of the chunk
-    for call, length in enumerate((2, 5, None, 1, 3, 4, 0, 2, 5)):
-        plans = np.stack([random_plan(rng, STEPS, artifact.manifest.groups, cells) for cells in written])
-        obs, noise = random_inputs(artifact, rng, streams)
-        prefix = None if length is None else rng.uniform(-1, 1, (streams, length, 2)).astype(np.float32)
-        correction = corrections[call % 3]
-        *ours, theirs = (
-            r.predict(obs, noise, Plan(cells=plans, correction=correction), prefix=prefix)[0] for r in runtimes
-        )
-        for each in ours:
-            assert_equal_but_for_rounding(each, theirs, terms)
-            if prefix is not None:
+    for samples, prefix in corrected_episode(artifact, rng, streams, corrections, (2, 5, None, 1, 3, 4, 0, 2, 5)):
+        if prefix is not None:
+            for each in samples:
                 np.testing.assert_array_equal(each[:, START : START + prefix.shape[1]], prefix)
-        written |= plans == Source.COMPUTE
 
 
 @pytest.mark.slow
@@ -281,9 +268,10 @@ def test_a_policy_whose_sampler_tells_no_noise_levels_says_so(toy_artifact: Arti
     policy = ttscompile.load(toy_artifact.path)
     assert policy.info.prefix_refusal is not None
     obs = {"obs": np.zeros((1, 2), np.float32)}
-    with pytest.raises(ObservationError, match=r"takes no prefix: the table of its sampler 'toy' does not give"):
-        policy.predict_action(obs, prefix=np.zeros((1, 1, 2), np.float32))
-    policy.predict_action(obs, prefix=np.zeros((1, 0, 2), np.float32))
+    for call in (policy.predict_action, policy.predict_action_chunk):
+        with pytest.raises(ObservationError, match=r"takes no prefix: the table of its sampler 'toy' does not give"):
+            call(obs, prefix=np.zeros((1, 1, 2), np.float32))
+        call(obs, prefix=np.zeros((1, 0, 2), np.float32))
 
 
 def test_where_channels_share_their_matrices_all_of_them_must_be_actions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,17 +26,11 @@ from ttscompile.runtimes.policy import CompiledPolicy
 
 from .agreement import call_terms
 from .conftest import MakeArtifact
-from .toys import pencil_program, toy_program, written_artifact
+from .toys import pencil_program, some_noise, toy_program, written_artifact
 
 OBS = np.array([[0.3, -1.2], [0.7, 0.1]], np.float32)
 PLAN = uniform_plan(5, 5, 1)  # four steps in a row compute nothing
 RUNTIMES = ["onnxruntime", "torch", "reference"]
-
-
-def some_noise(streams: int = 2, seed: int = 0) -> Noise:
-    rng = np.random.default_rng(seed)
-    shape = (streams, 3, 2)
-    return Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -365,6 +359,7 @@ def test_a_batch_that_changes_within_an_episode_is_refused_and_the_episode_goes_
     policy.reset()
     with pytest.raises(IllegalPlanError, match="never computed"):  # and nobody else's
         policy.predict_action({"obs": OBS[:1]}, plan=rollout)
+    assert policy.predict_action({"obs": OBS[:1]})["action"].shape == (1, 2, 2)
 
 
 @pytest.mark.parametrize("value", [np.int64(1), np.array(1), torch.tensor(1)])

@@ -5,32 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.plans import store_schedules
 from ttscompile import Source
 from ttscompile.artifact import Artifact
-from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import dense_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import ArtifactError, IllegalPlanError
 from ttscompile.runtimes import Runtime, open_runtime
-from ttscompile.runtimes.onnxruntime.workspace import Workspace
-from ttscompile.runtimes.reference.model import ReferenceModel
-from ttscompile.runtimes.torch.network import StreamsNetwork
 
 from .agreement import random_inputs
+from .conftest import Failure, failing_prologue
 
 RUNTIMES = ["onnxruntime", "torch", "reference"]
-
-
-class Failure(Exception):
-    pass
-
-
-@pytest.fixture
-def pruned(own_artifact: Artifact) -> Artifact:
-    """A toy whose default plan is its pruner's, which reads earlier calls."""
-    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
-    return load_artifact(own_artifact.path)
 
 
 def episode(artifact: Artifact, name: str, inputs: list[tuple[dict[str, np.ndarray], object]]) -> list[np.ndarray]:
@@ -48,10 +33,6 @@ def test_any_sequence_of_calls_resets_failures_and_refusals(
     """Every answer is that of a new runtime to the calls since the episode began."""
     draw, runtime = np.random.default_rng(seed), open_runtime(pruned, name)
     streams, since, read = 2, list[tuple[dict[str, np.ndarray], object]](), 0
-
-    def fail(*_: object) -> None:
-        raise Failure
-
     for what in draw.choice(["call", "reset", "fail", "refused"], 24, p=[0.7, 0.1, 0.1, 0.1]):
         obs, noise = random_inputs(pruned, draw, streams)
         if what == "call":
@@ -66,12 +47,8 @@ def test_any_sequence_of_calls_resets_failures_and_refusals(
             runtime.reset()
             streams, since = int(draw.integers(1, 4)), []
         else:
-            with monkeypatch.context() as patched:
-                patched.setattr(Workspace, "start", fail)
-                patched.setattr(ReferenceModel, "prologue", fail)
-                patched.setattr(StreamsNetwork, "prologue", fail)
-                with pytest.raises((Failure, ArtifactError)):
-                    runtime.predict(obs, noise, Plan(repair=True))
+            with failing_prologue(monkeypatch), pytest.raises((Failure, ArtifactError)):
+                runtime.predict(obs, noise, Plan(repair=True))
             since = []
     assert read >= 10  # else nothing could have leaked
 

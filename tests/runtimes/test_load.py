@@ -71,10 +71,17 @@ def act(python: Path | str, artifact: Path, call: Path) -> dict[str, Any]:
     return report
 
 
+@pytest.fixture(scope="module")
+def here(compiled_pusht: Path, call: Path) -> dict[str, Any]:
+    """What acts in the full environment."""
+    return act(sys.executable, compiled_pusht, call)
+
+
 @pytest.mark.slow
-def test_a_robot_without_torch_acts_as_the_full_environment_does(robot: Path, compiled_pusht: Path, call: Path) -> None:
+def test_a_robot_without_torch_acts_as_the_full_environment_does(
+    robot: Path, compiled_pusht: Path, call: Path, here: dict[str, Any]
+) -> None:
     runs = [act(robot, compiled_pusht, call) for _ in range(2)]
-    here = act(sys.executable, compiled_pusht, call)
     assert not set(COMPILERS_ONLY) & set(runs[0]["modules"])
     assert not {"click", "rich"} & set(runs[0]["modules"]), "they are the command line's, and not installed there"
     np.testing.assert_array_equal(runs[0]["action"], here["action"])
@@ -84,9 +91,8 @@ def test_a_robot_without_torch_acts_as_the_full_environment_does(robot: Path, co
 
 
 @pytest.mark.slow
-def test_loading_imports_nothing_of_the_compilers_where_it_is_installed(compiled_pusht: Path, call: Path) -> None:
-    modules = act(sys.executable, compiled_pusht, call)["modules"]
-    assert not set(COMPILERS_ONLY) & set(modules)
+def test_loading_imports_nothing_of_the_compilers_where_it_is_installed(here: dict[str, Any]) -> None:
+    assert not set(COMPILERS_ONLY) & set(here["modules"])
 
 
 def test_what_needs_the_compiler_says_so_on_a_robot(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,12 +25,11 @@ from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.load import load
 from ttscompile.runtimes.onnxruntime.workspace import Workspace
 
-from .agreement import call_terms, largest_difference, random_inputs
+from .agreement import call_terms, each_alone, largest_difference, random_inputs
 from .conftest import MakeArtifact
-from .plans import random_plan
 from .toys import f32, pencil_program, toy_program
 
-C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
+C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
 
 
 @pytest.fixture(params=["onnxruntime", "torch", "reference"])
@@ -48,9 +47,10 @@ def test_reuse_gives_41_and_compute_gives_44(pencil_artifact: Artifact, name: st
         return float(sample[0, 0, 0])
 
     assert call(35, [C, T]) == 41
-    assert call(35, [C, C]) == 44
-    assert call(40, [C, T]) == 56
-    assert call(33, [C, R]) == 40  # the 6 of the second call: the third computed nothing at step 1
+    assert call(35, [C, F]) == 41
+    assert call(35, [C, C]) == 44  # computes f(38) = 6 at step 1
+    assert call(40, [C, T]) == 40 + 8 + 8
+    assert call(33, [C, R]) == 33 + 1 + 6  # of the third call: the fourth computed nothing at step 1
     runtime.reset()
     with pytest.raises(IllegalPlanError, match="never computed"):
         call(33, [C, R])
@@ -96,37 +96,25 @@ def test_a_value_of_the_step_may_be_one_number(make_artifact: MakeArtifact) -> N
         assert sample.ravel().tolist() == [35 + 3 + 7, 33 + 1 + 3]
 
 
+VARIANTS = [{}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}, {"sequence_first": True}]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "variant", [{}, {"sequence_first": True}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}]
-)
-def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, Any]) -> None:
+@pytest.mark.parametrize("variant", [*VARIANTS, {"normed": True, "sequence_first": True}], ids=str)
+def test_they_agree_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, Any]) -> None:
+    """Batches of one to four streams, each with a plan of its own or all with the same."""
     artifact = make_artifact(toy_program(**variant, pruner=False))
-    runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
-    allowed = bound(call_terms(artifact))
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < allowed
+    reference, allowed = open_runtime(artifact, "reference"), bound(call_terms(artifact))
+    for name, seeds in (("onnxruntime", 12), ("torch", 5)):
+        runtime = open_runtime(artifact, name)
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            assert largest_difference(artifact, runtime, reference, rng, streams=1 + seed % 4, calls=4) < allowed
 
 
 def test_a_batch_of_streams_is_its_streams_one_by_one(toy_artifact: Artifact) -> None:
-    manifest = toy_artifact.manifest
-    rng = np.random.default_rng(0)
-    together = open_runtime(toy_artifact)
-    apart = [open_runtime(toy_artifact) for _ in range(3)]
-    written = np.zeros((3, manifest.steps, len(manifest.groups)), np.bool_)
-    terms = call_terms(toy_artifact)
-    for _ in range(4):
-        plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
-        obs, noise = random_inputs(toy_artifact, rng, 3)
-        assert noise.steps is not None
-        sample, report = together.predict(obs, noise, Plan(cells=plans))
-        for s, runtime in enumerate(apart):
-            own = Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
-            alone, single = runtime.predict({"obs": obs["obs"][s : s + 1]}, own, Plan(cells=plans[s]))
-            assert_equal_but_for_rounding(sample[s], alone[0], terms)
-            assert single.flops[0] == report.flops[s]
-        written |= plans == C
+    for beside, alone in each_alone(toy_artifact, np.random.default_rng(0), 3, calls=4):
+        assert_equal_but_for_rounding(beside, alone, call_terms(toy_artifact))
 
 
 def test_the_report_says_what_was_done(runtime: Runtime, toy_artifact: Artifact) -> None:
@@ -223,6 +211,8 @@ def test_noise_of_the_wrong_shape_is_refused(runtime: Runtime, toy_artifact: Art
     assert noise.steps is not None
     with pytest.raises(ObservationError, match=r"noise\.steps must be float32 .*; found float32 \[4, 2, 3, 2\]"):
         runtime.predict(obs, Noise(noise.initial, noise.steps[1:]), Plan(cells=dense_plan(5, 5)))
+    with pytest.raises(ObservationError, match=r"noise.steps is missing.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
+        runtime.predict(obs, Noise(noise.initial), Plan(cells=dense_plan(5, 5)))
 
 
 def test_what_a_call_gave_stays_as_it_was(runtime: Runtime, toy_artifact: Artifact) -> None:
@@ -372,21 +362,3 @@ for threads in (1, 2):
     messages = python(THREADS.format(path=str(toy_artifact.path), body=body)).splitlines()
     assert len(messages) == 2
     assert all("other code of this process has made onnxruntime's global thread pool" in one for one in messages)
-
-
-def test_two_threads_give_the_same_answer(toy_artifact: Artifact, tmp_path: Path) -> None:
-    body = """
-import numpy as np
-from ttscompile import Noise, Plan
-rng = np.random.default_rng(0)
-shape = (2, 3, 2)
-noise = Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
-obs = {"obs": rng.standard_normal((2, 2), dtype=np.float32)}
-plan = Plan(cells=np.zeros((5, 5), np.int8))
-samples = [open_runtime(artifact, threads=n).predict(obs, noise, plan)[0] for n in (1, 2)]
-np.save(OUT, samples)
-"""
-    body = body.replace("OUT", repr(str(tmp_path / "samples.npy")))
-    python(THREADS.format(path=str(toy_artifact.path), body=body))
-    one, other = np.load(tmp_path / "samples.npy")
-    assert_equal_but_for_rounding(one, other, call_terms(toy_artifact))

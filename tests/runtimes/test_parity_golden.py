@@ -14,7 +14,6 @@ from tests.rounding import PROMISED
 from ttscompile import Noise
 from ttscompile.artifact import load_artifact
 from ttscompile.core.lattice import Source
-from ttscompile.core.plan import Plan
 from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.info import PolicyInfo
@@ -23,8 +22,7 @@ from ttscompile.runtimes.policy import CompiledPolicy
 from ..families.support import record
 from ..golden import compiled_golden
 from ..once import Once
-from .agreement import largest_difference, random_inputs
-from .plans import random_plan
+from .agreement import each_alone, largest_difference
 
 pytestmark = pytest.mark.slow
 
@@ -113,19 +111,5 @@ def test_both_runtimes_agree_on_random_plans(compiled: Compiled, name: str) -> N
 
 @pytest.mark.parametrize("name", ["transformer_encoder_causal", "inpainting"])
 def test_a_batch_of_streams_is_its_streams_one_by_one(compiled: Compiled, name: str) -> None:
-    artifact = load_artifact(compiled(name))
-    rng = np.random.default_rng(0)
-    together, alone = open_runtime(artifact), [open_runtime(artifact) for _ in range(2)]
-    written = np.zeros((2, artifact.manifest.steps, len(artifact.manifest.groups)), np.bool_)
-    for _ in range(2):
-        plans = np.stack([random_plan(rng, artifact.manifest.steps, artifact.manifest.groups, one) for one in written])
-        obs, noise = random_inputs(artifact, rng, 2)
-        assert noise.steps is not None
-        batch, _ = together.predict(obs, noise, Plan(cells=plans))
-        for s, runtime in enumerate(alone):
-            own = Noise(noise.initial[s : s + 1], noise.steps[:, s : s + 1])
-            single, _ = runtime.predict(
-                {key: value[s : s + 1] for key, value in obs.items()}, own, Plan(cells=plans[s])
-            )
-            assert np.abs(batch[s] - single[0]).max() < PROMISED * np.abs(single).max()
-        written |= plans == Source.COMPUTE
+    for beside, alone in each_alone(load_artifact(compiled(name)), np.random.default_rng(0), 2, calls=2):
+        assert np.abs(beside - alone).max() < PROMISED * np.abs(alone).max()

@@ -28,7 +28,7 @@ from ttscompile.runtimes.policy import CompiledPolicy
 
 from .agreement import call_terms
 from .conftest import MakeArtifact
-from .toys import toy_program
+from .toys import some_noise, toy_program
 
 R = Source.ROLLOUT
 OBS = np.array([[0.3, -1.2], [0.7, 0.1]], np.float32)
@@ -42,12 +42,6 @@ def policy(request: pytest.FixtureRequest, toy_artifact: Artifact) -> CompiledPo
 @pytest.fixture
 def quick(toy_artifact: Artifact) -> CompiledPolicy:
     return load(toy_artifact.path, seed=0)
-
-
-def some_noise(streams: int = 2, seed: int = 0) -> Noise:
-    rng = np.random.default_rng(seed)
-    shape = (streams, 3, 2)
-    return Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
 
 
 def test_load_is_what_the_package_offers() -> None:
@@ -146,14 +140,6 @@ def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
             policy.predict_action({"obs": OBS}, plan=plan)
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
-def test_a_stochastic_sampler_needs_its_draws(toy_artifact: Artifact, runtime: str) -> None:
-    with pytest.raises(ObservationError, match=r"noise.steps is missing.*\[K, B, T, D\] = \(5, 2, 3, 2\)"):
-        open_runtime(toy_artifact, runtime).predict(
-            {"obs": OBS}, Noise(some_noise().initial), Plan(cells=dense_plan(5, 5))
-        )
-
-
 def test_a_refused_call_leaves_no_report_of_the_one_before(policy: CompiledPolicy) -> None:
     policy.predict_action({"obs": OBS}, plan="dense")
     with pytest.raises(ObservationError):
@@ -224,8 +210,6 @@ def with_value(value: float) -> np.ndarray:
         ({"obs": OBS[:, :1]}, r"wrong shape: expected float32 \[B, 2\]; found float32 \[2, 1\]"),
         ({"obs": OBS[:, :0]}, r"wrong shape: .*found float32 \[2, 0\]"),
         ({"obs": OBS[:0]}, r"wrong shape: .*found float32 \[0, 2\]"),
-        ({"obs": OBS.astype(np.float64)}, r"wrong dtype: expected float32 .*found float64 .*astype\(np.float32\)"),
-        ({"obs": OBS.astype(np.int32)}, "wrong dtype"),
         ({"obs": torch.from_numpy(OBS).double()}, "wrong dtype: .*found float64"),
         (
             {"obs": torch.from_numpy(OBS).bfloat16()},
@@ -256,16 +240,13 @@ def wrong_noise() -> list[tuple[Any, str]]:
             Noise(initial[:1], steps),
             r"noise.initial must be float32 \[B, T, D\] = \[2, 3, 2\]; found float32 \[1, 3, 2\]",
         ),
-        (Noise(initial.astype(np.float64), steps), "noise.initial must be float32 .*found float64"),
-        (Noise(initial, None), r"noise.steps is missing.*\(5, 2, 3, 2\)"),
-        (Noise(initial, steps[:4]), r"noise.steps must be .*= \[5, 2, 3, 2\]; found float32 \[4, 2, 3, 2\]"),
         (Noise(initial, broken), r"noise.steps must be finite; found nan at index \(4, 1, 2, 1\)"),
         (Noise(initial * np.inf, steps), "noise.initial must be finite"),
         (initial, "a ndarray; expected ttscompile.Noise"),
     ]
 
 
-@pytest.mark.parametrize("case", range(7))
+@pytest.mark.parametrize("case", range(4))
 def test_noise_that_does_not_fit_is_refused(quick: CompiledPolicy, case: int) -> None:
     noise, message = wrong_noise()[case]
     with pytest.raises(ObservationError, match=message):
@@ -279,14 +260,6 @@ def test_a_deterministic_sampler_needs_no_noise_of_steps(make_artifact: MakeArti
     out = [policy.predict_action({"obs": OBS}, noise=Noise(initial, draws))["action"] for draws in (None, steps)]
     assert np.array_equal(*out)
     assert policy.predict_action({"obs": OBS})["action"].shape == (2, 2, 2)
-
-
-def test_the_number_of_streams_changes_with_reset_only(policy: CompiledPolicy) -> None:
-    policy.predict_action({"obs": OBS})
-    with pytest.raises(ObservationError, match=r"holds 1 streams, and the episode under way 2.*reset\(\)"):
-        policy.predict_action({"obs": OBS[:1]})
-    policy.reset()
-    assert policy.predict_action({"obs": OBS[:1]})["action"].shape == (1, 2, 2)
 
 
 def test_observations_that_disagree_about_the_streams_are_refused() -> None:
@@ -364,12 +337,6 @@ def test_an_interrupt_at_any_line_of_a_call_comes_through_and_the_next_call_is_m
             call(lines)
         quick.reset()
     np.testing.assert_array_equal(quick.predict_action({"obs": OBS}, noise=noise)["action"], expected)
-
-
-def test_a_call_that_was_refused_does_not_keep_the_lock(quick: CompiledPolicy) -> None:
-    with pytest.raises(ObservationError):
-        quick.predict_action({})
-    quick.predict_action({"obs": OBS})
 
 
 def test_a_path_without_an_artifact(tmp_path: Path) -> None:

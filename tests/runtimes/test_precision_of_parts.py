@@ -97,9 +97,10 @@ def test_it_is_the_reference_within_the_tolerance_of_eight_bits_whatever_the_thr
         found = largest_difference(artifact, runtime, reference, rng, 2, calls=2, base=full)
         assert 1e-5 < found < CARRIED * EIGHT_BITS, "not in eight bits, or further off than verify allows"
         obs, noise = random_inputs(artifact, np.random.default_rng(1), 2)
-        runtime.reset()
-        samples.append(runtime.predict(obs, noise, full)[0])
-    np.testing.assert_array_equal(samples[0], samples[1])
+        for _ in range(2):
+            runtime.reset()
+            samples.append(runtime.predict(obs, noise, full)[0])
+    assert all(np.array_equal(one, samples[0]) for one in samples), "calls repeat to the bit"
     statuses = {rung.name: rung.status for rung in ttscompile.verify(int8).rungs}
     assert "failed" not in statuses.values() and statuses["precision"] == "passed"
 

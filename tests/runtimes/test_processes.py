@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.plans import store_schedules
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.errors import RuntimeUnavailableError, TtscompileError
 from ttscompile.runtimes import open_runtime
@@ -24,13 +23,6 @@ from ttscompile.runtimes.load import load
 OBS = np.array([[0.3, -1.2]], np.float32)
 
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-
-
-@pytest.fixture
-def pruned(own_artifact: Artifact) -> Path:
-    """A toy whose default plan is its pruner's, which has a thread."""
-    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
-    return own_artifact.path
 
 
 def program(code: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -65,7 +57,7 @@ def program(code: str, *arguments: object, **environment: str) -> subprocess.Com
 @pytest.mark.slow
 @forks
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_forked_child_is_told_to_load_the_policy_itself_and_can(pruned: Path, threads: int) -> None:
+def test_a_forked_child_is_told_to_load_the_policy_itself_and_can(pruned: Artifact, threads: int) -> None:
     """Threads of the pruner and of onnxruntime are not in the child; there the old policy must not even be let go."""
     code = """
     path, threads = sys.argv[1], int(sys.argv[2])
@@ -87,7 +79,7 @@ def test_a_forked_child_is_told_to_load_the_policy_itself_and_can(pruned: Path, 
     policy.reset(seed=0)
     print((policy.predict_action(OBS)["action"] == before).all())
     """
-    done = program(code, pruned, threads)
+    done = program(code, pruned.path, threads)
     *told, same, ended, again = done.stdout.splitlines()
     status, parent = ended.split()
     assert (same, status, again, done.stderr) == ("True", "7", "True", "")
@@ -97,7 +89,7 @@ def test_a_forked_child_is_told_to_load_the_policy_itself_and_can(pruned: Path, 
 
 
 @forks
-def test_workers_of_multiprocessing(pruned: Path) -> None:
+def test_workers_of_multiprocessing(pruned: Artifact) -> None:
     """A policy of the parent's is refused, and each worker may load its own."""
     code = """
     import multiprocessing
@@ -119,12 +111,12 @@ def test_workers_of_multiprocessing(pruned: Path) -> None:
     with context.Pool(2, begin) as pool:
         print(len(pool.map_async(inherited, range(4)).get(20)))
     """
-    done = program(code, pruned)
+    done = program(code, pruned.path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "refused\n4\n", "")
 
 
 @forks
-def test_a_fork_during_a_call_is_told_the_same(pruned: Path) -> None:
+def test_a_fork_during_a_call_is_told_the_same(pruned: Artifact) -> None:
     code = """
     policy = load(sys.argv[1])
     with policy._turn():
@@ -135,12 +127,12 @@ def test_a_fork_during_a_call_is_told_the_same(pruned: Path) -> None:
                 print("fork" in str(error), flush=True)
         print(forked(child))
     """
-    done = program(code, pruned)
+    done = program(code, pruned.path)
     assert (done.stdout, done.stderr) == ("True\n7\n", "")
 
 
 @forks
-def test_the_end_of_a_forked_child_leaves_the_files_of_its_parent(pruned: Path, tmp_path: Path) -> None:
+def test_the_end_of_a_forked_child_leaves_the_files_of_its_parent(pruned: Artifact, tmp_path: Path) -> None:
     code = """
     policy = load(sys.argv[1])
     folder = policy._artifact.path
@@ -149,18 +141,18 @@ def test_the_end_of_a_forked_child_leaves_the_files_of_its_parent(pruned: Path, 
     gc.collect()
     print(folder.exists())
     """
-    done = program(code, shutil.make_archive(str(tmp_path / "zipped"), "zip", pruned))
+    done = program(code, shutil.make_archive(str(tmp_path / "zipped"), "zip", pruned.path))
     assert (done.stdout, done.stderr) == ("7 True\nFalse\n", "")
 
 
-def test_a_policy_is_neither_copied_nor_sent(pruned: Path) -> None:
-    policy = load(pruned)
+def test_a_policy_is_neither_copied_nor_sent(pruned: Artifact) -> None:
+    policy = load(pruned.path)
     with pytest.raises(TtscompileError, match=r"nor sent to another process\. Load it again, where it is called"):
         pickle.dumps(policy)
 
 
-def test_a_plan_can_be_copied_and_sent(pruned: Path) -> None:
-    policy = load(pruned)
+def test_a_plan_can_be_copied_and_sent(pruned: Artifact) -> None:
+    policy = load(pruned.path)
     start = replace(policy.plans["dense"], precision={"blocks": "int8"}, otherwise=policy.plans["dense"])
     for sent in (pickle.loads(pickle.dumps(start)), copy.deepcopy(start)):
         assert sent.variant == start.variant
@@ -173,7 +165,7 @@ def test_a_plan_can_be_copied_and_sent(pruned: Path) -> None:
         np.testing.assert_array_equal(*answers)
 
 
-def test_the_exit_status_is_the_programs_though_a_daemon_thread_calls_the_policy(pruned: Path) -> None:
+def test_the_exit_status_is_the_programs_though_a_daemon_thread_calls_the_policy(pruned: Artifact) -> None:
     code = """
     policy = load(sys.argv[1])
     called = threading.Event()
@@ -187,11 +179,11 @@ def test_the_exit_status_is_the_programs_though_a_daemon_thread_calls_the_policy
     called.wait()
     sys.exit(5)
     """
-    done = program(code, pruned)
+    done = program(code, pruned.path)
     assert (done.returncode, done.stderr) == (5, "")
 
 
-def test_threads_call_the_policy_after_the_main_thread_has_ended(pruned: Path) -> None:
+def test_threads_call_the_policy_after_the_main_thread_has_ended(pruned: Artifact) -> None:
     code = """
     policy, ended = load(sys.argv[1]), threading.main_thread().join
 
@@ -201,11 +193,13 @@ def test_threads_call_the_policy_after_the_main_thread_has_ended(pruned: Path) -
 
     threading.Thread(target=calls).start()
     """
-    done = program(code, pruned)
+    done = program(code, pruned.path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "(1, 2, 2)\n", "")
 
 
-def test_a_call_at_the_end_is_made_by_handlers_that_were_registered_after_the_policy_was_loaded(pruned: Path) -> None:
+def test_a_call_at_the_end_is_made_by_handlers_that_were_registered_after_the_policy_was_loaded(
+    pruned: Artifact,
+) -> None:
     code = """
     import atexit
 
@@ -219,7 +213,7 @@ def test_a_call_at_the_end_is_made_by_handlers_that_were_registered_after_the_po
     policy = load(sys.argv[1])
     atexit.register(last, "after:")
     """
-    done = program(code, pruned)
+    done = program(code, pruned.path)
     after, before = done.stdout.splitlines()
     assert (done.returncode, after, done.stderr) == (0, "after: (1, 2, 2)", "")
     assert before.startswith("before: the program is ending, and the policy makes no more calls. Register")
@@ -234,7 +228,7 @@ def test_a_call_at_the_end_is_made_by_handlers_that_were_registered_after_the_po
         {"OMP_NUM_THREADS": "garbage", "ORT_INTRA_OP_NUM_THREADS": "4", "ORT_INTER_OP_NUM_THREADS": "4"},
     ],
 )
-def test_the_environment_changes_neither_threads_nor_actions(pruned: Path, environment: dict[str, str]) -> None:
+def test_the_environment_changes_neither_threads_nor_actions(pruned: Artifact, environment: dict[str, str]) -> None:
     code = """
     policy = load(sys.argv[1], seed=0)
     print(policy.predict_action(OBS)["action"].tobytes().hex())
@@ -244,9 +238,9 @@ def test_the_environment_changes_neither_threads_nor_actions(pruned: Path, envir
     other = load(sys.argv[1], plan="dense")
     print(len(os.listdir("/proc/self/task")) - before)
     """
-    policy = load(pruned, seed=0)
+    policy = load(pruned.path, seed=0)
     expected = policy.predict_action({"obs": OBS})["action"].tobytes().hex()
-    done = program(code, pruned, **environment)
+    done = program(code, pruned.path, **environment)
     threads = "['MainThread', 'ttscompile-pruner'] False"
     assert (done.stdout.splitlines(), done.stderr) == ([expected, threads, "1"], "")
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from ttscompile import Noise
 from ttscompile.artifact import Artifact
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import IllegalPlanError, NonFiniteActionsError, ObservationError
@@ -17,6 +16,8 @@ from ttscompile.runtimes.arrays import check_observation, read_observation
 from ttscompile.runtimes.load import load
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.queues import Queues, is_window
+
+from .toys import some_noise
 
 SPECS = {"observation.state": ObservationSpec((3, 2)), "tokens": ObservationSpec((4,), dtype="int64", window=False)}
 
@@ -161,25 +162,20 @@ def policy(toy_artifact: Artifact) -> CompiledPolicy:
     return load(toy_artifact.path, seed=0)
 
 
-def some_noise(streams: int = 1) -> Noise:
-    rng = np.random.default_rng(0)
-    return Noise(rng.standard_normal((streams, 3, 2), np.float32), rng.standard_normal((5, streams, 3, 2), np.float32))
-
-
 def test_select_action_computes_when_the_chunk_is_used_up(policy: CompiledPolicy) -> None:
     """Two actions a chunk: calls 1 and 3 compute, and what they give is ``predict_action``'s chunk."""
     obs = {"obs": torch.tensor([[0.3, -1.2]])}
-    chunk = policy.predict_action(obs, noise=some_noise(), plan="dense")["action"]
+    chunk = policy.predict_action(obs, noise=some_noise(1), plan="dense")["action"]
     assert chunk.shape == (1, 2, 2)
     policy.reset()
     found, reports = [], []
     for _ in range(3):
-        found.append(policy.select_action(obs | {"action": None}, noise=some_noise(), plan="dense"))
+        found.append(policy.select_action(obs | {"action": None}, noise=some_noise(1), plan="dense"))
         reports.append(policy.last_report)
     assert reports[0] is reports[1] is not reports[2]
     assert isinstance(found[0], torch.Tensor)
     assert torch.equal(torch.stack(found[:2], dim=1), chunk) and torch.equal(found[2], chunk[:, 0])
-    whole = policy.predict_action_chunk(obs, noise=some_noise(), plan="dense")
+    whole = policy.predict_action_chunk(obs, noise=some_noise(1), plan="dense")
     assert torch.equal(whole, chunk)
     report = policy.last_report
     assert torch.equal(policy.select_action(obs), chunk[:, 1])  # the queue of actions was left alone
@@ -204,14 +200,14 @@ def test_a_call_that_fails_keeps_no_frame(policy: CompiledPolicy, method: str, m
             with pytest.raises(error):
                 call(obs, **wrong)
             assert policy._queues._frames == before and not policy.queued
-        call(obs, noise=some_noise(), plan="dense")
+        call(obs, noise=some_noise(1), plan="dense")
         assert policy._queues._frames["obs"][-1].tolist() == [[value, value]]
         while policy.queued:
             policy._queues.pop()
 
 
 def test_reset_drops_actions_and_streams(policy: CompiledPolicy) -> None:
-    policy.select_action({"obs": np.zeros((1, 2), np.float32)}, noise=some_noise(), plan="dense")
+    policy.select_action({"obs": np.zeros((1, 2), np.float32)}, noise=some_noise(1), plan="dense")
     first = policy.last_report
     with pytest.raises(ObservationError, match=r"only after reset\(\)"):
         policy.select_action({"obs": np.zeros((2, 2), np.float32)})
@@ -226,7 +222,7 @@ def test_an_overflow_ends_the_episode_of_the_queues_too(
     """The error says that the episode has ended, as by ``reset``: then another number of streams may come."""
     one, two = ({"obs": np.zeros((n, 2), np.float32)} for n in (1, 2))
     for _ in range(2):  # a chunk
-        policy.select_action(one, noise=some_noise(), plan="dense")
+        policy.select_action(one, noise=some_noise(1), plan="dense")
     predict = policy._runtime.predict
 
     def overflown(*given: Any, **named: Any) -> Any:
@@ -236,13 +232,5 @@ def test_an_overflow_ends_the_episode_of_the_queues_too(
     with monkeypatch.context() as patched:
         patched.setattr(policy._runtime, "predict", overflown)
         with pytest.raises(NonFiniteActionsError, match=r"ended, as by reset\(\)"):
-            policy.select_action(one, noise=some_noise(), plan="dense")
+            policy.select_action(one, noise=some_noise(1), plan="dense")
     assert policy.select_action(two, noise=some_noise(2), plan="dense").shape == (2, 2)
-
-
-def test_a_chunk_of_lerobots_takes_a_prefix(toy_artifact: Artifact) -> None:
-    """As ``predict_action`` does; the toy's sampler has none, which it says in the same words."""
-    policy, obs = load(toy_artifact.path), {"obs": np.zeros((1, 2), np.float32)}
-    for call in (policy.predict_action, policy.predict_action_chunk):
-        with pytest.raises(ObservationError, match="the policy takes no prefix"):
-            call(obs, prefix=np.zeros((1, 1, 2), np.float32))

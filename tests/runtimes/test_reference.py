@@ -1,4 +1,4 @@
-"""The reference runtime against the pencil and section 2 executed literally; its gradients against calculus."""
+"""The reference runtime against section 2 executed literally; its gradients against calculus."""
 
 from __future__ import annotations
 
@@ -15,47 +15,25 @@ from ttscompile.core.lattice import PlanArray
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.program import Program
 from ttscompile.runtimes.reference.model import ReferenceModel
-from ttscompile.runtimes.reference.reuse import Caches, Cell, RolloutCache, reuse
+from ttscompile.runtimes.reference.reuse import Caches, Cell, reuse
 
 from .literal import Episode
 from .plans import random_plan
 from .recorded import everything_recorded
 from .toys import as_functions, model_of, pencil_program, pruner_weights, toy_program
 
-C, F, T, R = Source.COMPUTE, Source.FORWARD, Source.TIMESTEP, Source.ROLLOUT
+C, T, R = Source.COMPUTE, Source.TIMESTEP, Source.ROLLOUT
 TOY = toy_program()
 MODEL = model_of(TOY)
 
 
-def pencil(
-    model: ReferenceModel, x: float, plan: list[Source], cache: RolloutCache | None
-) -> tuple[float, RolloutCache]:
-    """One call of ``pencil_program``, whose block is ``f(h) = h - 32``."""
-    contexts = model.prologue({"obs": torch.tensor([[-32.0]])})
-    result = model.denoise(contexts, torch.full((1, 1, 1), float(x)), None, np.array(plan, np.int8)[:, None], cache)
-    return float(result.sample), result.cache
-
-
-def test_reuse_gives_41_and_compute_gives_44() -> None:
-    model = model_of(pencil_program())
-    assert pencil(model, 35, [C, T], None)[0] == 41
-    assert pencil(model, 35, [C, F], None)[0] == 41
-    assert pencil(model, 35, [C, C], None)[0] == 44
-
-
-def test_rollout_is_the_last_call_in_which_the_cell_was_computed() -> None:
-    model = model_of(pencil_program())
-    _, cache = pencil(model, 35, [C, C], None)  # writes f(38) = 6 at step 1
-    reused, cache = pencil(model, 40, [C, T], cache)  # 40 + 8 + 8, and writes nothing at step 1
-    assert reused == 56
-    assert pencil(model, 33, [C, R], cache)[0] == 33 + 1 + 6
-
-
 def test_a_rollout_that_was_never_written_is_refused() -> None:
+    """By the model itself, which calibration calls; ``test_onnxruntime`` has what the same policy computes."""
     model = model_of(pencil_program())
-    _, cache = pencil(model, 35, [C, T], None)
+    contexts, initial = model.prologue({"obs": torch.tensor([[-32.0]])}), torch.full((1, 1, 1), 35.0)
+    cache = model.denoise(contexts, initial, None, np.array([[C], [T]], np.int8)).cache
     with pytest.raises(IllegalPlanError, match="step 1, block 0"):
-        pencil(model, 35, [C, R], cache)
+        model.denoise(contexts, initial, None, np.array([[C], [R]], np.int8), cache)
 
 
 def inputs(rng: np.random.Generator, streams: int, program: Program = TOY) -> tuple[dict[str, torch.Tensor], Noise]:

@@ -1,11 +1,10 @@
-"""Actions that are relative to what the robot measures, however a call is made, and from one call to the next."""
+"""Actions that are relative to numbers that the robot measures; ``test_relative_poses`` has them beside poses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,22 +14,16 @@ from tests.artifact.tiny import tiny_spec
 from tests.calibration import policies
 from tests.lower.whole_call import every_way, inputs, make
 from tests.once import Once
-from ttscompile import ChunkSpec, Noise, ObservationSpec, Plan, PolicySpec
-from ttscompile.artifact.golden import load_golden_plans
+from ttscompile import ChunkSpec, Noise, ObservationSpec, PolicySpec
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.strict_json import dump, parse
 from ttscompile.artifact.typed_json import from_json, to_json
-from ttscompile.artifact.write import update_plans
-from ttscompile.core.lattice import Source
 from ttscompile.core.spec import Affine, Relative, Switch
-from ttscompile.core.start import rest_of
 from ttscompile.errors import ArtifactError, SpecError
 from ttscompile.report import facts
 from ttscompile.samplers.flow import flow_matching_table
-from ttscompile.verification.record_golden import record_plans
 
-from .toys import denoised_by, toy_program
+from .toys import toy_program
 
 RELATIVE = Relative("obs", (1, None))
 ROWS = np.arange(1, 4, dtype=np.float32)[:, None]
@@ -66,62 +59,12 @@ def test_every_way_to_make_a_call_adds_it(tmp_path: Path, rows: bool) -> None:
     assert told == "2 numbers, 3 steps predicted, 1..2 executed; 1 of the numbers are relative to 'obs'"
 
 
-@pytest.fixture(scope="module")
-def artifact(once: Once) -> Path:
-    """A policy of flow matching, with a plan that begins with the chunk of the call before."""
-
-    def convert(path: Path) -> None:
-        table = replace(flow_matching_table(6), timesteps=np.arange(6)[::-1].copy())
-        spec = replace(policies.spec(), sampler=table)
-        spec = replace(spec, chunk=replace(spec.chunk, relative=Relative("obs", (2, None))))
-        ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path)
-        dense = load_artifact(path).plans["dense"]
-        warm = Plan("original-last-2", np.zeros((2, 6), np.int8), otherwise=dense)
-        sparse = replace(warm, cells=np.array([[0] * 6, [Source.TIMESTEP] * 6], np.int8))
-        plans, starts = {"dense": dense, "warm": warm, "sparse": sparse}, {warm.loop: StartRecord("original", 2)}
-        update_plans(path, plans, "warm", {}, starts=starts, golden=record_plans)
-
-    return once.folder("relative and warm", convert)
-
-
-def observed(seed: int, streams: int = 2) -> tuple[dict[str, np.ndarray], Noise]:
-    rng = np.random.default_rng(seed)
-    obs = {"obs": 3 * rng.standard_normal((streams, 2, 3)).astype(np.float32)}
-    return obs, Noise(rng.standard_normal((streams, policies.HORIZON, policies.CHANNELS)).astype(np.float32))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
-def test_a_call_goes_on_with_the_actions_of_the_call_before(artifact: Path, runtime: str) -> None:
-    """Not with its numbers, which were relative to another state. Each call has a state of its own."""
-    policy, spec = ttscompile.load(artifact, runtime), load_artifact(artifact).manifest.spec
-    normalizer, (_, start) = spec.chunk.normalizer, rest_of(spec.sampler, 2)
-    assert normalizer is not None
-    before = policy.predict_action(*observed(0))["action_pred"]
-    for call in (1, 2):
-        obs, noise = observed(call)
-        going_on = np.concatenate([before[:, 4:], np.repeat(before[:, -1:], 4, 1)], 1)  # four are executed
-        going_on[..., 0] -= obs["obs"][:, -1:, 2]
-        initial = start.action * normalizer.normalize(going_on) + start.noise * noise.initial
-        before = policy.predict_action(obs, noise)["action_pred"]
-        np.testing.assert_allclose(before, rest_alone(artifact, obs, initial.astype(np.float32)), rtol=0, atol=1e-4)
-        assert policy.last_report is not None
-        assert policy.last_report.plan_name == "warm"
-
-
-@pytest.mark.slow
-def test_every_rung_of_verify_holds(artifact: Path) -> None:
-    """Its records hold actions, and calls that begin with the chunk of another observation."""
-    rungs = {one.name: one.status for one in ttscompile.verify(artifact, calls=2).rungs if one.name != "engaged"}
-    assert set(rungs.values()) == {"passed", "skipped"}, rungs  # what is saved here is less than noise
-    assert set(load_golden_plans(load_artifact(artifact), 2)) == {"sparse", "warm"}
-
-
-def rest_alone(artifact: Path, obs: dict[str, np.ndarray], initial: np.ndarray) -> np.ndarray:
-    """Actions of the last two steps, in torch."""
-    spec = load_artifact(artifact).manifest.spec
-    sample = denoised_by(policies.Mixer(0).eval(), rest_of(spec.sampler, 2)[0], spec, obs, initial)
-    return spec.chunk.unnormalized(sample, spec.chunk.reference(obs))
+def compiled(once: Once, relative: Relative | None) -> Path:
+    """A policy of flow matching."""
+    table, own = replace(flow_matching_table(6), timesteps=np.arange(6)[::-1].copy()), policies.spec()
+    spec = replace(own, sampler=table, chunk=replace(own.chunk, relative=relative))
+    name, network = f"flow, relative: {relative is not None}", policies.Mixer(0).eval()
+    return once.compiled(name, lambda to: ttscompile.compile_denoiser(network, spec, to))[0]
 
 
 @pytest.mark.parametrize("rows", [False, True])
@@ -143,35 +86,19 @@ def test_a_chunk_that_is_moved_holds_the_same_actions(rows: bool) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
-def test_a_prefix_is_of_actions(artifact: Path, once: Once, runtime: str) -> None:
+def test_a_prefix_is_of_actions(once: Once, runtime: str) -> None:
     """It is as one of the difference in the policy that has the same network and adds nothing."""
-    table = replace(flow_matching_table(6), timesteps=np.arange(6)[::-1].copy())
-    spec = replace(policies.spec(), sampler=table)
-    plain, _ = once.compiled("warm alone", lambda to: ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, to))
-    (obs, noise), added = observed(3), np.zeros((2, 1, 2), np.float32)
+    rng, added = np.random.default_rng(3), np.zeros((2, 1, 2), np.float32)
+    obs = {"obs": 3 * rng.standard_normal((2, 2, 3)).astype(np.float32)}
+    noise = Noise(rng.standard_normal((2, policies.HORIZON, policies.CHANNELS)).astype(np.float32))
     added[:, 0, 0] = obs["obs"][:, -1, 2]
-    prefix = np.random.default_rng(4).standard_normal((2, 2, 2)).astype(np.float32)
+    prefix = rng.standard_normal((2, 2, 2)).astype(np.float32)
     found, expected = (
-        ttscompile.load(path, runtime).predict_action(obs, noise, "dense", given)["action_pred"]
-        for path, given in ((artifact, prefix), (plain, prefix - added))
+        ttscompile.load(compiled(once, relative), runtime).predict_action(obs, noise, "dense", given)["action_pred"]
+        for relative, given in ((Relative("obs", (2, None)), prefix), (None, prefix - added))
     )
     np.testing.assert_allclose(found, expected + added, rtol=0, atol=1e-5)
     np.testing.assert_allclose(found[:, 1:3], prefix, rtol=0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_calibration_measures_what_the_network_says(once: Once, tmp_path: Path) -> None:
-    """Two answers to one observation have the same added to them: every distance is that of the policy without."""
-    recording, found = policies.record(tmp_path / "calls.npz"), list[dict[str, Any]]()
-    for relative in (None, Relative("obs", (2, None))):
-        path, own = tmp_path / str(relative is None), policies.spec()
-        spec = replace(own, chunk=replace(own.chunk, relative=relative))
-        ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, path)
-        ttscompile.calibrate(path, [recording], 0.8, "interval", progress=False)
-        plans = (load_artifact(path).manifest.calibration or {})["plans"]
-        found.append({name: (one["error"], one["distance"]) for name, one in plans.items()})
-    assert found[0]
-    assert found[0] == found[1]
 
 
 def test_it_is_written_where_there_is_some_and_read_strictly() -> None:

@@ -1,4 +1,4 @@
-"""Actions that are relative to a measured pose, however a call is made, and from one call to the next."""
+"""Actions that are relative to a measured pose and to numbers, however a call is made, and from call to call."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tests.calibration import policies
 from tests.lower.whole_call import every_way
 from tests.once import Once
 from ttscompile import ChunkSpec, Noise, ObservationSpec, Plan, PolicySpec
+from ttscompile.artifact.golden import load_golden_plans
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.strict_json import dump, parse
@@ -162,13 +163,17 @@ def test_every_rung_of_verify_holds_and_bench_measures(made: Path) -> None:
         one.name: one.status for one in ttscompile.verify(made / "artifact", calls=2).rungs if one.name != "engaged"
     }
     assert set(rungs.values()) == {"passed", "skipped"}, rungs  # what is saved here is less than noise
+    assert set(load_golden_plans(load_artifact(made / "artifact"), 2)) == {"sparse", "warm"}
     result = CliRunner().invoke(main, ["bench", str(made / "artifact"), "--calls", "2", "--json"])
     assert result.exit_code == 0, result.output
 
 
 @pytest.mark.slow
-def test_calibration_measures_what_the_network_says(once: Once, tmp_path: Path) -> None:
-    """As of the policy that composes nothing; and what is furthest is shown as the robot's own actions."""
+def test_calibration_measures_what_the_network_says(tmp_path: Path) -> None:
+    """Two answers to one observation have the same added to them: every distance is that of the policy without.
+
+    What is furthest is shown as the robot's own actions.
+    """
     rows = [observed(seed, 6)[0]["obs"] for seed in range(6)]
     np.savez(tmp_path / "calls.npz", obs=np.concatenate(rows), episode_ends=6 * np.arange(1, 7))
     recording, found, shown = tmp_path / "calls.npz", list[Mapping[str, Any]](), list[np.ndarray]()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.plans import store_schedules
 from ttscompile.artifact import Artifact
 
 from .soak import EPISODE, median_slope
@@ -19,10 +18,9 @@ pytestmark = pytest.mark.alone
 SOAK = Path(__file__).with_name("soak.py")
 
 
-def test_calls_are_repeatable_and_leave_nothing_behind(own_artifact: Artifact) -> None:
-    store_schedules(own_artifact.path, dict(own_artifact.pruner), {}, "tts", {"strategy": "tts"})
+def test_calls_are_repeatable_and_leave_nothing_behind(pruned: Artifact) -> None:
     # A process of its own: this one has the memory of a thousand other tests to give back or to keep.
-    command = [sys.executable, str(SOAK), str(own_artifact.path), "--calls", str(60 * EPISODE)]
+    command = [sys.executable, str(SOAK), str(pruned.path), "--calls", str(60 * EPISODE)]
     result = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     assert result["repeatable"]
     assert len(result["rss_mb"]) == 10

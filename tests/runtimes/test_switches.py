@@ -4,37 +4,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import ttscompile
-from tests.lower.whole_call import Episode, inputs, make
-from ttscompile import ChunkSpec, Noise
+from tests.lower.whole_call import every_way, inputs, make
+from ttscompile import ChunkSpec
 from ttscompile.artifact import load_artifact
 from ttscompile.core.spec import Affine, Switch
 from ttscompile.errors import ObservationError, SpecError
-from ttscompile.ir.program import Program
 
 from .toys import toy_program
 
 SWITCH = Switch(channel=1, threshold=0.125, below=3.0, above=-2.0)
 
 
-@pytest.fixture(scope="module")
-def program() -> Program:
-    made = toy_program(steps=3, blocks=2, noise=0.0, pruner=False)
-    return replace(made, spec=replace(made.spec, chunk=replace(made.spec.chunk, switches=(SWITCH,))))
-
-
 @pytest.mark.slow
-def test_every_way_to_make_a_call_decides_alike(program: Program, tmp_path: Path) -> None:
+def test_every_way_to_make_a_call_decides_alike_and_takes_no_prefix(tmp_path: Path) -> None:
+    program = toy_program(steps=3, blocks=2, noise=0.0, pruner=False)
+    chunk = replace(program.spec.chunk, switches=(SWITCH,))
+    program = replace(program, spec=replace(program.spec, chunk=chunk))
     policy, model = make(program, tmp_path)
-    rng, chunk = np.random.default_rng(0), program.spec.chunk
     assert chunk.normalizer is not None
-    obs, noise = inputs(policy, rng, 3)
+    obs, noise = inputs(policy, np.random.default_rng(0), 3)
     plain = replace(chunk, switches=())
     reference = ttscompile.load(tmp_path / "artifact", "reference")
     sample, _ = reference._runtime.predict(
@@ -43,29 +36,13 @@ def test_every_way_to_make_a_call_decides_alike(program: Program, tmp_path: Path
     expected = plain.unnormalized(sample)
     expected[..., 1] = np.where(sample[..., 1] >= 0.125, -2, 3)
     assert set(np.unique(expected[..., 1])) == {-2, 3}
-    made: dict[str, Any] = {
-        name: ttscompile.load(tmp_path / "artifact", name).predict_action(obs, noise, plan="dense")["action_pred"]
-        for name in ("onnxruntime", "torch", "reference")
-    }
-    cells = np.zeros((3, 2), np.int8)
-    made["file"] = Episode(model, 3).call(obs, noise, cells)["action_pred"]
-    module = ttscompile.to_module(tmp_path / "artifact", "dense")
-    with torch.inference_mode():
-        made["module"] = module({"obs": torch.from_numpy(obs["obs"])}, torch.from_numpy(noise.initial)).numpy()
-    for name, found in made.items():
+    for name, found in every_way(tmp_path / "artifact", model, obs, noise).items():
         np.testing.assert_array_equal(found[..., 1], expected[..., 1], name)
         np.testing.assert_allclose(found[..., 0], expected[..., 0], rtol=0, atol=1e-4, err_msg=name)
-
-
-@pytest.mark.slow
-def test_such_a_policy_takes_no_prefix(program: Program, tmp_path: Path) -> None:
-    """Its actions do not say what they were denoised as."""
-    policy, _ = make(program, tmp_path)
-    obs, noise = inputs(policy, np.random.default_rng(0), 1)
-    prefix = np.zeros((1, 1, 2), np.float32)
-    with pytest.raises(ObservationError, match="takes no prefix: .*two values alone"):
-        policy.predict_action(obs, Noise(noise.initial), prefix=prefix)
     assert load_artifact(tmp_path / "artifact").manifest.spec.chunk.switches == (SWITCH,)
+    # Its actions do not say what they were denoised as.
+    with pytest.raises(ObservationError, match="takes no prefix: .*two values alone"):
+        policy.predict_action(obs, noise, prefix=np.zeros((3, 1, 2), np.float32))
 
 
 def test_the_range_of_such_a_number_is_that_of_its_values() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 import onnxruntime
@@ -13,14 +12,12 @@ from tests.rounding import bound
 from ttscompile.artifact import Artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.ir.pieces import DENSE_STEP, JOINT
-from ttscompile.ir.program import Program
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.onnxruntime.sessions import FIRST_STEP, SINGLE_THREADED, JointBlock, Sessions
 
 from .agreement import call_terms, largest_difference
+from .conftest import MakeArtifact
 from .toys import toy_program
-
-MakeArtifact = Callable[[Program], Artifact]
 
 
 @pytest.mark.parametrize("sequence_first", [False, True])

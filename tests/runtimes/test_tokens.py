@@ -37,6 +37,8 @@ pytestmark = pytest.mark.slow
 Array = npt.NDArray[Any]
 TOKENS = 37
 REUSE = TokenReuse(threshold=0.0, refresh=1000)
+FIRST, OTHER = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
+"""Of the second a patch of one camera is another."""
 
 
 @pytest.fixture(scope="module")
@@ -133,12 +135,11 @@ def test_what_is_seen_has_each_patch_as_it_was_computed_last(policy: CompiledPol
 
 def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(compiled / "artifact", tmp_path / "own")
-    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
 
     def tokens(**options: Any) -> tuple[int, int]:
         policy = ttscompile.load(folder, **options)
-        act(policy, first, first)
-        act(policy, first, other)
+        act(policy, FIRST, FIRST)
+        act(policy, FIRST, OTHER)
         return counted(policy)
 
     artifact = load_artifact(folder)
@@ -156,7 +157,7 @@ def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -
         assert tokens(runtime=runtime, plan="some@fp32") == (0, 0)
     whole = open_policy(load_artifact(folder), "reference", plan="dense")
     with pytest.raises(RuntimeUnavailableError, match="the plan reuses some"):
-        act(whole, first, other, whole.plans["some"])
+        act(whole, FIRST, OTHER, whole.plans["some"])
 
 
 def test_cameras_and_streams_share_nothing(policy: CompiledPolicy) -> None:
@@ -202,16 +203,14 @@ def test_actions_depend_on_the_frames_before_and_on_nothing_else(artifact: Artif
 
 @pytest.mark.parametrize("forget", ["reset", "forget_frames"])
 def test_nothing_is_kept_afterwards(policy: CompiledPolicy, forget: str) -> None:
-    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
-    act(policy, first, first)
+    act(policy, FIRST, FIRST)
     getattr(policy, forget)()
-    act(policy, other, other)
+    act(policy, OTHER, OTHER)
     assert counted(policy) == (74, 74)
 
 
 def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact: Artifact) -> None:
-    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
-    act(policy, first, first)
+    act(policy, FIRST, FIRST)
     frames: Any = policy._runtime._used.frames
     (tower,) = frames._tokens.values()
     plain = tower._renew
@@ -222,12 +221,12 @@ def test_after_a_failure_nothing_stale_is_read(policy: CompiledPolicy, artifact:
 
     tower._renew = failing
     with pytest.raises(ArtifactError, match="out of memory"):
-        act(policy, first, other)
+        act(policy, FIRST, OTHER)
     tower._renew = plain
-    found = act(policy, first, other)
+    found = act(policy, FIRST, OTHER)
     assert counted(policy) == (37, 37), "what was kept of this camera is gone; the other one is known"
     exact = open_policy(artifact, plan=DENSE)
-    np.testing.assert_allclose(found, act(exact, first, other), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found, act(exact, FIRST, OTHER), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("wrong", [{"patch": (1000, 1000)}, {"patch": (2, 4)}, {"fixed": 0}, {"fixed": 3}])
@@ -296,10 +295,9 @@ def test_in_eight_bits(compiled: Path) -> None:
     assert {"frame_00", "tokens_00"} <= set(record.models)
     int8 = artifact.plan("dense@int8")
     whole, some = (open_policy(artifact, seed=0, plan=plan) for plan in (int8, replace(int8, tokens=REUSE)))
-    first, other = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
-    np.testing.assert_allclose(act(some, first, first), act(whole, first, first), rtol=0, atol=1e-4)
-    near, far = act(whole, first, other), act(whole, other, frame((picture(8), picture(9))))
-    assert np.abs(act(some, first, other) - near).max() < 0.2 * np.abs(far - near).max()
+    np.testing.assert_allclose(act(some, FIRST, FIRST), act(whole, FIRST, FIRST), rtol=0, atol=1e-4)
+    near, far = act(whole, FIRST, OTHER), act(whole, OTHER, frame((picture(8), picture(9))))
+    assert np.abs(act(some, FIRST, OTHER) - near).max() < 0.2 * np.abs(far - near).max()
     assert counted(some) == (5, 37)
 
 

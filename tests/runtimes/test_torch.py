@@ -15,7 +15,6 @@ from torch.fx.experimental.proxy_tensor import make_fx
 import ttscompile
 from tests.families import cameras
 from tests.once import Once
-from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding, bound
 from ttscompile import Source
 from ttscompile.artifact import Artifact, load_artifact
@@ -31,12 +30,11 @@ from ttscompile.runtimes.torch.loop import denoise
 from ttscompile.runtimes.torch.network import Parts, Placed, StreamsNetwork
 from ttscompile.runtimes.torch.sampler import Advance
 
-from .agreement import call_terms, largest_difference, random_inputs
+from .agreement import assert_alike, call_terms, random_inputs
 from .conftest import MakeArtifact
 from .plans import random_correction, random_plan
+from .pruners import scheduled
 from .toys import toy_program
-
-VARIANTS = [{}, {"noise": 0.0, "steps": 8}, {"steps": 1}, {"blocks": 1}, {"normed": True, "sequence_first": True}]
 
 
 def replaying(lines: list[Line]) -> Callable[[Line], Line]:
@@ -56,18 +54,6 @@ def replaying(lines: list[Line]) -> Callable[[Line], Line]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", VARIANTS, ids=str)
-def test_it_agrees_with_the_reference(make_artifact: MakeArtifact, variant: dict[str, Any]) -> None:
-    """Batches of one to four streams, each with a plan of its own or all with the same."""
-    artifact = make_artifact(toy_program(**variant, pruner=False))
-    runtimes = open_runtime(artifact, "torch"), open_runtime(artifact, "reference")
-    allowed = bound(call_terms(artifact))
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        assert largest_difference(artifact, *runtimes, rng, streams=1 + seed % 4, calls=4) < allowed
-
-
-@pytest.mark.slow
 def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
     """Two streams follow one plan and the third another: residuals of an earlier call stay with their stream."""
     artifact = make_artifact(toy_program(normed=True, pruner=False))
@@ -77,9 +63,7 @@ def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
     for _ in range(4):
         one, other = (random_plan(rng, manifest.steps, manifest.groups, np.all(written, axis=0)) for _ in range(2))
         plans = np.stack([one, other, one])
-        obs, noise = random_inputs(artifact, rng, 3)
-        ours, theirs = (runtime.predict(obs, noise, Plan(cells=plans))[0] for runtime in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, call_terms(artifact))
+        assert_alike(artifact, runtimes, Plan(cells=plans), rng, 3)
         written |= plans == Source.COMPUTE
     assert isinstance(runtimes[0].backend, TorchBackend)
     assert sorted(runtimes[0].backend._some) == [1, 2]
@@ -87,16 +71,7 @@ def test_streams_with_one_plan_are_a_batch(make_artifact: MakeArtifact) -> None:
 
 @pytest.fixture
 def calibrated(make_artifact: MakeArtifact) -> Artifact:
-    """The toy with two schedules, one of which reads the rollout cache, and has a correction; and with its pruner."""
-    artifact = make_artifact(toy_program(normed=True))
-    manifest, rng = artifact.manifest, np.random.default_rng(3)
-    evenly = uniform_plan(manifest.steps, len(manifest.groups), 2)
-    mixed = random_plan(rng, manifest.steps, manifest.groups, np.ones_like(evenly, np.bool_))
-    assert (mixed == Source.ROLLOUT).any()
-    corrections = {"mixed": random_correction(artifact, rng)}
-    plans = {"evenly": evenly, "mixed": mixed}
-    store_schedules(artifact.path, dict(artifact.pruner), plans, "evenly", {}, corrections=corrections)
-    return load_artifact(artifact.path)
+    return scheduled(make_artifact(toy_program(steps=4, blocks=3, normed=True)))
 
 
 def both(artifact: Artifact, lines: list[Line]) -> list[Runtime]:
@@ -113,9 +88,7 @@ def test_a_call_is_captured_once_and_replayed_on_other_inputs(calibrated: Artifa
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(0)
     for called in (DENSE, name, name, name):
-        obs, noise = random_inputs(calibrated, rng, streams)
-        ours, theirs = (runtime.predict(obs, noise, calibrated.plans[called])[0] for runtime in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, 2 * call_terms(calibrated))
+        assert_alike(calibrated, runtimes, calibrated.plans[called], rng, streams, times=2)
     assert len(lines) == (1 if name == DENSE else 2)
 
 
@@ -124,12 +97,9 @@ def test_the_first_call_of_an_episode_is_captured_too(calibrated: Artifact) -> N
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(0)
     for _ in range(2):
-        obs, noise = random_inputs(calibrated, rng, 1)
-        samples = []
+        assert_alike(calibrated, runtimes, calibrated.plans["mixed"], rng)
         for runtime in runtimes:
             runtime.reset()
-            samples.append(runtime.predict(obs, noise, calibrated.plans["mixed"])[0])
-        assert_equal_but_for_rounding(samples[0], samples[1], call_terms(calibrated))
     assert len(lines) == 1
 
 
@@ -146,11 +116,9 @@ def test_what_a_pruner_decides_selects_among_captured_calls_and_a_matrix_is_capt
         assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
         seen.add(report.plan.tobytes())
     assert len(lines) == 1 + len(seen)  # the prologue is a line of its own, since the pruner reads it
-    matrix = random_plan(rng, 5, calibrated.manifest.groups, np.zeros((5, 5), np.bool_))
+    matrix = random_plan(rng, 4, calibrated.manifest.groups, np.zeros((4, 3), np.bool_))
     for number in range(3):
-        obs, noise = random_inputs(calibrated, rng, 1)
-        ours, theirs = (runtime.predict(obs, noise, Plan(cells=matrix))[0] for runtime in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
+        assert_alike(calibrated, runtimes, Plan(cells=matrix), rng)
         assert len(lines) == 1 + len(seen) + (number > 0)
 
 
@@ -178,9 +146,7 @@ def test_another_batch_size_is_captured_anew(calibrated: Artifact) -> None:
     lines: list[Line] = []
     runtimes, rng = both(calibrated, lines), np.random.default_rng(1)
     for streams in (1, 1, 2, 2, 1):
-        obs, noise = random_inputs(calibrated, rng, streams)
-        ours, theirs = (runtime.predict(obs, noise, calibrated.plans["evenly"])[0] for runtime in runtimes)
-        assert_equal_but_for_rounding(ours, theirs, call_terms(calibrated))
+        assert_alike(calibrated, runtimes, calibrated.plans["evenly"], rng, streams)
         for runtime in runtimes:
             runtime.reset()
     assert len(lines) == 3

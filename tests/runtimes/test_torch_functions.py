@@ -20,7 +20,7 @@ from ttscompile.runtimes.torch.functions import write_function
 from .toys import B, f32, node
 
 
-def attention(streams_first: bool) -> Graph:
+def attention() -> Graph:
     """Products, moves of all sorts that change how memory is seen, and constants that can be computed ahead."""
     x, wide, heads = f32(B, 3, 4), f32(B, 3, 8), f32(B, 2, 3, 4)
     nodes = (
@@ -35,13 +35,13 @@ def attention(streams_first: bool) -> Graph:
         node("a", "add.Tensor", heads, Ref("h"), Ref("u")),
         node("p", "permute.default", f32(3, B, 4, 2), Ref("a"), (2, 0, 3, 1)),
         node("c", "reshape.default", f32(3, B, 8), Ref("p"), (3, B, 8)),
-        node("z", "sum.dim_IntList", x if streams_first else f32(3, B), Ref("c"), (2,)),
+        node("z", "sum.dim_IntList", f32(3, B), Ref("c"), (2,)),
     )
     return Graph({"x": x}, {"w": f32(8, 4), "b": f32(8)}, nodes, ("z", "h", "x"))
 
 
 def test_a_function_computes_what_its_graph_says_and_nothing_of_constants_alone() -> None:
-    graph, rng = attention(False), torch.Generator().manual_seed(0)
+    graph, rng = attention(), torch.Generator().manual_seed(0)
     weights = {name: torch.randn(kind.at(1), generator=rng) for name, kind in graph.constants.items()}
     for streams in (1, 3):
         function = write_function(graph, weights, [torch.zeros(streams, 3, 4)], streams, None)
@@ -105,12 +105,18 @@ def rms_graph(axis: int = -1, power: int = 2) -> Graph:
     return Graph({"x": kind}, {"w": f32(4), "wide": f32(4, 4)}, nodes, ("q", "k", "normed"))
 
 
+def drawn(graph: Graph) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Weights of a graph, and what it is given: two streams ``[2, 3, 4]``."""
+    draw = torch.Generator().manual_seed(0)
+    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
+    return weights, torch.randn(2, 3, 4, generator=draw)
+
+
 @pytest.mark.parametrize(("axis", "power", "fused"), [(-1, 2, True), (-1, 4, False), (-2, 2, False)])
 def test_an_rms_norm_is_one_operation(axis: int, power: int, fused: bool) -> None:
     """And nothing else is, which only looks like it; of axis -2 the mean is of another shape, which broadcasts too."""
-    graph, draw = rms_graph(axis, power), torch.Generator().manual_seed(0)
-    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
-    x = torch.randn(2, 3, 4, generator=draw)
+    graph = rms_graph(axis, power)
+    weights, x = drawn(graph)
     function = write_function(graph, weights, [x], 2, None)
     calls = function.__code__.co_names
     assert (torch.rms_norm in [function.__globals__[name] for name in calls]) == fused
@@ -119,9 +125,8 @@ def test_an_rms_norm_is_one_operation(axis: int, power: int, fused: bool) -> Non
 
 
 def test_what_several_products_read_is_narrowed_once() -> None:
-    graph, draw = rms_graph(), torch.Generator().manual_seed(0)
-    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
-    x = torch.randn(2, 3, 4, generator=draw)
+    graph = rms_graph()
+    weights, x = drawn(graph)
     with torch.autocast("cpu", torch.bfloat16):
         function = write_function(graph, weights, [x], 2, torch.bfloat16)
         found, expected = function(x), evaluate(graph, weights, {"x": x})
@@ -133,11 +138,10 @@ def test_what_several_products_read_is_narrowed_once() -> None:
 
 def test_an_rms_norm_of_a_product_stays_in_fp32() -> None:
     """What a product gives is narrow, and torch would norm it in that type; so it is computed as it was captured."""
-    graph, draw = rms_graph(), torch.Generator().manual_seed(0)
+    graph = rms_graph()
     first = node("x", "linear.default", f32(B, 3, 4), Ref("given"), Ref("wide"))
     graph = replace(graph, inputs={"given": f32(B, 3, 4)}, nodes=(first, *graph.nodes), outputs=("normed",))
-    weights = {name: torch.randn(kind.at(1), generator=draw) for name, kind in graph.constants.items()}
-    x = torch.randn(2, 3, 4, generator=draw)
+    weights, x = drawn(graph)
     with torch.autocast("cpu", torch.bfloat16):
         found = write_function(graph, weights, [x], 2, torch.bfloat16)(x)[0]
         expected = evaluate(graph, weights, {"given": x})[0]

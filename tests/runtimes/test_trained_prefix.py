@@ -7,14 +7,14 @@ from math import prod
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 
 import ttscompile
+from tests.lower.whole_call import every_way
 from tests.once import Once
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile import ObservationSpec, Source
+from ttscompile import ObservationSpec
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.lattice import dense_plan
@@ -25,14 +25,11 @@ from ttscompile.ir.program import Binding
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import known_samples, noise_levels, prefix_refusal
 from ttscompile.runtimes.reference.model import ReferenceModel
-from ttscompile.runtimes.single_file import inputs_of
 
 from . import committed
-from .agreement import call_terms, random_inputs
+from .agreement import RUNTIMES, call_terms, corrected_episode, random_inputs
 from .committed import ACTIONS, HORIZON, LONGEST, START, WIDTH, Network
-from .plans import random_correction, random_plan
-
-RUNTIMES = ("onnxruntime", "torch", "reference")
+from .plans import random_correction
 
 
 @pytest.fixture(params=committed.SAMPLERS)
@@ -48,25 +45,13 @@ def artifact_of(once: Once, sampler: str) -> Artifact:
 @pytest.mark.parametrize("streams", [1, 3])
 def test_runtimes_agree_with_random_plans_and_prefixes(once: Once, sampler: str, streams: int) -> None:
     """Lengths go up and down, with calls without a prefix and corrections in between."""
-    artifact = artifact_of(once, sampler)
-    manifest, rng = artifact.manifest, np.random.default_rng(streams)
-    runtimes = [open_runtime(artifact, name) for name in RUNTIMES]
+    artifact, rng = artifact_of(once, sampler), np.random.default_rng(streams)
     corrections = [None, random_correction(artifact, rng), random_correction(artifact, rng)]
-    written = np.zeros((streams, manifest.steps, len(manifest.groups)), np.bool_)
-    terms = call_terms(artifact) + manifest.steps * 6 * HORIZON
-    for call, length in enumerate((2, 3, None, 1, 3, 0, 2)):
-        plans = np.stack([random_plan(rng, manifest.steps, manifest.groups, cells) for cells in written])
-        obs, noise = random_inputs(artifact, rng, streams)
-        prefix = None if length is None else rng.uniform(-1, 1, (streams, length, ACTIONS)).astype(np.float32)
-        plan = Plan(cells=plans, correction=corrections[call % 3])
-        *ours, theirs = (runtime.predict(obs, noise, plan, prefix=prefix)[0] for runtime in runtimes)
-        for each in ours:
-            assert_equal_but_for_rounding(each, theirs, terms)
+    for samples, prefix in corrected_episode(artifact, rng, streams, corrections, (2, 3, None, 1, 3, 0, 2)):
         if prefix is not None:
-            here = slice(START, START + prefix.shape[1])
-            np.testing.assert_array_equal(theirs[:, here, :ACTIONS], prefix)
-            assert not theirs[:, here, ACTIONS:].any()  # channels that are no actions
-        written |= plans == Source.COMPUTE
+            here = samples[-1][:, START : START + prefix.shape[1]]
+            np.testing.assert_array_equal(here[..., :ACTIONS], prefix)
+            assert not here[..., ACTIONS:].any()  # channels that are no actions
 
 
 @pytest.mark.slow
@@ -176,15 +161,7 @@ def test_a_module_and_a_single_file_compute_the_call_without_a_prefix(tmp_path: 
     folder, file = tmp_path / "compiled", tmp_path / "whole.onnx"
     ttscompile.compile_denoiser(Network(), committed.spec(committed.rk4()), folder, single_file=file)
     artifact = load_artifact(folder)
-    manifest = artifact.manifest
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 2)
-    expected = ttscompile.load(folder).predict_action(obs, ttscompile.Noise(noise.initial), plan="dense")["action_pred"]
-    module = ttscompile.to_module(folder, plan="dense")
-    found = module({"obs": torch.from_numpy(obs["obs"])}, torch.from_numpy(noise.initial))
-    assert_equal_but_for_rounding(found.numpy(), expected, call_terms(artifact))
-    session = onnxruntime.InferenceSession(str(file))
-    cells = (2, manifest.steps, len(manifest.groups))
-    rows = np.zeros((0, *manifest.blocks[0].type.at(1)), np.float32)
-    given = {"initial_noise": noise.initial, "rollout_rows": rows, "rollout_index": np.full(cells, -1)}
-    (found,) = session.run(["action_pred"], {**obs, **given, **inputs_of(folder, "dense")})
-    assert_equal_but_for_rounding(found, expected, call_terms(artifact))
+    made = every_way(folder, file.read_bytes(), obs, ttscompile.Noise(noise.initial))
+    for found in made.values():
+        assert_equal_but_for_rounding(found, made["reference"], call_terms(artifact))

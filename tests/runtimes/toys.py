@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile import Affine, ChunkSpec, Noise, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.write import write_artifact
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
@@ -225,6 +225,12 @@ def toy_program(
         chunk=ChunkSpec(channels, 1, horizon, Affine(np.array([0.5, 4.0]), np.array([1.0, -1.0]))),
     )
     return assemble(spec, pieces, kinds, stream, weights)
+
+
+def some_noise(streams: int = 2, seed: int = 0) -> Noise:
+    """Of a call of ``toy_program()``."""
+    rng, shape = np.random.default_rng(seed), (streams, 3, 2)
+    return Noise(rng.standard_normal(shape, dtype=np.float32), rng.standard_normal((5, *shape), dtype=np.float32))
 
 
 def as_functions(program: Program, obs: npt.NDArray[np.float32], noise: npt.NDArray[np.float32] | None) -> Toy:

@@ -9,18 +9,24 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 
-from ttscompile import ChunkSpec, ObservationSpec
+from ttscompile import Affine, ChunkSpec, ObservationSpec
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
 REAL_LIMIT = 20.0
 """Seconds of real time after which a thread that should have moved is called stuck."""
 TO, TA = 2, 8
+NORMALIZER = Affine(np.array([0.5, -0.1]), np.array([0.0, 1.0]))
+"""Of two numbers, which are in -2..2 and 0..20."""
+
+
+def rows(*values: tuple[float, float]) -> np.ndarray:
+    return np.array(values, np.float32)
 
 
 class FakeClock:
@@ -184,6 +190,27 @@ class ScriptedPolicy:
                 self.clock.wait(self._released, None if self._hanging else until - self.clock.now())
 
 
+@dataclass
+class Told(ScriptedPolicy):
+    """Attributes: prefixes: what each call was told to be committed, float32 ``[N, 3]``."""
+
+    prefixes: list[np.ndarray] = field(default_factory=list)
+
+    def predict_action(
+        self, obs_dict: Mapping[str, Any], *, plan: str, prefix: np.ndarray | None = None
+    ) -> dict[str, Any]:
+        if prefix is not None:
+            self.prefixes.append(prefix[0])
+        return super().predict_action(obs_dict, plan=plan)
+
+
+class Quick(ScriptedPolicy):
+    """It takes no time, not even its clock's, and nothing moves."""
+
+    def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> dict[str, Any]:
+        return {"action_pred": np.zeros((1, 16, 3), np.float32)}
+
+
 class World:
     """An executor over a scripted policy; times are offsets from the start, so that float32 actions hold them."""
 
@@ -234,9 +261,15 @@ class World:
         self.executor.action(timeout=10.0)
         self.clock.advance(1 / self.hz)
 
+    def run(self, ticks: int) -> np.ndarray:
+        """Begin, and then so many ticks; their actions ``[ticks, Da]``."""
+        self.begin()
+        return np.stack([self.tick() for _ in range(ticks)])
+
     def run_until_starved(self, ticks: int = 100) -> tuple[list[np.ndarray], DeadlineMissedError]:
-        """Tick until there is no action; the actions before that, and the error."""
+        """Begin, and tick until there is no action; the actions before that, and the error."""
         made: list[np.ndarray] = []
+        self.begin()
         for _ in range(ticks):
             self.observe()
             try:
@@ -254,6 +287,27 @@ class World:
         self.policy.release()
         self.executor.close(timeout=REAL_LIMIT)
         assert workers() == []
+
+
+def given_out(
+    settings: ExecutorSettings, action: ChunkSpec, reserve: int, actions: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Thirty actions of a policy of these chunks, whose loop has two ticks a step where it interpolates."""
+    policy = ScriptedPolicy(FakeClock(), actions=actions, reserve=reserve)
+    policy.info = replace(policy.info, action=action, sample=(policy.predicted, action.action_dim))
+    with World(20.0 if settings.interpolation == "linear" else 10.0, settings, policy) as world:
+        return world.run(30)
+
+
+def opened_meanwhile(policy: ScriptedPolicy, settings: ExecutorSettings | None = None) -> AsyncExecutor:
+    """An executor that measures its policy. Its maker waits for that in real time: another thread, as time goes on."""
+    made: list[AsyncExecutor] = []
+    opener = threading.Thread(target=lambda: made.append(AsyncExecutor(policy, 10, settings, clock=policy.clock)))
+    opener.start()
+    while opener.is_alive():
+        policy.clock.advance(0.05)
+    opener.join()
+    return made[0]
 
 
 def actions_of(

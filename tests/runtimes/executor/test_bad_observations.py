@@ -65,9 +65,7 @@ def test_late_frames_and_frames_out_of_order_still_make_windows() -> None:
 
 def test_a_frame_that_comes_far_too_late_is_counted_and_left_out() -> None:
     with World() as world:
-        world.begin()
-        for _ in range(30):
-            world.tick()
+        world.run(30)
         world.observe(at=0.5)
         assert world.executor.statistics().frames_late == 1
 

@@ -17,6 +17,7 @@ from tests.plans import store_schedules
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import AsyncExecutor, ExecutorSettings, GuardLimits, Source
 from ttscompile.errors import DeadlineMissedError
+from ttscompile.runtimes.executor import ExecutorStatistics
 from ttscompile.runtimes.policy import CompiledPolicy
 
 from .simulation import FakeClock
@@ -41,7 +42,7 @@ class Slow:
     """
 
     def __init__(self, policy: CompiledPolicy, clock: FakeClock, seed: int) -> None:
-        self.info, self._policy, self._clock, self._chance = policy.info, policy, clock, random.Random(seed)
+        self.info, self._policy, self.clock, self._chance = policy.info, policy, clock, random.Random(seed)
         self.episodes: list[list[tuple[Mapping[str, Any], ttscompile.Noise, str, np.ndarray]]] = [[]]
         self.read, self._waits = 0, threading.Condition()
 
@@ -56,11 +57,35 @@ class Slow:
         self.read += int((self._policy.last_report.plan == Source.ROLLOUT).sum())
         obs = {key: np.array(one) for key, one in obs_dict.items()}
         self.episodes[-1].append((obs, noise, plan, made["action_pred"]))
-        until = self._clock.now() + TYPICAL * self._chance.choice([1, 1, 1, 20])  # the last is late for its chunk
+        until = self.clock.now() + TYPICAL * self._chance.choice([1, 1, 1, 20])  # the last is late for its chunk
         with self._waits:
-            while self._clock.now() < until:
-                self._clock.wait(self._waits, until - self._clock.now())
+            while self.clock.now() < until:
+                self.clock.wait(self._waits, until - self.clock.now())
         return made
+
+
+def driven(policy: Slow, seed: int, resets: float = 0.0, **settings: Any) -> ExecutorStatistics:
+    """What a loop of 250 ticks counts, after a share of which the executor is reset."""
+    clock, chance, draw = policy.clock, random.Random(seed), np.random.default_rng(seed)
+    own, latencies = ExecutorSettings(n_obs_steps=1, **settings), {PLAN: TYPICAL, "dense": TYPICAL}
+    executor = AsyncExecutor(policy, HZ, own, clock=clock, latencies=latencies)
+    shape = next(iter(policy.info.observation.values())).shape
+    clock.settle()
+    try:
+        for _ in range(250):
+            executor.observe({"obs": draw.standard_normal(shape[-1]).astype(np.float32)})
+            clock.settle()
+            if executor.ready:
+                with suppress(DeadlineMissedError):
+                    executor.action()
+            clock.advance(1 / HZ)
+            if chance.random() < resets:
+                executor.reset()  # a call under way is not waited for: what it gives is dropped
+                clock.settle()
+    finally:
+        clock.free()
+        executor.close()
+    return executor.statistics()
 
 
 def drawn(policy: CompiledPolicy, number: int) -> ttscompile.Noise:
@@ -74,28 +99,8 @@ def drawn(policy: CompiledPolicy, number: int) -> ttscompile.Noise:
 @pytest.mark.parametrize("seed", range(2))
 def test_late_calls_dropped_chunks_and_resets(pruned: Path, seed: int) -> None:
     """Every call is answered as by a policy that made the same calls of this episode, and no others."""
-    clock, chance = FakeClock(), random.Random(seed)
-    policy = Slow(ttscompile.load(pruned), clock, seed)
-    settings = ExecutorSettings(n_obs_steps=1)
-    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies={PLAN: TYPICAL})
-    shape = next(iter(policy.info.observation.values())).shape
-    draw = np.random.default_rng(seed)
-    clock.settle()
-    try:
-        for _ in range(250):
-            executor.observe({"obs": draw.standard_normal(shape[-1]).astype(np.float32)})
-            clock.settle()
-            if executor.ready:
-                with suppress(DeadlineMissedError):
-                    executor.action()
-            clock.advance(1 / HZ)
-            if chance.random() < 0.03:
-                executor.reset()  # a call under way is not waited for: what it gives is dropped
-                clock.settle()
-    finally:
-        clock.free()
-        executor.close()
-    counted = executor.statistics()
+    policy = Slow(ttscompile.load(pruned), FakeClock(), seed)
+    counted = driven(policy, seed, resets=0.03)
     assert counted.chunks_discarded > 3
     assert counted.chunks_refused > 3  # by the guard: its bounds are those of the toy's data
     assert counted.latency_ms is not None
@@ -109,29 +114,10 @@ def test_late_calls_dropped_chunks_and_resets(pruned: Path, seed: int) -> None:
 @pytest.mark.slow
 def test_a_call_after_a_stall_goes_on_from_nothing(pruned: Path) -> None:
     """With a reach that no action leaves; what the calls before computed is read neither by this call nor later."""
-    clock = FakeClock()
-    policy = Slow(ttscompile.load(pruned), clock, 0)
-    settings = ExecutorSettings(
-        n_obs_steps=1, tiers=(PLAN,), stall_after=2.0, stall_range=1e9, guard=GuardLimits(low=-1e9, high=1e9)
-    )
-    latencies = {PLAN: TYPICAL, "dense": TYPICAL}
-    executor = AsyncExecutor(policy, HZ, settings, clock=clock, latencies=latencies)
-    shape = next(iter(policy.info.observation.values())).shape
-    draw = np.random.default_rng(0)
-    clock.settle()
-    try:
-        for _ in range(250):
-            executor.observe({"obs": draw.standard_normal(shape[-1]).astype(np.float32)})
-            clock.settle()
-            if executor.ready:
-                with suppress(DeadlineMissedError):
-                    executor.action()
-            clock.advance(1 / HZ)
-    finally:
-        clock.free()
-        executor.close()
+    policy, guard = Slow(ttscompile.load(pruned), FakeClock(), 0), GuardLimits(low=-1e9, high=1e9)
+    counted = driven(policy, 0, tiers=(PLAN,), stall_after=2.0, stall_range=1e9, guard=guard)
     first, *others = policy.episodes[1:]  # the first reset is before the first call
-    assert len(others) == executor.statistics().stalls > 2
+    assert len(others) == counted.stalls > 2
     assert [episode[0][2] for episode in others] == ["dense"] * len(others)
     assert {plan for episode in (first, *others) for _, _, plan, _ in episode[1:]} == {PLAN}
     require_alone(pruned, policy)

@@ -6,19 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ttscompile import Affine
 from ttscompile.errors import DeadlineMissedError, ExecutorError
 from ttscompile.runtimes.executor import ExecutorSettings, ExecutorStatistics, GuardLimits
 from ttscompile.runtimes.executor.guard import Guard
 
-from .simulation import FakeClock, ScriptedPolicy, World
+from .simulation import NORMALIZER, FakeClock, ScriptedPolicy, World, rows
 
-NORMALIZER = Affine(np.array([0.5, -0.1]), np.array([0.0, 1.0]))  # -2..2 and 0..20
 NOTHING = np.empty((0, 2), np.float32)
-
-
-def rows(*values: tuple[float, float]) -> np.ndarray:
-    return np.array(values, np.float32)
 
 
 @given(

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from ttscompile import Affine
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor.feasibility import MOST_PATIENCE, Feasibility, LatencyWindow, Tiers
 from ttscompile.runtimes.executor.guard import Guard, GuardLimits
+
+from .simulation import NORMALIZER, rows
 
 
 def test_the_arithmetic_of_push_t() -> None:
@@ -123,38 +124,29 @@ def test_one_plan_has_nowhere_to_go() -> None:
     assert tiers.plan == "only"
 
 
-NORMALIZER = Affine(np.array([0.5, -0.1]), np.array([0.0, 1.0]))  # -2..2 and 0..20
-
-
-def chunk(*rows: tuple[float, float]) -> np.ndarray:
-    return np.array(rows, np.float32)
-
-
 def test_the_guard_takes_its_bounds_from_the_normaliser() -> None:
     guard = Guard(GuardLimits(margin=0.1), NORMALIZER, 2)
-    assert guard.refuse(chunk((-2.4, -2), (2.4, 22))) is None
-    assert guard.refuse(chunk((0, 0), (2.41, 0))) == "action 1, channel 0, is 2.41; the bounds are -2.4 to 2.4"
-    assert "channel 1, is -2.1" in str(guard.refuse(chunk((0, -2.1))))
-    assert Guard(GuardLimits(), None, 2).refuse(chunk((1e30, -1e30))) is None
-    assert Guard(GuardLimits(low=0.0), NORMALIZER, 2).refuse(chunk((-0.1, 5))) is not None
+    assert guard.refuse(rows((-2.4, -2), (2.4, 22))) is None
+    assert guard.refuse(rows((0, 0), (2.41, 0))) == "action 1, channel 0, is 2.41; the bounds are -2.4 to 2.4"
+    assert "channel 1, is -2.1" in str(guard.refuse(rows((0, -2.1))))
+    assert Guard(GuardLimits(), None, 2).refuse(rows((1e30, -1e30))) is None
+    assert Guard(GuardLimits(low=0.0), NORMALIZER, 2).refuse(rows((-0.1, 5))) is not None
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_the_guard_refuses_what_is_no_number_with_and_without_bounds(bad: float) -> None:
     for normalizer in (None, NORMALIZER):
-        assert (
-            Guard(GuardLimits(), normalizer, 2).refuse(chunk((0, 5), (bad, 5))) == "1 of its 4 numbers are not finite"
-        )
+        assert Guard(GuardLimits(), normalizer, 2).refuse(rows((0, 5), (bad, 5))) == "1 of its 4 numbers are not finite"
 
 
 def test_the_guard_limits_steps_the_seam_included() -> None:
     guard = Guard(GuardLimits(max_step=[1.0, 5.0]), None, 2)
     nothing = np.empty((0, 2), np.float32)
-    assert guard.refuse_motion(nothing, chunk((9, 9))) is None
-    assert guard.refuse_motion(chunk((0, 0)), chunk((1, 5), (0, 0))) is None
-    assert guard.refuse_motion(chunk((0, 0)), chunk((1.5, 0))) == "its step of 1.5 in channel 0 exceeds the limit of 1"
-    assert "channel 1" in str(guard.refuse_motion(nothing, chunk((0, 0), (0, 6))))
-    assert guard.refuse_motion(chunk((9, 9), (0, 0)), chunk((0, 0))) is None  # what was played cannot be undone
+    assert guard.refuse_motion(nothing, rows((9, 9))) is None
+    assert guard.refuse_motion(rows((0, 0)), rows((1, 5), (0, 0))) is None
+    assert guard.refuse_motion(rows((0, 0)), rows((1.5, 0))) == "its step of 1.5 in channel 0 exceeds the limit of 1"
+    assert "channel 1" in str(guard.refuse_motion(nothing, rows((0, 0), (0, 6))))
+    assert guard.refuse_motion(rows((9, 9), (0, 0)), rows((0, 0))) is None  # what was played cannot be undone
 
 
 def test_the_guard_limits_jerk() -> None:

@@ -88,9 +88,7 @@ def seeing(cost: float = COST, breaks: int | None = None, hz: float = 10.0, rese
 
 def test_a_call_waits_for_its_newest_frame_alone() -> None:
     with seeing() as world:
-        world.begin()
-        for _ in range(5 * TA):
-            world.tick()
+        world.run(5 * TA)
         policy: Any = world.policy
         assert policy.waited == [ROWS] * len(policy.calls)
         assert len(policy.calls) >= 5
@@ -104,9 +102,7 @@ def test_a_call_waits_for_its_newest_frame_alone() -> None:
 
 def test_between_the_frames_of_a_window_none_is_prepared() -> None:
     with seeing(cost=0.01, hz=50.0) as world:
-        world.begin()
-        for _ in range(5 * 4 * TA):
-            world.tick()
+        world.run(5 * 4 * TA)
         policy: Any = world.policy
     assert set(policy.waited) == {ROWS}
     assert len(policy.early) <= len(policy.calls) + 1
@@ -124,14 +120,6 @@ def test_frames_of_a_camera_that_is_faster_than_the_policy_and_not_punctual(rese
     assert len(policy.calls) >= 8
     assert np.mean(np.array(policy.waited) == ROWS) >= 0.8, "the frames that calls read were others"
     assert len(policy.early) <= 2 * len(policy.calls)
-
-
-def test_a_policy_without_frame_pieces_is_asked_for_none() -> None:
-    with World() as world:  # its policy has no prepare_frame
-        world.begin()
-        for _ in range(3 * TA):
-            world.tick()
-        assert world.executor.statistics().frames_early == 0
 
 
 @pytest.mark.parametrize(
@@ -164,9 +152,7 @@ def test_cameras_of_another_window_than_the_policys(
             return {key: value for key, value in {**super().frame(at), **pictures}.items() if key in own}
 
     with Seen(10.0, ExecutorSettings(policy_hz=10.0), policy) as world:
-        world.begin()
-        for _ in range(3 * TA):
-            world.tick()
+        world.run(3 * TA)
         assert len(policy.calls) >= 2
     assert bool(given) is asked
     assert all(one["wrist"] == one["head"] == (1, 3, 2, 2) for one in given)
@@ -205,10 +191,8 @@ def test_a_frame_that_another_takes_the_place_of_is_left() -> None:
 @pytest.mark.parametrize("breaks", [0, 1, 5])
 def test_what_fails_is_told_and_no_action_comes_of_it(breaks: int) -> None:
     world = seeing(breaks=breaks)
-    with pytest.raises(WorkerDeadError) as raised, world:  # noqa: PT012
-        world.begin()
-        for _ in range(3 * TA):
-            world.tick()
+    with pytest.raises(WorkerDeadError) as raised, world:
+        world.run(3 * TA)
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 

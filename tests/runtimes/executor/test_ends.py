@@ -105,15 +105,6 @@ def test_a_missing_action_keeps_nothing_of_the_callers() -> None:
         gc.enable()
 
 
-def test_closing_twice_is_closing_once() -> None:
-    executor = opened(ScriptedPolicy(FakeClock()))
-    executor.close()
-    executor.close()
-    with pytest.raises(ExecutorClosedError):
-        executor.observe({"obs": np.zeros(2)})
-    assert executor.statistics().frames == 0
-
-
 def test_the_policy_may_close_the_executor_that_calls_it() -> None:
     policy = Calling(lambda: executor.close())
     executor: AsyncExecutor = opened(policy)

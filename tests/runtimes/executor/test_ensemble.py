@@ -130,8 +130,7 @@ def test_it_is_much_smoother_than_to_replace() -> None:
         policy.actions = lambda _: rng.normal(0, 1, (policy.predicted, 3)).astype(np.float32)
         settings = ExecutorSettings(seam=seam, horizon=1, ensemble_coefficient=0.0)
         with World(settings=settings, policy=policy) as world:
-            world.begin()
-            return float(np.diff([world.tick() for _ in range(80)][12:], axis=0).std())
+            return float(np.diff(world.run(80)[12:], axis=0).std())
 
     assert roughness("ensemble") < 0.35 * roughness("replace")
 

@@ -29,7 +29,7 @@ from ttscompile.runtimes.arrays import check_observation
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits, settings
 from ttscompile.runtimes.executor.measure import some_observation
 
-from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, World
+from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, Told, World, opened_meanwhile
 
 
 def test_every_tick_has_the_action_for_its_time() -> None:
@@ -46,6 +46,7 @@ def test_every_tick_has_the_action_for_its_time() -> None:
             assert 0 <= index < TA
         counted = world.executor.statistics()
     assert (counted.ticks, counted.holds, counted.starved, counted.deadlines_missed) == (61, 0, 0, 0)
+    assert counted.frames_early == 0, "a policy without pieces for frames is asked for none"
     assert counted.chunks == counted.calls == len(world.policy.calls)
     assert counted.latency_ms is not None and counted.latency_ms.p50 == pytest.approx(100)
 
@@ -56,9 +57,7 @@ def test_calls_start_with_the_last_frame_that_comes_early_enough() -> None:
     The first chunk begins when its call is done, 0.1 s after its frame.
     """
     with World() as world:
-        world.begin()
-        for _ in range(60):
-            world.tick()
+        world.run(60)
         starts = np.array([start for start, _, _ in world.policy.calls])
         counted = world.executor.statistics()
     np.testing.assert_allclose(np.diff(starts), [0.6, *[0.5] * (len(starts) - 2)], atol=1e-6)
@@ -67,21 +66,10 @@ def test_calls_start_with_the_last_frame_that_comes_early_enough() -> None:
     assert counted.observation_age_ms.max == 0
 
 
-def test_the_window_holds_consecutive_frames_of_one_episode() -> None:
-    with World() as world:
-        world.begin()
-        for _ in range(30):
-            world.tick()
-        for _, _, obs in world.policy.calls:
-            (first, second) = obs[0]
-            assert second[1] - first[1] == pytest.approx(0.1)
-
-
 def test_a_slow_start_plays_what_is_left_of_the_chunk() -> None:
     """Three actions are given out while a chunk is computed: it is played from its fourth on."""
     with World(latency={"dense": 0.25}) as world:
-        world.begin()
-        seen = [world.tick() for _ in range(30)]
+        seen = world.run(30)
     changes = [b[2] for a, b in pairwise(seen) if a[1] != b[1]]
     assert changes
     assert set(changes) <= {3.0, 4.0}  # 0.25 s of inference and one tick of margin
@@ -91,8 +79,7 @@ def test_a_slow_start_plays_what_is_left_of_the_chunk() -> None:
 def test_the_same_times_give_the_same_actions() -> None:
     def run() -> list[float]:
         with World(20, ExecutorSettings(policy_hz=10, seam="blend", interpolation="linear")) as world:
-            world.begin()
-            return [float(x) for _ in range(100) for x in world.tick()]
+            return [float(x) for x in world.run(100).ravel()]
 
     assert run() == run()
 
@@ -178,8 +165,7 @@ def test_reset_starts_an_episode_and_passes_the_seed_on() -> None:
         world.episode = 1
         with pytest.raises(DeadlineMissedError, match="0 of 2 frames"):
             world.executor.action()
-        world.begin()
-        assert world.tick()[0] == 1
+        assert world.run(1)[0, 0] == 1
         assert world.policy.resets == [None, 7]
         assert world.executor.statistics().resets == 1
 
@@ -205,15 +191,7 @@ def test_the_prefix_seam_is_refused_for_a_policy_that_cannot_inpaint() -> None:
 def test_the_prefix_seam_gives_the_policy_what_is_committed(trained: int) -> None:
     """Of a policy that was trained with a prefix no longer one, in a loop that knowingly asks for it."""
 
-    class Inpainting(ScriptedPolicy):
-        prefixes: list[np.ndarray] = []  # noqa: RUF012
-
-        def predict_action(self, obs_dict, *, plan, prefix):  # type: ignore[no-untyped-def, override]
-            self.prefixes.append(prefix)
-            return super().predict_action(obs_dict, plan=plan)
-
-    clock = FakeClock()
-    policy = Inpainting(clock, {"dense": 0.2})
+    policy = Told(FakeClock(), {"dense": 0.2})
     settings = ExecutorSettings(seam="prefix")
     if trained:
         vars(policy.info).update(trained_prefix=trained)
@@ -224,12 +202,12 @@ def test_the_prefix_seam_gives_the_policy_what_is_committed(trained: int) -> Non
     with World(settings=settings, policy=policy) as world:
         world.begin()
         played = {round(world.hz * world.time): world.tick() for _ in range(20)}
-    assert policy.prefixes[0].shape == (1, 0, 3)
+    assert policy.prefixes[0].shape == (0, 3)
     for (start, _, _), prefix in list(zip(policy.calls, policy.prefixes, strict=True))[1:3]:
         tick = round(world.hz * (start - world.start))
-        assert prefix.shape == (1, trained or 3, 3)  # now, and the two ticks that the call will take
-        np.testing.assert_array_equal(prefix[0, :2], [played[tick], played[tick + 1]])
-        assert trained or prefix[0, 2, 2] == prefix[0, 1, 2] + 1
+        assert prefix.shape == (trained or 3, 3)  # now, and the two ticks that the call will take
+        np.testing.assert_array_equal(prefix[:2], [played[tick], played[tick + 1]])
+        assert trained or prefix[2, 2] == prefix[1, 2] + 1
 
 
 def test_what_is_infeasible_is_refused_with_the_arithmetic() -> None:
@@ -245,16 +223,8 @@ def test_what_is_infeasible_is_refused_with_the_arithmetic() -> None:
 
 
 def test_latencies_are_measured_if_they_are_not_given_and_warm_up_does_not_count() -> None:
-    clock = FakeClock()
-    policy = ScriptedPolicy(clock, {"dense": 0.1}, fault={0: 5.0, 1: 3.0})
-    # The constructor waits for the worker in real time, so somebody else has to advance the clock.
-    made: list[AsyncExecutor] = []
-    opener = threading.Thread(target=lambda: made.append(AsyncExecutor(policy, 10, clock=clock)))
-    opener.start()
-    while opener.is_alive():
-        clock.advance(0.05)
-    opener.join()
-    (executor,) = made
+    policy = ScriptedPolicy(FakeClock(), {"dense": 0.1}, fault={0: 5.0, 1: 3.0})
+    executor = opened_meanwhile(policy)
     executor.close()
     assert executor.feasibility()["dense"].latency == pytest.approx(0.1, abs=0.02)
     assert len(policy.calls) == 7
@@ -281,17 +251,15 @@ def test_a_closed_executor_says_so() -> None:
         with pytest.raises(ExecutorClosedError):
             use()
     world.executor.close()
-    assert world.executor.statistics().chunks == 1
+    assert (world.executor.statistics().chunks, world.executor.statistics().frames) == (1, 2)
 
 
 def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
     limits = GuardLimits(low=-1, high=[10, 3, 20])  # channel 1 is the time of the observation
     with World(settings=ExecutorSettings(guard=limits, max_hold=2)) as world:
-        world.begin()
         refused = r"the guard refused the last chunk: action 0, channel 1, is 3\.\d"
-        with pytest.raises(DeadlineMissedError, match=refused):  # noqa: PT012
-            for _ in range(60):
-                world.tick()
+        with pytest.raises(DeadlineMissedError, match=refused):
+            world.run(60)
         counted = world.executor.statistics()
         assert counted.chunks_refused > 0
         assert counted.holds == 2
@@ -313,6 +281,10 @@ def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
         ({"tiers": ()}, "tiers must be a tuple of names"),
         ({"tiers": "fast"}, "each once; found 'fast'"),
         ({"tiers": ("a", "a")}, "each once"),
+        ({"stall_after": 0}, "stall_after must be a number, positive and finite; found 0"),
+        ({"stall_after": "2"}, "stall_after must be a number, positive and finite; found '2'"),
+        ({"stall_range": -0.1}, "stall_range must be a number, positive and finite"),
+        ({"stall_plan": None}, "stall_plan must be the name of a plan; found None"),
     ],
 )
 def test_settings_are_checked(made: dict[str, object], message: str) -> None:
@@ -333,6 +305,7 @@ def test_settings_are_checked(made: dict[str, object], message: str) -> None:
         ({"horizon": 10, "reserve": 6}, 10, "Give at most 5, or None"),
         ({"reserve": 8}, 10, "Give at most 7, or None"),
         ({"tiers": ("dense", "quick")}, 10, "no plan 'quick'; it has"),
+        ({"stall_after": 1.0, "stall_plan": "slow"}, 10, "no plan 'slow'; it has .* Name tiers and stall_plan among"),
     ],
 )
 def test_settings_have_to_fit_the_policy(made: dict[str, object], hz: float, message: str) -> None:

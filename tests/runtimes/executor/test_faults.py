@@ -49,7 +49,6 @@ def test_inference_slower_than_the_horizon_holds_and_then_raises_and_says_why() 
 
 def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
     with World(latency={"dense": 0.1}, fault={1: 1.0}, settings=ExecutorSettings(max_hold=3)) as world:
-        world.begin()
         made, error = world.run_until_starved()
         counted = world.executor.statistics()
         assert "the last one was held for 3 ticks" in str(error)
@@ -60,7 +59,7 @@ def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
         while world.executor.statistics().chunks < 2:  # the call ends, and the loop goes on
             world.tick(action=False)
         for _ in range(20):
-            assert world.tick() is not None
+            world.tick()
         assert world.executor.statistics().deadlines_missed == 1
 
 
@@ -82,7 +81,6 @@ def test_frames_at_another_rate_than_the_policys_are_a_trouble_until_one_fits() 
 
 def test_a_hold_of_nothing_raises_at_once() -> None:
     with World(fault={1: 1.0}, settings=ExecutorSettings(max_hold=0)) as world:
-        world.begin()
         made, _ = world.run_until_starved()
         assert made[-1][2] == TA - 1
         assert world.executor.statistics().holds == 0
@@ -90,7 +88,6 @@ def test_a_hold_of_nothing_raises_at_once() -> None:
 
 def test_a_call_that_hangs_raises_in_time_and_the_executor_recovers_if_it_ends() -> None:
     with World(fault={1: "hang"}, settings=ExecutorSettings(max_hold=2)) as world:
-        world.begin()
         _, error = world.run_until_starved()
         assert "has been under way for" in str(error)
         with pytest.raises(DeadlineMissedError):
@@ -150,10 +147,8 @@ def test_closing_wakes_whoever_waits_for_an_action() -> None:
 
 def test_an_exception_in_the_policy_is_raised_at_the_next_call_of_anybody() -> None:
     with World(fault={1: "raise"}) as world:
-        world.begin()
-        with pytest.raises(WorkerDeadError, match="ZeroDivisionError: scripted") as caught:  # noqa: PT012
-            for _ in range(30):
-                world.tick()
+        with pytest.raises(WorkerDeadError, match="ZeroDivisionError: scripted") as caught:
+            world.run(30)
         assert isinstance(caught.value.__cause__, ZeroDivisionError)
         for use in (world.executor.action, world.executor.reset, world.observe):
             with pytest.raises(WorkerDeadError):
@@ -206,39 +201,29 @@ def test_a_prediction_of_the_wrong_shape_is_an_error() -> None:
         world.begin()
 
 
-def test_nan_is_not_executed() -> None:
-    with World(fault=dict.fromkeys(range(1, 4), "nan")) as world:
-        world.begin()
-        for _ in range(30):
-            assert np.isfinite(world.tick()).all()
-        counted = world.executor.statistics()
-        assert counted.chunks_refused == 3
-        assert counted.last_refusal == f"1 of its {3 * TA} numbers are not finite"
-        assert counted.starved == 0
-
-
-def test_a_call_without_actions_is_a_chunk_that_the_guard_refuses() -> None:
+@pytest.mark.parametrize(("raises", "wrong"), [(False, 1), (True, 3 * TA)])
+def test_nan_is_not_executed(raises: bool, wrong: int) -> None:
     """A compiled policy raises where its arithmetic overflowed: the thread goes on, and so does the robot."""
     policy = ScriptedPolicy(FakeClock())
 
     def overflow(obs: np.ndarray) -> np.ndarray:
+        chunk = np.zeros((policy.predicted, 3))
         if len(policy.calls) in (2, 3, 4):
-            raise NonFiniteActionsError("scripted")
-        return np.zeros((policy.predicted, 3))
+            chunk[3, 1] = np.nan
+            if raises:
+                raise NonFiniteActionsError("scripted")
+        return chunk
 
     policy.actions = overflow
     with World(policy=policy) as world:
-        world.begin()
-        for _ in range(30):
-            assert np.isfinite(world.tick()).all()
+        assert np.isfinite(world.run(30)).all()
         counted = world.executor.statistics()
         assert (counted.chunks_refused, counted.starved) == (3, 0)
-        assert counted.last_refusal == f"{3 * TA} of its {3 * TA} numbers are not finite"
+        assert counted.last_refusal == f"{wrong} of its {3 * TA} numbers are not finite"
 
 
 def test_nothing_but_nan_ends_in_an_error_that_says_so() -> None:
     with World(fault=dict.fromkeys(range(1, 100), "nan")) as world:
-        world.begin()
         _, error = world.run_until_starved()
         assert "the guard refused the last chunk: 1 of its" in str(error)
 
@@ -248,7 +233,6 @@ def test_a_jump_at_the_seam_is_refused() -> None:
     policy = ScriptedPolicy(FakeClock())
     policy.actions = lambda obs: np.full((16, 3), 0.0 if obs[-1, 1] < 0.3 else 5.0)
     with World(policy=policy, settings=ExecutorSettings(guard=GuardLimits(max_step=1.0))) as world:
-        world.begin()
         made, error = world.run_until_starved()
         assert "its step of 5 in channel 0 exceeds the limit of 1" in str(error)
         assert not np.any(made)
@@ -267,8 +251,7 @@ def test_only_a_normaliser_that_knows_the_range_of_the_actions_bounds_them(range
             with pytest.raises(DeadlineMissedError, match="the bounds are -1.1 to 1.1"):
                 world.begin()
         else:
-            world.begin()
-            assert (world.tick() == 5).all()
+            assert (world.run(1) == 5).all()
 
 
 def test_reset_during_inference_a_hundred_times_at_random_moments() -> None:
@@ -291,8 +274,7 @@ def test_reset_during_inference_a_hundred_times_at_random_moments() -> None:
             if world.executor.statistics().calls < calls:
                 during.add(calls)
             assert len(world.policy.calls) == calls
-        world.begin()
-        assert world.tick()[0] == 100
+        assert world.run(1)[0, 0] == 100
         counted = world.executor.statistics()
         assert len(during) > 50
         assert counted.chunks_discarded == len(during)
@@ -311,9 +293,7 @@ def test_a_reset_before_a_call_reaches_the_policy_before_that_call() -> None:
             return super().predict_action(obs_dict, plan=plan)
 
     with World(policy=Noting(FakeClock())) as world:
-        world.begin()
-        for _ in range(5):
-            world.tick()
+        world.run(5)
         assert order == ["reset None", "call 0", "call 0"]  # the second one is under way
         for seed in (3, None):
             world.executor.reset(seed)

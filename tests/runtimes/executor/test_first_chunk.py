@@ -2,31 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
-
-import numpy as np
 import pytest
 
 from ttscompile.errors import StaleObservationError
 from ttscompile.runtimes.executor import ExecutorSettings
 
-from .simulation import TA, FakeClock, ScriptedPolicy, World
-
-
-@dataclass
-class Told(ScriptedPolicy):
-    """Attributes: prefixes: what each call was told to be committed, float32 ``[N, 3]``."""
-
-    prefixes: list[np.ndarray] = field(default_factory=list)
-
-    def predict_action(
-        self, obs_dict: Mapping[str, Any], *, plan: str, prefix: np.ndarray | None = None
-    ) -> dict[str, Any]:
-        if prefix is not None:
-            self.prefixes.append(prefix[0])
-        return super().predict_action(obs_dict, plan=plan)
+from .simulation import TA, FakeClock, Told, World
 
 
 @pytest.mark.parametrize("seam", ["replace", "prefix"])

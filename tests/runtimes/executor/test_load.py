@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from ttscompile.errors import ExecutorError, StaleObservationError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.executor.window import MOST_FRAMES
 
-from .simulation import REAL_LIMIT, FakeClock, ScriptedPolicy, World, workers
+from .simulation import REAL_LIMIT, FakeClock, Quick, ScriptedPolicy, World, workers
 
 
 def kept(executor: AsyncExecutor) -> int:
@@ -43,10 +42,6 @@ def test_four_cameras_at_10_khz_are_one_window_and_no_tick_is_missed() -> None:
 
 def test_threads_that_observe_as_fast_as_they_can_starve_nobody() -> None:
     """In real time: no call waits for a frame that came, and no tick for the lock for long."""
-
-    class Quick(ScriptedPolicy):
-        def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
-            return {"action_pred": np.zeros((1, 16, 3))}
 
     settings = ExecutorSettings(max_hold=1000, policy_hz=50)
     with AsyncExecutor(Quick(FakeClock()), 100, settings, latencies={"dense": 0.01}) as executor:
@@ -83,33 +78,25 @@ def test_threads_that_observe_as_fast_as_they_can_starve_nobody() -> None:
 
 def test_a_clock_that_jumps_ahead_ends_what_is_scheduled_and_the_loop_goes_on_with_new_frames() -> None:
     with World() as world:
-        world.begin()
-        for _ in range(10):
-            world.tick()
+        world.run(10)
         world.clock.advance(3600.0)  # the machine slept, and the clock did not
         with pytest.raises(StaleObservationError, match="no complete observation window|is 3600 s old"):
             world.executor.action()
-        world.begin()
-        for _ in range(20):
-            assert world.tick()[1] > 3600
+        assert (world.run(20)[:, 1] > 3600).all()
         assert world.executor.statistics().starved == 1
 
 
 def test_a_clock_that_is_set_back_is_told_and_a_reset_begins_anew() -> None:
     """``time.monotonic`` never is; one that was injected may be."""
     with World() as world:
-        world.begin()
-        for _ in range(10):
-            world.tick()
+        world.run(10)
         world.clock._now -= 3600.0
         world.observe()
         assert world.executor.statistics().frames_late == 1
         with pytest.raises(ExecutorError, match="ticks before the last one that was given out. Times must not go back"):
             world.executor.action()
         world.executor.reset()
-        world.begin()
-        for _ in range(20):
-            assert world.tick()[1] < -3500
+        assert (world.run(20)[:, 1] < -3500).all()
 
 
 def test_the_time_of_day_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import pytest
 
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
-from .simulation import FakeClock, ScriptedPolicy
+from .simulation import FakeClock, Quick
 
 pytestmark = pytest.mark.alone
 
@@ -19,16 +18,9 @@ MOST = 20e-6
 HZ, ROUNDS = 500, 3000
 
 
-class Quick(ScriptedPolicy):
-    """At once, and with actions for a minute."""
-
-    def predict_action(self, obs_dict: Any, *, plan: str) -> Any:
-        return {"action_pred": np.zeros((1, 16, 3), np.float32)}
-
-
 @pytest.fixture
 def running():  # type: ignore[no-untyped-def]
-    settings = ExecutorSettings(policy_hz=0.5, max_hold=10**9)
+    settings = ExecutorSettings(policy_hz=0.5, max_hold=10**9)  # a chunk has actions for a minute
     executor = AsyncExecutor(Quick(FakeClock()), HZ, settings, latencies={"dense": 0.0})
     with executor:
         now = time.monotonic()

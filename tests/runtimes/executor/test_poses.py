@@ -1,4 +1,4 @@
-"""Poses at seams: no seam, no interpolation and no limit gives numbers that are no rotation."""
+"""Poses, and what else is relative to the state, at seams: nothing jumps with it, and rotations stay rotations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ttscompile.runtimes.executor import GuardLimits
 from ttscompile.runtimes.executor.measure import measure_latencies
 from ttscompile.runtimes.executor.settings import resolve
 
-from .simulation import TA, TO, FakeClock, ScriptedPolicy, World, actions_of
+from .simulation import TA, TO, FakeClock, ScriptedPolicy, actions_of, given_out
 
 RESERVE, HZ, HORIZON, EXECUTED = 6, 10.0, 10, 6
 RELATIVE = Relative("obs", (None,) * 10, (Pose(1, 0),))
@@ -44,14 +44,7 @@ def given(settings: ExecutorSettings, relative: Relative | None, turn: float = 1
         chunk[:, :4] = np.arange(len(chunk))[:, None]
         return chunk
 
-    policy = ScriptedPolicy(FakeClock(), actions=actions, reserve=RESERVE)
-    action = ChunkSpec(10, TO - 1, TO - 1 + TA, relative=relative)
-    policy.info = replace(policy.info, action=action, sample=(policy.info.sample[0], 10))
-    world = World(20.0 if settings.interpolation == "linear" else 10.0, settings, policy)
-    with world.executor:
-        world.begin()
-        made = [world.tick() for _ in range(30)]
-    return np.stack([one for one in made if one is not None])
+    return given_out(settings, ChunkSpec(10, TO - 1, TO - 1 + TA, relative=relative), RESERVE, actions)
 
 
 def off_orthonormal(rows: np.ndarray) -> float:
@@ -101,49 +94,54 @@ def test_a_pose_is_no_displacement() -> None:
 
 
 class Path3(nn.Module):
-    """Where a path of its own goes from here, less where the robot is: the observation is that pose, and the time."""
+    """Where a path of its own goes from here, less where the robot is: observed are a pose, the time and a place."""
 
     def __init__(self) -> None:
         super().__init__()
         self.steps = nn.Parameter(torch.arange(float(HORIZON)))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        turned, now = obs[:, 0, :9], obs[:, :, 9:] + self.steps[:, None]
+        turned, now = obs[:, 0, :9], obs[:, :, 9:10] + self.steps[:, None]
         first, second = turned[:, 3:6], turned[:, 6:9]
         back = torch.stack([first, second, torch.linalg.cross(first, second)], 2)  # the inverse, for orthonormal rows
         place = torch.cat([now, 2 * now, -now], 2) - turned[:, None, :3]
         c, s, o = torch.cos(0.3 * now), torch.sin(0.3 * now), 0 * now
         whole = torch.stack([torch.cat(row, 2) for row in ((c, -s, o), (s, c, o), (o, o, 1 + o))], 2)
         rows = (back[:, None] @ whole)[:, :, :2].flatten(2)
-        return torch.cat([now, (back[:, None] @ place[..., None])[..., 0], rows], 2)
+        return 0.5 * torch.cat([now - obs[:, :, 10:], (back[:, None] @ place[..., None])[..., 0], rows], 2) + 0.1
 
 
-def compiled(once: Once) -> Path:
+def compiled(once: Once, relative: Relative | None) -> Path:
     spec = PolicySpec(
         sample=(HORIZON, 10),
-        observations={"obs": ObservationSpec((1, 10))},
+        observations={"obs": ObservationSpec((1, 11))},
         sampler=ttscompile.direct_table(),
-        chunk=ChunkSpec(10, 0, EXECUTED, ranged=False, relative=RELATIVE),
+        chunk=ChunkSpec(10, 0, EXECUTED, Affine(np.full(10, 0.5), np.full(10, 0.1)), ranged=False, relative=relative),
     )
-    network = DirectDenoiser(Path3()).eval()
-    return once.compiled("a path of poses", lambda to: ttscompile.compile_denoiser(network, spec, to))[0]
+    name, network = f"a path, relative: {relative is not None}", DirectDenoiser(Path3()).eval()
+    return once.compiled(name, lambda to: ttscompile.compile_denoiser(network, spec, to))[0]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seam", ["replace", "blend", "ensemble"])
 def test_the_path_does_not_jump_with_the_state(once: Once, seam: str) -> None:
-    """Of a robot that is somewhere else at every tick."""
-    rng, policy = np.random.default_rng(0), ttscompile.load(compiled(once), seed=0)
+    """Of a robot that is somewhere else at every tick: the first number is relative to its place, and a pose to its."""
 
-    def seen(tick: int) -> np.ndarray:
-        turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-        return np.concatenate([rng.uniform(-9, 9, 3), turn[:2].ravel(), [tick]])
+    def played(relative: Relative | None) -> np.ndarray:
+        rng, policy = np.random.default_rng(0), ttscompile.load(compiled(once, relative), seed=0)
 
-    found = actions_of(policy, ExecutorSettings(seam=seam), HZ, 0.2, seen, 4 * EXECUTED)
+        def seen(tick: int) -> np.ndarray:
+            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+            return np.concatenate([rng.uniform(-9, 9, 3), turn[:2].ravel(), [tick], rng.uniform(-9, 9, 1)])
+
+        return actions_of(policy, ExecutorSettings(seam=seam, blend_steps=3), HZ, 0.2, seen, 4 * EXECUTED)
+
+    found = played(Relative("obs", (10, *[None] * 9), (Pose(1, 0),)))
     now = found[:, 0]
     np.testing.assert_allclose(np.diff(now), 1, atol=1e-4)
     np.testing.assert_allclose(found[:, 1:4], now[:, None] * [1, 2, -1], atol=1e-3)
     np.testing.assert_allclose(found[:, 4:], about_z(0.3 * now), atol=1e-4)
+    assert np.abs(np.diff(played(None)[:, 0])).max() > 4, "the state is what would jump"
 
 
 def test_latencies_are_measured_where_the_middle_of_a_range_is_no_rotation() -> None:

@@ -91,7 +91,7 @@ class Schedule(RuleBasedStateMachine):
         """The control loop is late by a part of a tick."""
         self.good = 0
         self.world.clock.advance(share / self.world.hz)
-        self.check_threads()
+        assert len(workers()) <= 1
 
     @rule(timeout=st.floats(0, 1))
     def wait_for_an_action(self, timeout: float) -> None:
@@ -218,9 +218,6 @@ class Schedule(RuleBasedStateMachine):
         self.world.clock.advance(1 / self.world.hz)
         if any(number >= self.counts.calls for number in self.policy.fault):
             self.good = 0  # a fault is still to come, or under way
-
-    def check_threads(self) -> None:
-        assert len(workers()) <= 1
 
     def teardown(self) -> None:
         if not hasattr(self, "world"):

@@ -75,9 +75,7 @@ def test_what_a_user_gets_cannot_be_changed() -> None:
 
 def test_the_control_rate_is_measured() -> None:
     with World() as world:
-        world.begin()
-        for _ in range(20):
-            world.tick()
+        world.run(20)
         measured = world.executor.statistics().tick_ms
         assert measured is not None and measured.p50 == pytest.approx(100)
 
@@ -145,9 +143,7 @@ def test_a_trace_keeps_the_last_events() -> None:
 
 def test_a_run_leaves_ticks_calls_and_resets_in_the_trace() -> None:
     with World() as world:
-        world.begin()
-        for _ in range(10):
-            world.tick()
+        world.run(10)
         world.executor.reset()
         world.tick(action=False)
         events = world.executor.trace.to_json()["traceEvents"]
@@ -165,9 +161,7 @@ def test_calls_far_outside_of_what_was_recorded_are_counted() -> None:
     with World() as world:
         far = property(lambda policy: SimpleNamespace(far=len(policy.calls) % 3 == 0, timings=None, frames=None))
         world.policy.__class__ = type("Reporting", (ScriptedPolicy,), {"last_report": far})
-        world.begin()
-        for _ in range(60):
-            world.tick()
+        world.run(60)
         counted = world.executor.statistics()
         events = world.executor.trace.to_json()["traceEvents"]
     assert counted.calls == len(world.policy.calls) > 6

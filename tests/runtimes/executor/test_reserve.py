@@ -28,8 +28,7 @@ def test_calls_start_as_many_actions_apart_as_the_policy_executes(
     policy = ScriptedPolicy(FakeClock(), {"dense": latency}, reserve=9)
     settings = ExecutorSettings(policy_hz=10.0, margin_ticks=margin, seam=seam)
     with World(10.0 * ticks_per_step, settings, policy) as world:
-        world.begin()
-        made = [world.tick() for _ in range(60 * ticks_per_step)]
+        made = world.run(60 * ticks_per_step)
         counted = world.executor.statistics()
         assert set(starts(world)) == {TA * ticks_per_step}
     later = made[2 * TA * ticks_per_step :]  # than the first chunk, which is played from its beginning
@@ -46,9 +45,7 @@ def test_calls_start_sooner_where_too_little_is_predicted(reserve: int, apart: i
     """With calls of 1.9 ticks and a margin of 1 the next chunk is needed 11 ticks after the first, if it can wait."""
     policy = ScriptedPolicy(FakeClock(), {"dense": 0.19}, reserve=reserve)
     with World(policy=policy, settings=ExecutorSettings(margin_ticks=1)) as world:
-        world.begin()
-        for _ in range(60):
-            world.tick()
+        world.run(60)
         assert set(starts(world)) == {apart}
         assert world.executor.statistics().deadlines_missed == 0
 
@@ -57,8 +54,7 @@ def test_no_more_is_planned_with_than_is_allowed() -> None:
     """reserve=0 never plays an action that the policy would not execute."""
     policy = ScriptedPolicy(FakeClock(), {"dense": 0.19}, reserve=9)
     with World(policy=policy, settings=ExecutorSettings(reserve=0)) as world:
-        world.begin()
-        made = [world.tick() for _ in range(60)]
+        made = world.run(60)
         assert max(action[2] for action in made) <= TA - 1
         assert set(starts(world)) == {5}
 
@@ -66,7 +62,6 @@ def test_no_more_is_planned_with_than_is_allowed() -> None:
 def test_a_late_chunk_is_bridged_by_what_the_last_one_predicted_beyond_its_horizon() -> None:
     policy = ScriptedPolicy(FakeClock(), fault={1: 1.0}, reserve=7)
     with World(policy=policy, settings=ExecutorSettings(max_hold=2)) as world:
-        world.begin()
         made, error = world.run_until_starved()
         counted = world.executor.statistics()
         assert "the last one was held for 2 ticks" in str(error)
@@ -81,8 +76,7 @@ def test_a_chunk_that_comes_after_its_horizon_is_played_from_its_reserve() -> No
     policy = ScriptedPolicy(FakeClock(), {"dense": 0.1, "fast": 0.05}, fault={1: 0.85}, reserve=9)
     settings = ExecutorSettings(tiers=("dense", "fast"), max_hold=0)
     with World(policy=policy, settings=settings) as world:
-        world.begin()
-        ticks = [world.tick() for _ in range(40)]
+        ticks = world.run(40)
         counted = world.executor.statistics()
     assert max(action[2] for action in ticks) >= TA
     for number, action in enumerate(ticks):
@@ -100,7 +94,6 @@ def test_no_reserve_is_kept_that_the_guard_refuses(bad: str) -> None:
     policy.actions = lambda obs: np.where(np.arange(16)[:, None] < 1 + TA + 2, 0.0, np.full((16, 3), 5.0))
     limits = GuardLimits(high=1.0, low=-1.0) if bad == "bounds" else GuardLimits(max_step=1.0)
     with World(policy=policy, settings=ExecutorSettings(max_hold=0, guard=limits)) as world:
-        world.begin()
         made, _ = world.run_until_starved()
         counted = world.executor.statistics()
     assert not np.any(made)
@@ -112,7 +105,6 @@ def test_a_reserve_in_hand_is_not_given_up_for_a_late_chunk_that_the_guard_refus
     policy = ScriptedPolicy(FakeClock(), {"dense": 0.3}, fault={1: 0.85}, reserve=12)
     policy.actions = lambda obs: np.full((21, 3), 0.0 if obs[-1, 1] < 0.3 else 5.0)
     with World(policy=policy, settings=ExecutorSettings(max_hold=0, guard=GuardLimits(max_step=1.0))) as world:
-        world.begin()
         made, error = world.run_until_starved()
         counted = world.executor.statistics()
     assert not np.any(made)

@@ -20,19 +20,6 @@ from ttscompile.runtimes.executor import Shadow
 from .simulation import FakeClock, ScriptedPolicy, World
 
 
-class Clock:
-    """Time that the toys take."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def now(self) -> float:
-        return self.seconds
-
-    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
-        raise AssertionError("nobody waits")
-
-
 class Toy:
     """Its two actions are the observation, and twice it, plus ``off``; a call takes ``latency`` of the clock.
 
@@ -40,7 +27,7 @@ class Toy:
         faults: by number of the call: an error to raise, or an event to wait for.
     """
 
-    def __init__(self, clock: Clock, latency: float, off: tuple[float, float] = (0.0, 0.0)) -> None:
+    def __init__(self, clock: FakeClock, latency: float, off: tuple[float, float] = (0.0, 0.0)) -> None:
         self.clock, self.latency, self.off = clock, latency, np.array(off)
         self.faults: dict[int, Exception | threading.Event] = {}
         self.calls: list[float] = []
@@ -64,7 +51,7 @@ class Toy:
         number, value = len(self.calls), float(obs["obs"][0, 0])
         self.calls.append(value)
         self.words.append(words)
-        self.clock.seconds += self.latency
+        self.clock.advance(self.latency)
         fault = self.faults.get(number)
         if isinstance(fault, Exception):
             raise fault
@@ -88,7 +75,7 @@ def drained(shadow: Shadow) -> Shadow:
 
 @pytest.fixture
 def toys() -> Iterator[tuple[Toy, Toy]]:
-    clock = Clock()
+    clock = FakeClock()
     yield Toy(clock, 0.5), Toy(clock, 0.25, (0.25, -1.0))
     assert not [one for one in threading.enumerate() if one.name == "ttscompile-shadow" and one.is_alive()]
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ttscompile import ChunkSpec
 from ttscompile.core.spec import Switch
 from ttscompile.runtimes.executor import ExecutorSettings
 
-from .simulation import TA, TO, FakeClock, ScriptedPolicy, World
+from .simulation import TA, TO, given_out
 
 RESERVE = 6  # so that a chunk and the one before have actions for the same ticks
 GRIPPER = Switch(channel=2, threshold=0.5, below=-1.0, above=1.0)
@@ -26,13 +26,7 @@ def given(settings: ExecutorSettings, switches: tuple[Switch, ...]) -> np.ndarra
         chunk[:, 2] = next(turns) * np.where(np.arange(len(chunk)) % 3 < 2, 1, -1)
         return chunk
 
-    policy = ScriptedPolicy(FakeClock(), actions=actions, reserve=RESERVE)
-    policy.info = replace(policy.info, action=replace(policy.info.action, switches=switches))
-    world = World(20.0 if settings.interpolation == "linear" else 10.0, settings, policy)
-    with world.executor:
-        world.begin()
-        made = [world.tick() for _ in range(30)]
-    return np.stack([one for one in made if one is not None])
+    return given_out(settings, ChunkSpec(3, TO - 1, TO - 1 + TA, switches=switches), RESERVE, actions)
 
 
 @pytest.mark.parametrize(

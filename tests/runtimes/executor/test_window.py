@@ -89,30 +89,22 @@ def test_a_window_needs_all_its_frames_and_repeats_none() -> None:
     assert values(made) == [0.0, 0.1, 0.2]
 
 
-def test_a_gap_leaves_the_newest_window_that_has_none() -> None:
-    made = window(times=[0.0, 0.1, 0.3])
-    assert values(made) == [0.0, 0.1]
-    made.add(0.4, frame(0.4), 0.4)
-    assert values(made) == [0.3, 0.4]
-
-
-def test_frames_out_of_order_are_put_in_order() -> None:
-    made = window(3, times=[0.0, 0.2])
-    assert values(made) is None
-    assert made.add(0.1, frame(0.1), 0.2) == "added"
-    assert values(made) == [0.0, 0.1, 0.2]
-
-
-def test_frames_too_old_for_any_window_are_late() -> None:
-    made = window(times=[1.0, 1.1])
-    assert made.add(0.5, frame(0.5), 1.1) == "late"
-    assert values(made) == [1.0, 1.1]
-
-
-def test_a_second_frame_of_a_time_replaces_the_first() -> None:
-    made = window(times=[0.0, 0.1])
-    assert made.add(0.1, frame(7), 0.1) == "replaced"
-    assert values(made) == [0.0, 7.0]
+@pytest.mark.parametrize(
+    ("times", "before", "time", "what", "after"),
+    [
+        pytest.param([0.0, 0.1, 0.3], [0.0, 0.1], 0.4, "added", [0.3, 7.0], id="a gap"),
+        pytest.param([0.0, 0.2], None, 0.1, "added", [7.0, 0.2], id="out of order"),
+        pytest.param([1.0, 1.1], [1.0, 1.1], 0.5, "late", [1.0, 1.1], id="too old for any window"),
+        pytest.param([0.0, 0.1], [0.0, 0.1], 0.1, "replaced", [0.0, 7.0], id="a second one of a time"),
+    ],
+)
+def test_a_frame_more(
+    times: list[float], before: list[float] | None, time: float, what: str, after: list[float]
+) -> None:
+    made = window(times=times)
+    assert values(made) == before
+    assert made.add(time, frame(7), max(*times, time)) == what
+    assert values(made) == after
 
 
 def test_faster_frames_are_sampled_at_the_policys_rate() -> None:
