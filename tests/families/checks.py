@@ -27,6 +27,11 @@ def golden(name: str) -> Arrays:
         return dict(file)
 
 
+def part(arrays: Arrays, name: str) -> Arrays:
+    """What is called ``NAME.WHAT`` among arrays, by WHAT."""
+    return {key.removeprefix(f"{name}."): value for key, value in arrays.items() if key.startswith(f"{name}.")}
+
+
 def kinds(program: Program) -> dict[str, int]:
     """How many blocks of each kind were found; a signature without what changes with the version of torch."""
     return dict(Counter(re.sub(r"\d+ops_\w+$", "region", block.kind) for block in program.blocks))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,19 +11,36 @@ import onnx
 import onnxruntime
 import torch
 
+from ttscompile.runtimes.onnxruntime.sessions import EXACT_INTEGERS
 
-def session(model: onnx.ModelProto, weights: Mapping[str, torch.Tensor]) -> onnxruntime.InferenceSession:
-    """A session on the model with these weights; every initializer without data must be among them."""
+Array = npt.NDArray[Any]
+
+
+def session(
+    model: onnx.ModelProto, weights: Mapping[str, torch.Tensor] | Mapping[str, Array], exact: bool = True
+) -> onnxruntime.InferenceSession:
+    """A session on one thread of a model that is checked, unless it has operations of onnxruntime's or lacks shapes.
+
+    Args:
+        model: without the data of its weights.
+        weights: every initializer without data must be among them.
+        exact: integers are summed exactly on every processor.
+    """
     filled = onnx.ModelProto()
     filled.CopyFrom(model)
     for tensor in _initializers(filled.graph):
         if not tensor.raw_data:
-            value = weights[tensor.name]
-            assert tuple(tensor.dims) == tuple(value.shape)
-            tensor.raw_data = value.detach().numpy().tobytes()
-    onnx.checker.check_model(filled, full_check=True)
+            given = weights[tensor.name]
+            value = given.detach().numpy() if isinstance(given, torch.Tensor) else given
+            expected = tuple(tensor.dims), onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)
+            assert expected == (value.shape, value.dtype)
+            tensor.raw_data = np.ascontiguousarray(value).tobytes()
+    own = {node.domain for node in filled.graph.node} <= {""}
+    if own and all(value.type.tensor_type.HasField("shape") for value in filled.graph.output):
+        onnx.checker.check_model(filled, full_check=True)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
+    options.add_session_config_entry(EXACT_INTEGERS, str(int(exact)))
     return onnxruntime.InferenceSession(filled.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 

@@ -10,7 +10,7 @@ import pytest
 from onnx import ModelProto, NodeProto, TensorProto
 from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
 
-from tests.lower.running import Array, session
+from tests.lower.sessions import Array, session
 from ttscompile.ir.pieces import CONDITION
 from ttscompile.lower.integer_attention import FEWEST, HEADS
 from ttscompile.lower.precision import lower_precision, quantize_model

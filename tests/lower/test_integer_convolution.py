@@ -12,7 +12,7 @@ from onnx import ModelProto, NodeProto, TensorProto
 from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
 from torch.nn import functional
 
-from tests.lower.running import Array, session
+from tests.lower.sessions import Array, session
 from ttscompile.lower.integer_convolution import LEAST
 from ttscompile.lower.precision import quantize_matrix, quantize_model
 from ttscompile.measure.machine import has_integer_dot_product

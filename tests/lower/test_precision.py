@@ -16,7 +16,7 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 from torch.nn import functional
 
 from tests.lower.modules import captured, random_values
-from tests.lower.running import session
+from tests.lower.sessions import session
 from tests.runtimes.toys import B, f32, node
 from ttscompile.core.four_bits import unpack
 from ttscompile.errors import LoweringError

@@ -16,7 +16,7 @@ from onnx import GraphProto
 from torch import nn
 
 import ttscompile
-from tests.lower.whole_call import Episode, groups, inputs, make, policy_groups
+from tests.lower.whole_call import Episode, groups, inputs, lowered, make, make_toy, policy_groups
 from tests.passes.modules import MODULES, spec
 from tests.rounding import allowed, assert_equal_but_for_rounding, bound
 from tests.runtimes.agreement import call_terms
@@ -56,8 +56,7 @@ from ttscompile.runtimes.policy import CompiledPolicy
 )
 def test_random_plans_of_all_sources(tmp_path: Path, options: dict[str, Any]) -> None:
     """Each with 9 episodes of 5 calls, of one to three streams."""
-    program = toy_program(**options)
-    policy, model = make(program, tmp_path)
+    program, policy, model = make_toy(tmp_path, **options)
     terms = call_terms(load_artifact(tmp_path / "artifact"))
     rng = np.random.default_rng(0)
     reads = np.zeros(4, int)
@@ -86,8 +85,7 @@ def test_random_plans_of_all_sources(tmp_path: Path, options: dict[str, Any]) ->
 @pytest.mark.slow
 @pytest.mark.parametrize(("noise", "read"), [(0.0, 3), (0.1, 3), (0.0, 0)])
 def test_a_schedule_with_a_correction(tmp_path: Path, noise: float, read: int) -> None:
-    program = toy_program(steps=7, noise=noise)
-    policy, model = make(program, tmp_path)
+    program, policy, model = make_toy(tmp_path, steps=7, noise=noise)
     empty = no_correction(7, program.spec.sample)
     rng = np.random.default_rng(0)
     weights, bias = (rng.normal(0, 0.1, each.shape).astype(np.float32) for each in (empty.weights, empty.bias))
@@ -134,8 +132,7 @@ def test_with_a_pencil(tmp_path: Path) -> None:
 
 
 def test_it_repairs_what_legalize_repairs(tmp_path: Path) -> None:
-    program = toy_program()
-    policy, model = make(program, tmp_path)
+    program, policy, model = make_toy(tmp_path)
     terms = call_terms(load_artifact(tmp_path / "artifact"))
     rng = np.random.default_rng(0)
     episode = Episode(model, 1)
@@ -156,8 +153,7 @@ def test_it_repairs_what_legalize_repairs(tmp_path: Path) -> None:
 
 
 def test_what_is_not_kept_is_not_there(tmp_path: Path) -> None:
-    program = toy_program()
-    policy, model = make(program, tmp_path)
+    _, policy, model = make_toy(tmp_path)
     obs, noise = inputs(policy, np.random.default_rng(0), 1)
     episode = Episode(model, 1)
     dense = np.zeros((5, 5), np.int8)
@@ -182,8 +178,7 @@ def branches(graph: GraphProto) -> Iterator[tuple[str, str]]:
 
 
 def test_every_block_has_a_branch_that_computes_and_one_that_reuses() -> None:
-    program = toy_program(blocks=8)
-    model = lower_single_file(program, lower_program(program), program.weights)
+    _, _, model = lowered(blocks=8)
     found = sorted(pair for pair in branches(model.graph) if pair[0].startswith("block_"))
     assert found == [(f"block_{b:02d}", f"block_{b:02d}_reused") for b in range(8)]
 
@@ -206,10 +201,9 @@ def test_blocks_of_another_precision(tmp_path: Path) -> None:
     assert np.abs(fp32["action"] - expected["action"]).max() > 1e-3
 
 
-def test_the_same_program_gives_the_same_bytes(tmp_path: Path) -> None:
-    program = toy_program()
-    models = lower_program(program)
-    first, second = (lower_single_file(program, models, program.weights) for _ in range(2))
+def test_the_same_program_gives_the_same_bytes() -> None:
+    program, models, first = lowered()
+    second = lower_single_file(program, models, program.weights)
     assert first.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True)
 
 
@@ -237,17 +231,16 @@ def wider(program: Program) -> Program:
     ],
 )
 def test_programs_without_a_single_file(change: Callable[[Program], Program], message: str) -> None:
-    program = toy_program()
-    models = lower_program(program)
+    program, models, _ = lowered()
     with pytest.raises(LoweringError, match=message):
         lower_single_file(change(program), models, change(program).weights)
 
 
 def test_two_gigabytes_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    program = toy_program()
+    program, models, _ = lowered()
     monkeypatch.setattr("ttscompile.lower.single_file.LARGEST", 1000)
     with pytest.raises(LoweringError, match="an ONNX file holds at most 2"):
-        lower_single_file(program, lower_program(program), program.weights)
+        lower_single_file(program, models, program.weights)
 
 
 @pytest.mark.slow

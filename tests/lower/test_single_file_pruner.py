@@ -14,19 +14,16 @@ from onnx import GraphProto
 from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
 import ttscompile
-from tests.lower.whole_call import Episode, inputs, make
+from tests.lower.whole_call import Episode, inputs, lowered, make_toy
 from tests.rounding import assert_equal_but_for_rounding
 from tests.runtimes.agreement import call_terms
 from tests.runtimes.pruners import calibrated, random_pruner
-from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import IllegalPlanError
-from ttscompile.lower.program import lower_program
-from ttscompile.lower.single_file import lower_single_file
 from ttscompile.runtimes.single_file import inputs_of
 
 
@@ -41,8 +38,7 @@ from ttscompile.runtimes.single_file import inputs_of
 )
 def test_episodes_of_its_plans(tmp_path: Path, options: dict[str, Any], corrected: bool) -> None:
     """All sources, a plan for each stream, residuals of earlier calls, and a schedule in between."""
-    program = toy_program(**options)
-    _, model = make(program, tmp_path)
+    program, _, model = make_toy(tmp_path, **options)
     folder = calibrated(tmp_path / "artifact", program, corrected)
     policy = ttscompile.load(folder, "reference")
     assert policy.info.default_plan == "pruner"
@@ -75,8 +71,7 @@ def test_episodes_of_its_plans(tmp_path: Path, options: dict[str, Any], correcte
 
 def test_streams_of_one_plan_go_together_and_others_do_not_see_it(tmp_path: Path) -> None:
     """Two streams of one observation and a third: each has the actions that it has alone."""
-    program = toy_program()
-    policy, model = make(program, tmp_path)
+    program, policy, model = make_toy(tmp_path)
     given = inputs_of(calibrated(tmp_path / "artifact", program, corrected=False))
     terms = call_terms(load_artifact(tmp_path / "artifact"))
     obs, noise = inputs(policy, np.random.default_rng(5), 3)
@@ -93,8 +88,7 @@ def test_streams_of_one_plan_go_together_and_others_do_not_see_it(tmp_path: Path
 
 
 def test_a_plan_of_the_caller_for_each_stream(tmp_path: Path) -> None:
-    program = toy_program(pruner=False)
-    policy, model = make(program, tmp_path)
+    _, policy, model = make_toy(tmp_path, pruner=False)
     obs, noise = inputs(policy, np.random.default_rng(0), 2)
     plans = np.stack([uniform_plan(5, 5, n) for n in (2, 5)])
     expected = policy.predict_action(obs, noise=noise, plan=plans)["action_pred"]
@@ -106,8 +100,7 @@ def test_a_plan_of_the_caller_for_each_stream(tmp_path: Path) -> None:
 
 def test_weights_that_are_left_out_are_those_that_were_converted(tmp_path: Path) -> None:
     """And the plan that is given is not looked at."""
-    program = toy_program()
-    policy, model = make(program, tmp_path)
+    program, policy, model = make_toy(tmp_path)
     obs, noise = inputs(policy, np.random.default_rng(0), 1)
     plan, used = np.full((1, 5, 5), Source.TIMESTEP, np.int8), np.array(True)
     found = Episode(model, 1).call(obs, noise, plan, use_pruner=used)
@@ -121,8 +114,7 @@ def test_weights_that_are_left_out_are_those_that_were_converted(tmp_path: Path)
 
 
 def test_a_broken_pruner_gives_no_actions(tmp_path: Path) -> None:
-    program = toy_program()
-    policy, model = make(program, tmp_path)
+    program, policy, model = make_toy(tmp_path)
     obs, noise = inputs(policy, np.random.default_rng(0), 2)
     given, weights = np.zeros((5, 5), np.int8), random_pruner(program, 0)
     fine = Episode(model, 2).call(obs, noise, given, use_pruner=np.array(True), **weights)
@@ -134,8 +126,7 @@ def test_a_broken_pruner_gives_no_actions(tmp_path: Path) -> None:
 
 
 def test_a_policy_without_a_pruner_has_no_such_input(tmp_path: Path) -> None:
-    program = toy_program(pruner=False)
-    policy, model = make(program, tmp_path)
+    _, policy, model = make_toy(tmp_path, pruner=False)
     obs, noise = inputs(policy, np.random.default_rng(0), 1)
     names = {value.name for value in onnx.load_model_from_string(model).graph.input}
     assert not [name for name in names if "pruner" in name]
@@ -146,8 +137,7 @@ def test_a_policy_without_a_pruner_has_no_such_input(tmp_path: Path) -> None:
 
 
 def test_a_plan_with_weights_of_its_own_is_refused(tmp_path: Path) -> None:
-    program = toy_program()
-    make(program, tmp_path)
+    make_toy(tmp_path)
     own = BlockWeights({"block.0.w": np.zeros((4, 4), np.float32)}, {})
     evenly = Plan(cells=uniform_plan(5, 5, 2))
     plans = {"evenly": evenly, "weights": replace(evenly, weights="weights")}
@@ -168,9 +158,7 @@ def graphs(graph: GraphProto) -> Iterator[GraphProto]:
 
 def test_the_head_and_the_branches_are_in_the_file() -> None:
     """Of the head every operation and constant, in a branch; of each block one that computes and one that reuses."""
-    program = toy_program(blocks=8)
-    models = lower_program(program)
-    model = lower_single_file(program, models, program.weights)
+    _, models, model = lowered(blocks=8)
     parts = {graph.name: graph for graph in graphs(model.graph)}
     assert {f"block_{b:02d}{end}" for b in range(8) for end in ("", "_reused")} <= parts.keys()
     head = parts["pruner"]
@@ -183,6 +171,5 @@ def test_the_head_and_the_branches_are_in_the_file() -> None:
     (asked,) = [node for node in model.graph.node if node.op_type == "If" and "use_pruner" in node.input]
     asked_for = {attribute.name: attribute.g.name for attribute in asked.attribute}
     assert asked_for == {"then_branch": "pruner", "else_branch": "given_plan"}
-    without = toy_program(blocks=8, pruner=False)
-    model = lower_single_file(without, lower_program(without), without.weights)
-    assert "pruner" not in {graph.name for graph in graphs(model.graph)}
+    _, _, without = lowered(blocks=8, pruner=False)
+    assert "pruner" not in {graph.name for graph in graphs(without.graph)}

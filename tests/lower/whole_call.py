@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import onnxruntime
 import torch
 
 import ttscompile
+from tests.runtimes.toys import toy_program
 from ttscompile import Noise
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.write import write_artifact
@@ -62,6 +63,23 @@ def make(program: Program, folder: Path) -> tuple[CompiledPolicy, bytes]:
     model = lower_single_file(program, models, program.weights)
     onnx.checker.check_model(model, full_check=True)
     return ttscompile.load(folder / "artifact", "reference"), model.SerializeToString(deterministic=True)
+
+
+@cache
+def lowered(**options: Any) -> tuple[Program, dict[str, onnx.ModelProto], onnx.ModelProto]:
+    """A toy program of these options, its models, and the single file of them; none of it is to be changed."""
+    program = toy_program(**options)
+    models = lower_program(program)
+    model = lower_single_file(program, models, program.weights)
+    onnx.checker.check_model(model, full_check=True)
+    return program, models, model
+
+
+def make_toy(folder: Path, **options: Any) -> tuple[Program, CompiledPolicy, bytes]:
+    """The same with its artifact, ``artifact`` in the folder, as the reference runs it, and the bytes of the file."""
+    program, models, model = lowered(**options)
+    write_artifact(program, models, folder / "artifact")
+    return program, ttscompile.load(folder / "artifact", "reference"), model.SerializeToString(deterministic=True)
 
 
 def inputs(policy: CompiledPolicy, rng: np.random.Generator, streams: int) -> tuple[Arrays, Noise]:

@@ -1,5 +1,7 @@
 """The block finder on graphs that have blocks, almost have them, and have none."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import nn
@@ -25,13 +27,24 @@ def test_a_plain_chain_is_found_block_by_block() -> None:
     assert table.declined == ()
 
 
-def test_the_order_of_operands_does_not_matter() -> None:
+def _beside(b: Builder, x: Ref) -> Ref:
+    return b.op("g", "linear.default", (B, 4, 8), x, b.constant("v", 8, 8))
+
+
+SUMMANDS: dict[str, Callable[[Builder, Ref, Ref], tuple[Ref, Ref]]] = {
+    "operands in the other order": lambda b, x, f: (f, x),
+    "with a gate": lambda b, x, f: (x, b.op("r", "mul.Tensor", (B, 4, 8), f, b.input("gate", B, 1, 8))),
+    "parallel branches": lambda b, x, f: (x, b.op("r", "add.Tensor", (B, 4, 8), f, _beside(b, x))),
+}
+
+
+@pytest.mark.parametrize("how", SUMMANDS)
+def test_all_that_is_added_to_the_stream_is_the_residual(how: str) -> None:
     b = Builder()
     x = b.input("x", B, 4, 8)
-    f = b.op("f", "linear.default", (B, 4, 8), x, b.constant("w", 8, 8))
-    b.op("a", "add.Tensor", (B, 4, 8), f, x)
-    (block,) = find_residual_blocks(b.graph(Ref("a")), "x").blocks
-    assert (block.stream, block.residual) == ("x", "f")
+    first, second = SUMMANDS[how](b, x, b.op("f", "linear.default", (B, 4, 8), x, b.constant("w", 8, 8)))
+    (block,) = find_residual_blocks(b.graph(b.op("a", "add.Tensor", (B, 4, 8), first, second)), "x").blocks
+    assert (block.stream, block.residual) == ("x", "r" if second != x else "f")
 
 
 def test_a_split_is_no_stream() -> None:
@@ -44,25 +57,6 @@ def test_a_split_is_no_stream() -> None:
     h = b.residual("a", b.op("sum", "add.Tensor", (B, 4, 8), Ref("part0"), Ref("part1")))
     (block,) = find_residual_blocks(b.graph(h), "x").blocks
     assert (block.stream, block.residual) == ("sum", "a.f")
-
-
-def test_gated_residual_includes_the_gate() -> None:
-    b = Builder()
-    x, gate = b.input("x", B, 4, 8), b.input("gate", B, 1, 8)
-    f = b.op("f", "linear.default", (B, 4, 8), x, b.constant("w", 8, 8))
-    g = b.op("g", "mul.Tensor", (B, 4, 8), f, gate)
-    (block,) = find_residual_blocks(b.graph(b.op("a", "add.Tensor", (B, 4, 8), x, g)), "x").blocks
-    assert block.residual == "g"
-
-
-def test_parallel_branches_are_one_block() -> None:
-    b = Builder()
-    x = b.input("x", B, 4, 8)
-    f = b.op("f", "linear.default", (B, 4, 8), x, b.constant("w", 8, 8))
-    g = b.op("g", "linear.default", (B, 4, 8), x, b.constant("v", 8, 8))
-    both = b.op("both", "add.Tensor", (B, 4, 8), f, g)
-    (block,) = find_residual_blocks(b.graph(b.op("a", "add.Tensor", (B, 4, 8), x, both)), "x").blocks
-    assert block.residual == "both"
 
 
 def test_no_residual_is_refused_and_says_where_the_search_ended() -> None:

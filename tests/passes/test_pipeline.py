@@ -17,7 +17,7 @@ from ttscompile.passes.base import PassResult
 from ttscompile.passes.hoist import Hoist
 from ttscompile.passes.insert_pruner import InsertPruner
 from ttscompile.passes.partition import Partition
-from ttscompile.passes.split_tokens import SplitTokens
+from ttscompile.passes.split_tokens import SplitFeatures, SplitTokens
 from ttscompile.verification.record_golden import record_original
 
 
@@ -104,6 +104,8 @@ def test_passes_run_in_their_order_only() -> None:
     for each in (SplitTokens(), Hoist(), InsertPruner()):
         with pytest.raises(PassError, match=f"^{each.name}: takes a program that is (Cut|Program); found Captured"):
             each(bare)  # type: ignore[arg-type]
+    with pytest.raises(PassError, match="^SplitFeatures: takes a program that is Cut; found Program"):
+        SplitFeatures()(program)  # type: ignore[arg-type]
     with pytest.raises(PassError, match="^Partition: takes a program that is Captured; found Program"):
         Partition(program.blocks)(program)  # type: ignore[arg-type]
 

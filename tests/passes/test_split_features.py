@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from torch import nn
 
@@ -12,7 +11,6 @@ from tests.passes.graphs import B, Builder
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.capture.export import capture
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
-from ttscompile.errors import PassError
 from ttscompile.ir.binding import bindings
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
@@ -83,12 +81,6 @@ def test_features_of_another_dtype_stay_together() -> None:
     assert _features(graph.nodes[1], graph.producers(), graph.types()) == []
     floats = {name: replace(type_, dtype="float32") for name, type_ in graph.types().items()}
     assert _features(graph.nodes[1], graph.producers(), floats) == ["time", "count"]
-
-
-@pytest.mark.slow
-def test_runs_before_hoist_only() -> None:
-    with pytest.raises(PassError, match="takes a program that is Cut; found Program"):
-        SplitFeatures()(Hoist()(_program(True)).program)  # type: ignore[arg-type]
 
 
 def test_a_class_token_for_every_image_is_no_table() -> None:

@@ -8,15 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from safetensors.torch import save_file
 
 from ttscompile.policies.lerobot.act import ACT, ACTConfig, as_saved, read_config
 from ttscompile.policies.lerobot.config import ENVIRONMENT, STATE
 
 from .hybrid import Array, fill
-from .lerobot_tiny import write_json, write_processors
+from .lerobot_tiny import observe_variant, save_variant
 
 STREAMS, STATE_DIM, ACTION_DIM, CHUNK = 2, 4, 3, 6
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
@@ -88,22 +86,7 @@ _BASE: dict[str, Any] = {
 def save(variant: str, directory: Path) -> Path:
     """Save a policy as lerobot does. Returns the directory."""
     made = VARIANTS[variant]
-    directory.mkdir(parents=True)
-    features = {**made["inputs"], "action": ("ACTION", [ACTION_DIM])}
-    described = {key: {"type": kind, "shape": shape} for key, (kind, shape) in features.items()}
-    outputs = {"action": described["action"]}
-    inputs = {key: each for key, each in described.items() if key not in outputs}
-    own = {"input_features": inputs, "output_features": outputs, "normalization_mapping": made["modes"]}
-    write_json(directory / "config.json", _BASE | own | made["settings"])
-    statistics: dict[str, torch.Tensor] = {}
-    for key, (kind, shape) in features.items():
-        of = (shape[0], 1, 1) if kind == "VISUAL" else tuple(shape)
-        low, width = torch.linspace(-0.3, 0.2, shape[0]).reshape(of), torch.linspace(0.7, 1.4, shape[0]).reshape(of)
-        statistics |= {f"{key}.{name}": low.clone() for name in ("min", "q01", "q10", "mean")}
-        statistics |= {f"{key}.{name}": low + width for name in ("max", "q99", "q90")} | {f"{key}.std": width}
-    write_processors(directory, described, made["modes"], made.get("renamed", {}), statistics)
-    save_file(_weights(directory), directory / "model.safetensors")
-    return directory
+    return save_variant(directory, made, {**made["inputs"], "action": ("ACTION", [ACTION_DIM])}, _BASE, _weights)
 
 
 def config_of(directory: Path) -> ACTConfig:
@@ -139,9 +122,4 @@ def _autoencoder(config: ACTConfig) -> dict[str, torch.Tensor]:
 def observation(variant: str) -> dict[str, Array]:
     """Windows of one frame by the robot's names, images in 0..1."""
     made = VARIANTS[variant]
-    robots = {new: old for old, new in made.get("renamed", {}).items()}
-    rng = np.random.RandomState(7)
-    return {
-        robots.get(key, key): rng.uniform(0, 1, (STREAMS, 1, *shape)).astype(np.float32)
-        for key, (_, shape) in made["inputs"].items()
-    }
+    return observe_variant(made, {key: (STREAMS, 1, *shape) for key, (_, shape) in made["inputs"].items()})

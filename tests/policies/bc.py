@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tests.families.checks import Arrays, golden
+from tests.families.checks import Arrays, golden, part
 from tests.families.weights import draw_weights
 from ttscompile.policies.diffusion_bc import DiffusionBC, Sizes
 
@@ -38,12 +38,8 @@ def counts(name: str) -> bool:
 
 def schedule(timesteps: int) -> dict[str, torch.Tensor]:
     """The buffers of ``ddpm_schedules(1e-4, 0.02, timesteps)``, as the golden file has them."""
-    prefix = f"schedule{timesteps}."
-    return {
-        name.removeprefix(prefix): torch.from_numpy(value)
-        for name, value in golden("diffusion_bc").items()
-        if name.startswith(prefix)
-    }
+    found = part(golden("diffusion_bc"), f"schedule{timesteps}")
+    return {name: torch.from_numpy(value) for name, value in found.items()}
 
 
 def observation(variant: str) -> Arrays:
@@ -61,8 +57,7 @@ def draws(variant: str) -> np.ndarray:
 
 def expected(variant: str) -> Arrays:
     """What the original gave."""
-    found = golden("diffusion_bc").items()
-    return {name.removeprefix(f"{variant}."): value for name, value in found if name.startswith(f"{variant}.")}
+    return part(golden("diffusion_bc"), variant)
 
 
 def save(path: Path, variant: str, wrapped: bool = False, **changes: Any) -> Path:

@@ -1,13 +1,20 @@
 """Small checkpoints, built as the original saves them but with plain dictionaries for the configuration."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 
+from tests.once import Once
 from ttscompile.policies.networks.transformer_for_diffusion import TransformerConfig, TransformerForDiffusion
+
+if TYPE_CHECKING:
+    from .vlas import Array
+    from .whole_vlas import Whole
 
 HORIZON, TO, DO, DA = 6, 2, 5, 3
 
@@ -100,3 +107,28 @@ def save(tmp_path: Path) -> Callable[[Payload], Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="module")
+def whole(request: pytest.FixtureRequest) -> Whole:
+    """The vision-language-action model that a file is about."""
+    found: Whole = request.module.MODEL
+    return found
+
+
+@pytest.fixture(scope="module")
+def golden(whole: Whole) -> Mapping[str, Array]:
+    """The actions that lerobot gave."""
+    return whole.golden()
+
+
+@pytest.fixture(scope="module")
+def compiled(whole: Whole, once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The artifact of the first kind."""
+    return whole.compiled(once, tmp_path_factory.mktemp("saved"))[0]
+
+
+@pytest.fixture
+def directory(whole: Whole, tmp_path: Path) -> Path:
+    """A policy of the first kind, of the test's own."""
+    return whole.save(whole.kinds[0], tmp_path, 0)

@@ -3,17 +3,14 @@
 ``golden/make_lerobot_evo1.py`` wrote the folders, and gave lerobot the same weights, observations and noise.
 """
 
-import json
 import math
-import shutil
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 
 from .hybrid import fill
-from .vlas import CAMERAS, STATE, Array
+from .vlas import CAMERAS, SHAPES as SHAPES, Array, drawn_frame, unpack
 
 KINDS = ("words", "pooled")
 """The second reads the last word alone, has three embodiments and one action a chunk, and differs in rarer entries."""
@@ -21,18 +18,13 @@ TASKS = ("push the block", " Lift it.\n")
 SIZES = ((28, 28), (40, 24))
 """Height and width of the images of each call; the first is what the encoder sees."""
 SAVED = Path(__file__).parent / "golden" / "lerobot_evo1"
-LANGUAGE, SHAPES = "internvl-tiny", "shapes.json"
+LANGUAGE = "internvl-tiny"
 STATE_DIM, PADDED, HORIZON = 4, 6, {"words": 6, "pooled": 1}
 
 
 def save(kind: str, folder: Path) -> Path:
     """A policy and, beside it, the files of its language model. Returns the policy's directory."""
-    for name in ("policy", LANGUAGE):
-        shutil.copytree(SAVED / kind / name, folder / name)
-    shapes = json.loads((folder / "policy" / SHAPES).read_text())
-    (folder / "policy" / SHAPES).unlink()
-    save_file(weights(shapes), folder / "policy" / "model.safetensors")
-    return folder / "policy"
+    return unpack(SAVED / kind, folder, weights)
 
 
 def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
@@ -50,9 +42,7 @@ def _waves(count: int, width: int) -> torch.Tensor:
 
 def observation(call: int) -> dict[str, Array]:
     """One frame; of the second call's images the size is another, and so is the state."""
-    rng = np.random.RandomState(call)
-    found: dict[str, Array] = {STATE: rng.standard_normal(STATE_DIM).astype(np.float32)}
-    return found | {key: rng.uniform(0, 1, (3, *SIZES[call])).astype(np.float32) for key in CAMERAS}
+    return drawn_frame(call, STATE_DIM, dict.fromkeys(CAMERAS, SIZES[call]))
 
 
 def noise(kind: str) -> Array:

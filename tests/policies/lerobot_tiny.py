@@ -1,11 +1,14 @@
 """Tiny LeRobot policies with random weights, saved as lerobot saves them."""
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from ttscompile.policies.lerobot.multi_task_dit import MultiTaskDiTConfig, Network, read_config
 from ttscompile.policies.networks.clip import TextConfig, VisionConfig
@@ -58,6 +61,65 @@ def write_json(path: Path, content: Any) -> None:
 def change_json(path: Path, **changes: Any) -> None:
     """Change entries of a JSON file."""
     write_json(path, json.loads(path.read_text(encoding="utf-8")) | changes)
+
+
+def changed_policy(
+    saved: Path, directory: Path, weights: Callable[[dict[str, torch.Tensor]], object] | None = None, **entries: Any
+) -> Path:
+    """Save a policy again with other entries of its ``config.json``, and with weights that ``weights`` changes."""
+    directory.mkdir()
+    for file in saved.iterdir():
+        if file.name != "config.json" and (file.name != "model.safetensors" or weights is None):
+            (directory / file.name).symlink_to(file)
+    write_json(directory / "config.json", json.loads((saved / "config.json").read_text(encoding="utf-8")) | entries)
+    if weights is not None:
+        tensors = load_file(saved / "model.safetensors")
+        weights(tensors)
+        save_file(tensors, directory / "model.safetensors")
+    return directory
+
+
+def save_variant(
+    directory: Path,
+    made: Mapping[str, Any],
+    features: Mapping[str, tuple[str, list[int]]],
+    base: Mapping[str, Any],
+    weights: Callable[[Path], dict[str, torch.Tensor]],
+) -> Path:
+    """Save a policy of a type that has several variants.
+
+    Args:
+        directory: of the policy.
+        made: ``inputs``, ``modes``, ``settings`` and, of what the robot calls otherwise, ``renamed`` of the variant.
+        features: type and shape of all that it reads, and of its action.
+        base: entries of ``config.json`` that are common to the variants.
+        weights: ``weights(directory)``, of what is saved there.
+
+    Returns:
+        The directory.
+    """
+    directory.mkdir(parents=True)
+    described = {key: {"type": kind, "shape": shape} for key, (kind, shape) in features.items()}
+    outputs = {"action": described["action"]}
+    inputs = {key: each for key, each in described.items() if key not in outputs}
+    own = {"input_features": inputs, "output_features": outputs, "normalization_mapping": made["modes"]}
+    write_json(directory / "config.json", {**base, **own, **made["settings"]})
+    statistics: dict[str, torch.Tensor] = {}
+    for key, (kind, shape) in features.items():
+        of = (shape[0], 1, 1) if kind == "VISUAL" else tuple(shape)
+        low, width = torch.linspace(-0.3, 0.2, shape[0]).reshape(of), torch.linspace(0.7, 1.4, shape[0]).reshape(of)
+        statistics |= {f"{key}.{name}": low.clone() for name in ("min", "q01", "q10", "mean")}
+        statistics |= {f"{key}.{name}": low + width for name in ("max", "q99", "q90")} | {f"{key}.std": width}
+    write_processors(directory, described, made["modes"], made.get("renamed", {}), statistics)
+    save_file(weights(directory), directory / "model.safetensors")
+    return directory
+
+
+def observe_variant(made: Mapping[str, Any], shapes: Mapping[str, tuple[int, ...]]) -> dict[str, npt.NDArray[Any]]:
+    """Windows of these shapes by the robot's names, images in 0..1."""
+    robots = {new: old for old, new in made.get("renamed", {}).items()}
+    rng = np.random.RandomState(7)
+    return {robots.get(key, key): rng.uniform(0, 1, shape).astype(np.float32) for key, shape in shapes.items()}
 
 
 def save_policy(

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 
 from ttscompile.policies.lerobot.diffusion import DiffusionConfig, Network, as_saved, read_config
 
 from .hybrid import Array, fill
-from .lerobot_tiny import write_json, write_processors
+from .lerobot_tiny import observe_variant, save_variant
 
 STREAMS, STEPS, STATE_DIM, ACTION_DIM = 2, 6, 4, 3
 STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
@@ -95,22 +94,8 @@ _BASE: dict[str, Any] = {
 def save(variant: str, directory: Path) -> Path:
     """Save a policy as lerobot does. Returns the directory."""
     made = VARIANTS[variant]
-    directory.mkdir(parents=True)
     features = {STATE: ("STATE", [STATE_DIM]), **made["inputs"], "action": ("ACTION", [ACTION_DIM])}
-    described = {key: {"type": kind, "shape": shape} for key, (kind, shape) in features.items()}
-    outputs = {"action": described["action"]}
-    inputs = {key: each for key, each in described.items() if key not in outputs}
-    own = {"input_features": inputs, "output_features": outputs, "normalization_mapping": made["modes"]}
-    write_json(directory / "config.json", _BASE | own | made["settings"])
-    statistics: dict[str, torch.Tensor] = {}
-    for key, (kind, shape) in features.items():
-        of = (shape[0], 1, 1) if kind == "VISUAL" else tuple(shape)
-        low, width = torch.linspace(-0.3, 0.2, shape[0]).reshape(of), torch.linspace(0.7, 1.4, shape[0]).reshape(of)
-        statistics |= {f"{key}.{name}": low.clone() for name in ("min", "q01", "q10", "mean")}
-        statistics |= {f"{key}.{name}": low + width for name in ("max", "q99", "q90")} | {f"{key}.std": width}
-    write_processors(directory, described, made["modes"], made.get("renamed", {}), statistics)
-    save_file(_weights(read(directory)), directory / "model.safetensors")
-    return directory
+    return save_variant(directory, made, features, _BASE, lambda saved: _weights(read(saved)))
 
 
 def read(directory: Path) -> DiffusionConfig:
@@ -131,13 +116,8 @@ def observation(variant: str) -> dict[str, Array]:
     """Windows by the robot's names, images in 0..1."""
     made = VARIANTS[variant]
     frames = made["settings"].get("n_obs_steps", _BASE["n_obs_steps"])
-    robots = {new: old for old, new in made.get("renamed", {}).items()}
-    rng = np.random.RandomState(7)
     shapes = {STATE: [STATE_DIM], **{key: shape for key, (_, shape) in made["inputs"].items()}}
-    return {
-        robots.get(key, key): rng.uniform(0, 1, (STREAMS, frames, *shape)).astype(np.float32)
-        for key, shape in shapes.items()
-    }
+    return observe_variant(made, {key: (STREAMS, frames, *shape) for key, shape in shapes.items()})
 
 
 def noise() -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from tests.families.checks import Arrays, golden
+from tests.families.checks import Arrays, golden, part
 from tests.families.weights import draw_weights
 from tests.policies import hybrid
 from ttscompile.policies.networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
@@ -171,5 +171,4 @@ def draws(variant: str) -> np.ndarray:
 
 def expected(variant: str) -> Arrays:
     """What the original gave."""
-    numbers = golden("streaming").items()
-    return {name.removeprefix(f"{variant}."): value for name, value in numbers if name.startswith(f"{variant}.")}
+    return part(golden("streaming"), variant)

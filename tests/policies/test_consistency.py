@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import ttscompile
+from tests.families.checks import part
 from tests.rounding import PROMISED, assert_equal_but_for_rounding
 from ttscompile.core.spec import Noise, PolicySpec, SamplerTable
 from ttscompile.errors import CheckpointError, SpecError
@@ -21,7 +22,7 @@ from ttscompile.policies.diffusion_policy import family as diffusion_policy
 
 from ..families.support import record
 from . import consistency
-from .originals import Arrays, as_seen, assert_actions, golden
+from .originals import Arrays, as_seen, assert_actions, assert_same_actions, golden
 
 Build = Callable[..., tuple[Any, PolicySpec]]
 _weights = cache(consistency.state_dict)
@@ -47,8 +48,7 @@ def build() -> Build:
 
 def expected(variant: str) -> Arrays:
     """What the original gave of one variant."""
-    numbers = golden("consistency_policy").items()
-    return {key.removeprefix(f"{variant}."): value for key, value in numbers if key.startswith(f"{variant}.")}
+    return part(golden("consistency_policy"), variant)
 
 
 def asked(spec: PolicySpec) -> SamplerTable:
@@ -95,7 +95,8 @@ def convert(variant: str, folder: Path, **options: Any) -> Program:
 def test_the_compiled_teacher_is_the_original(teacher: tuple[Program, Path], runtime: str) -> None:
     """Heun's method, two evaluations a step, from raw observations to actions."""
     policy = ttscompile.load(teacher[1], runtime=runtime)
-    assert_same(policy.predict_action(consistency.observation(), noise=noise(teacher[0].spec.sampler)), "heun")
+    found = policy.predict_action(consistency.observation(), noise=noise(teacher[0].spec.sampler))
+    assert_same_actions(found, expected("heun"))
 
 
 @pytest.mark.slow
@@ -108,7 +109,8 @@ def test_the_compiled_student_is_the_original(
     program, directory = student
     table = program.spec.sampler if plan == "dense" else asked(program.spec)
     policy = ttscompile.load(directory, runtime=runtime)
-    assert_same(policy.predict_action(consistency.observation(), noise=noise(table), plan=plan), variant)
+    found = policy.predict_action(consistency.observation(), noise=noise(table), plan=plan)
+    assert_same_actions(found, expected(variant))
 
 
 @pytest.mark.slow
@@ -130,14 +132,6 @@ def student(tmp_path_factory: pytest.TempPathFactory) -> tuple[Program, Path]:
     """Program and artifact of a student, with the loop of three evaluations too."""
     folder = tmp_path_factory.mktemp("student")
     return convert("student", folder, steps=3), folder / "compiled"
-
-
-def assert_same(found: Any, variant: str) -> None:
-    """The actions are those of the original."""
-    numbers = expected(variant)
-    for name in ("action", "action_pred"):
-        assert found[name].shape == numbers[name].shape
-        assert np.abs(found[name] - numbers[name]).max() < PROMISED * np.ptp(numbers["action_pred"])
 
 
 # Settings

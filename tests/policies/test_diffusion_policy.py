@@ -9,12 +9,13 @@ import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 from tests.rounding import Counted, allowed, assert_equal_but_for_rounding
-from ttscompile.errors import CheckpointError, SpecError
+from ttscompile.errors import SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.policies.diffusion_policy.parts import choose_weights
 from ttscompile.samplers.table import sampler_table
 
+from .refused import assert_not_read
 from .variants import VARIANTS, Build, Save
 
 
@@ -94,8 +95,7 @@ def test_interpolated_configuration_is_the_same_policy(payload: Build, save: Sav
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[key], expected[key]) for key in found)
     config["policy"]["model"]["n_emb"] = "${oc.env:WIDTH}"
-    with pytest.raises(CheckpointError, match=r"cfg\.policy\.model\.n_emb is '\$\{oc\.env:WIDTH\}'"):
-        load_checkpoint_policy(save(built))
+    assert_not_read(save(built), r"cfg\.policy\.model\.n_emb is '\$\{oc\.env:WIDTH\}'")
 
 
 # Weights
@@ -110,8 +110,7 @@ def test_wanted_weights_are_missing(payload: Build, save: Save) -> None:
     del built["cfg"]["training"]["use_ema"]
     assert load_checkpoint_policy(save(built))[1].source["weights"] == "model"
     built["state_dicts"] = {"optimizer": {}}
-    with pytest.raises(CheckpointError, match=r"state_dicts holds \['optimizer'\]"):
-        load_checkpoint_policy(save(built))
+    assert_not_read(save(built), r"state_dicts holds \['optimizer'\]")
 
 
 def test_half_precision_is_loaded_as_float32(payload: Build, save: Save) -> None:
@@ -144,55 +143,39 @@ def test_wrappers_of_torch_are_taken_off(payload: Build, old: str, new: str) -> 
     assert list(found) == list(expected) and list(states["ema_model"]) != list(expected)
 
 
-@pytest.mark.parametrize(
-    "key", ["model.head.bias", "model.decoder.layers.0.norm3.weight", "model.mask", "model.cond_obs_emb.weight"]
-)
-def test_missing_weights_are_named(payload: Build, save: Save, key: str) -> None:
-    """Any one of them."""
-    built = payload()
-    del built["state_dicts"]["ema_model"][key]
-    with pytest.raises(CheckpointError, match=rf"missing {key}\."):
-        load_checkpoint_policy(save(built))
-
-
-@pytest.mark.parametrize(
-    "key", ["model.extra.weight", "obs_encoder.weight", "normalizer.other", "model.decoder.layers.1.norm3.weight"]
-)
-def test_extra_weights_are_named(payload: Build, save: Save, key: str) -> None:
-    """A network with more in it is another network."""
-    built = payload()
-    built["state_dicts"]["ema_model"][key] = torch.zeros(8)
-    with pytest.raises(CheckpointError, match=rf"unexpected {key}\."):
-        load_checkpoint_policy(save(built))
-
-
 def test_many_missing_weights_are_counted(payload: Build, save: Save) -> None:
     """The message stays readable."""
     built = payload()
     built["cfg"]["policy"]["model"]["n_layer"] = 3
-    with pytest.raises(CheckpointError, match=r"missing model\.decoder\.layers\.1\.\S+,.* and 30 more\."):
-        load_checkpoint_policy(save(built))
+    assert_not_read(save(built), r"missing model\.decoder\.layers\.1\.\S+,.* and 30 more\.")
+
+
+MISSING = ("model.head.bias", "model.decoder.layers.0.norm3.weight", "model.mask", "model.cond_obs_emb.weight")
+UNKNOWN = ("model.extra.weight", "obs_encoder.weight", "normalizer.other", "model.decoder.layers.1.norm3.weight")
+"""A network with more in it is another network."""
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
+        *((key, None, rf"missing {key}\.") for key in MISSING),
+        *((key, torch.zeros(8), rf"unexpected {key}\.") for key in UNKNOWN),
         ("model.head.bias", torch.zeros(4), r"model\.head\.bias has shape \(4,\); expected \(3,\)"),
         ("model.head.bias", torch.tensor([0.0, math.nan, math.inf]), r"model\.head\.bias holds 2 values that are not"),
         ("model.head.bias", torch.zeros(3, dtype=torch.int64), r"model\.head\.bias is a torch\.int64 tensor"),
         ("model.head.bias", [0.0, 0.0, 0.0], r"model\.head\.bias is a list"),
         ("model.mask", torch.zeros(6, 6), r"model\.mask is not the causal mask"),
         ("normalizer.params_dict.obs.scale", torch.tensor([1.0, 1, 0, 1, 1]), r"obs\.scale is .* no zero"),
-        ("normalizer.params_dict.action.offset", torch.tensor([1.0, math.nan, 0]), r"action\.offset is .* finite"),
+        ("normalizer.params_dict.action.scale", torch.tensor([0.0, 1, 1]), r"action\.scale is \[0\.0, .* no zero in a"),
         ("normalizer.params_dict.obs.offset", torch.zeros(10), r"obs\.offset has shape \(10,\).* 5 channels"),
     ],
 )
 def test_wrong_weights_are_refused(payload: Build, save: Save, key: str, value: Any, message: str) -> None:
-    """Shape, type, and values that are not finite; masks hold -inf and are compared instead."""
+    """Names, shape, type, and values that are not finite; masks hold -inf and are compared instead."""
     built = payload()
-    built["state_dicts"]["ema_model"][key] = value
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(save(built))
+    weights = built["state_dicts"]["ema_model"]
+    built["state_dicts"]["ema_model"] = {k: v for k, v in (weights | {key: value}).items() if v is not None}
+    assert_not_read(save(built), message)
 
 
 def test_normalizer(payload: Build, save: Save) -> None:
@@ -209,8 +192,7 @@ def test_normalizer(payload: Build, save: Save) -> None:
     assert affine is not None
     assert affine.scale.tolist() == [2.0] * 5
     del weights["normalizer.params_dict.action.scale"]
-    with pytest.raises(CheckpointError, match=r"no normalizer\.params_dict\.action\.scale"):
-        load_checkpoint_policy(save(built))
+    assert_not_read(save(built), r"no normalizer\.params_dict\.action\.scale")
 
 
 # Configuration
@@ -221,8 +203,7 @@ def test_checkpoint_of_something_else(payload: Build, save: Save, part: str) -> 
     """What is missing and what is there instead."""
     built = payload()
     built["weights"] = built.pop(part)
-    with pytest.raises(CheckpointError, match=rf"policy\.ckpt: no entry '{part}'; found .*'weights'"):
-        load_checkpoint_policy(save(built))
+    assert_not_read(save(built), rf"policy\.ckpt: no entry '{part}'; found .*'weights'")
 
 
 @pytest.mark.parametrize(
@@ -266,8 +247,7 @@ def test_contradictions_are_refused(
     built = payload()
     policy = built["cfg"]["policy"]
     {"policy": policy, "training": built["cfg"]["training"], **policy}[place].update(changes)
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(save(built))
+    assert_not_read(save(built), message)
 
 
 # Samplers

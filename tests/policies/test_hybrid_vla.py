@@ -7,19 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 import ttscompile
 from tests.families.checks import golden, in_loop
-from tests.families.support import record
+from tests.families.support import record, stored_program
 from tests.rounding import PROMISED
 from ttscompile.artifact import load_artifact
-from ttscompile.cli import main
-from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions, find_family
 
 from . import hybrid_vlas as tiny
+from .authors import by_one_command
+from .refused import assert_not_read
 
 RANGE = np.ptp([tiny.LOW, tiny.HIGH])
 
@@ -48,10 +47,7 @@ def test_the_original_predicts_the_same(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """By one command."""
-    folder = tmp_path_factory.mktemp("hybrid_vla")
-    result = CliRunner().invoke(main, ["convert", str(tiny.save(folder)), "-o", str(folder / "compiled")])
-    assert result.exit_code == 0, result.output
-    return folder / "compiled"
+    return by_one_command(tiny.save(tmp_path_factory.mktemp("hybrid_vla")))
 
 
 @pytest.mark.slow
@@ -67,9 +63,9 @@ def test_the_compiled_policy_acts_as_the_original(compiled: Path, runtime: str) 
 
 
 @pytest.mark.slow
-def test_the_language_model_reads_the_prefix_once(tmp_path: Path) -> None:
+def test_the_language_model_reads_the_prefix_once(compiled: Path) -> None:
     """Its layers are the blocks, and of all arithmetic less than an eighth is left in the loop."""
-    program = ttscompile.convert(tiny.save(tmp_path), tmp_path / "compiled")
+    program = stored_program(load_artifact(compiled))
     assert in_loop(program) < 1 / 8
     record(
         "HybridVLA, its diffusion, read from its file",
@@ -77,7 +73,7 @@ def test_the_language_model_reads_the_prefix_once(tmp_path: Path) -> None:
         "ddim 4",
         program,
     )
-    assert load_artifact(tmp_path / "compiled").manifest.spec.observations["prefix"].shape == (12, 256)
+    assert program.spec.observations["prefix"].shape == (12, 256)
 
 
 def test_what_the_network_is_told_of_the_state(tmp_path: Path) -> None:
@@ -154,27 +150,21 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("changes", "message"), REFUSED)
 def test_what_is_no_such_policy_is_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     path = tiny.save(tmp_path, **changes)
-    with pytest.raises(CheckpointError, match=message) as caught:
-        load_checkpoint_policy(path, format="hybrid_vla")
-    assert str(tmp_path) in str(caught.value)
+    assert_not_read(path, message, names=tmp_path, format="hybrid_vla")
 
 
 def test_hostile_and_damaged_files_are_refused(tmp_path: Path) -> None:
     path = tiny.save(tmp_path, x_embedder={"hook": print})
-    with pytest.raises(CheckpointError, match=r"refused, .*could run code"):
-        load_checkpoint_policy(path)
+    assert_not_read(path, r"refused, .*could run code")
     path = tiny.save(tmp_path)
     (tmp_path / "config.json").write_text(json.dumps([1]))
-    with pytest.raises(CheckpointError, match=r"config\.json: holds a list; expected an object"):
-        load_checkpoint_policy(path)
+    assert_not_read(path, r"config\.json: holds a list; expected an object")
     tiny.save(tmp_path).write_bytes(path.read_bytes()[:4000])
-    with pytest.raises(CheckpointError, match="not a torch checkpoint, or a truncated one"):
-        load_checkpoint_policy(path, format="hybrid_vla")
+    assert_not_read(path, "not a torch checkpoint, or a truncated one", format="hybrid_vla")
 
 
 def test_a_machine_without_the_memory_is_told_before_anything_is_copied(tmp_path: Path, monkeypatch: Any) -> None:
     """Seven thousand million weights are more than most have memory for."""
     monkeypatch.setattr("ttscompile.frontends.saved_weights.memory_bytes", lambda: 2**18)
     path = tiny.save(tmp_path)
-    with pytest.raises(CheckpointError, match=rf"{path}: .*million weights.*this machine has 0\.0 GiB"):
-        load_checkpoint_policy(path)
+    assert_not_read(path, rf"{path}: .*million weights.*this machine has 0\.0 GiB")

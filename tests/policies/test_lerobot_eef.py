@@ -15,14 +15,15 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.poses import Pose, composed, orthonormal
 from ttscompile.core.spec import Noise, Relative
-from ttscompile.errors import CheckpointError, ObservationError
+from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.report import facts
 
-from . import eefs, groots, originals, relatives
+from . import eefs, groots, originals
+from .originals import assert_agreement_on_random_plans
 from .vlas import STATE, Array
-from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
+from .whole_vlas import eager_chunk
 
 RELATIVE = {
     "arm": Relative(STATE, (10, 11, *[None] * 10), (Pose(2, 0),)),
@@ -131,23 +132,3 @@ def test_a_state_without_a_rotation_is_refused(once: Once, tmp_path: Path) -> No
     given[STATE] = 0 * given[STATE]
     with pytest.raises(ObservationError, match="'observation.state': numbers 3 to 8 are to be two rows of a rotation"):
         policy.predict_action_chunk(given, noise=Noise(eefs.noise()))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "XYZ_ROTVEC"}, r"'eef_9d' are relative, as EEF of the format XYZ_ROTVEC, which lerobot does not"),
-        ({"format": "DEFAULT"}, "expected NON_EEF, or EEF of the format XYZ_ROT6D"),
-        ({"type": "HAND"}, "as HAND of the format XYZ_ROT6D, which lerobot does not decode"),
-        ({"state_key": "joint_position"}, "'eef_9d' have 9 numbers, and the state 'joint_position' 2; expected 9 each"),
-        ({"format": "xyz+rot6d", "type": "eef", "rep": "relative"}, None),
-    ],
-)
-def test_what_lerobot_composes_alone_is_compiled(tmp_path: Path, changes: dict[str, Any], message: str | None) -> None:
-    directory = eefs.save("arm", tmp_path)
-    relatives.change_group(directory, 1, changes)
-    if message is None:
-        assert load_checkpoint_policy(directory)[1].chunk.relative == RELATIVE["arm"]
-        return
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(directory)

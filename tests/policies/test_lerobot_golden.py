@@ -11,17 +11,16 @@ import torch
 from torch import nn
 
 import ttscompile
-from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding, bound
+from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.instruct import Instruct
 
 from ..families.support import record, stored_program
-from ..runtimes.agreement import call_terms, largest_difference
+from .originals import assert_agreement_on_random_plans
 
 pytestmark = pytest.mark.slow
 
@@ -157,10 +156,7 @@ def test_encoders_and_modulations_leave_the_loop(golden: Golden, compiled: Path)
 
 def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
     """Episodes of random legal plans, several streams."""
-    artifact = load_artifact(compiled)
-    runtimes = [open_runtime(artifact, name) for name in ("onnxruntime", "reference")]
-    rng = np.random.default_rng(3)
-    assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=3) < bound(call_terms(artifact))
+    assert_agreement_on_random_plans(compiled, calls=3)
 
 
 def test_a_task_in_words(golden: Golden) -> None:

@@ -11,15 +11,17 @@ import pytest
 import ttscompile
 from tests.once import Once
 from ttscompile.core.spec import Noise, Relative
-from ttscompile.errors import CheckpointError, ObservationError
+from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import AS_SAVED
 
-from . import groots, originals, pis, relatives, vla_jepas
+from . import eefs, groots, originals, pis, relatives, vla_jepas
 from .lerobot_tiny import change_json
+from .originals import assert_agreement_on_random_plans
+from .refused import Refusals, assert_not_read, refusals
 from .vlas import STATE, Array
-from .whole_vlas import assert_agreement_on_random_plans, eager_chunk
+from .whole_vlas import eager_chunk
 
 KINDS = ("pi0", "pi05", "groot", "vla_jepa")
 ENTRIES = {
@@ -168,45 +170,58 @@ def test_steps_that_are_no_pair_are_refused(
             steps.remove(own)
             steps.insert(0 if "first" in changes else len(steps), own)
         change_json(path, steps=steps)
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(directory)
+    assert_not_read(directory, message)
 
 
 def test_a_state_that_is_shorter_than_an_action(tmp_path: Path) -> None:
     directory = relatives.with_relative_steps(pis.save("pi0", tmp_path / "policy"), None)
-    with pytest.raises(CheckpointError, match="the 5 numbers of an action are relative to those of a state that has 4"):
-        load_checkpoint_policy(directory)
+    assert_not_read(directory, "the 5 numbers of an action are relative to those of a state that has 4")
 
 
 def test_a_gripper_of_two_values_has_to_be_absolute(tmp_path: Path) -> None:
     directory = relatives.with_wide_state(vla_jepas.save("libero", tmp_path), "vla_jepa")
     relatives.with_relative_steps(directory, None)
-    with pytest.raises(
-        CheckpointError, match="number 6 of an action is relative to the state, and then made one of two"
-    ):
-        load_checkpoint_policy(directory)
+    assert_not_read(directory, "number 6 of an action is relative to the state, and then made one of two")
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+GROUPS: Refusals = {
+    "groot": [
         ({"type": "EEF", "format": "XYZ_ROT6D"}, "have 3 numbers, and the state 'arm' 3; expected 9 each, as EEF"),
         ({"state_key": "leg"}, "ValueError.*leg.*; expected groups of an action"),
         ({"state_key": "gripper"}, "actions 'reach' have 3 numbers, and the state 'gripper' 1"),
-        ({"rep": "ABSOLUTE"}, None),
     ],
-)
-def test_groups_that_are_not_rebuilt_are_named(tmp_path: Path, changes: dict[str, Any], message: str | None) -> None:
-    directory = relatives.save("groot", tmp_path)
+    "groot eef": [
+        ({"format": "XYZ_ROTVEC"}, r"'eef_9d' are relative, as EEF of the format XYZ_ROTVEC, which lerobot does not"),
+        ({"format": "DEFAULT"}, "expected NON_EEF, or EEF of the format XYZ_ROT6D"),
+        ({"type": "HAND"}, "as HAND of the format XYZ_ROT6D, which lerobot does not decode"),
+        ({"state_key": "joint_position"}, "'eef_9d' have 9 numbers, and the state 'joint_position' 2; expected 9 each"),
+    ],
+}
+
+
+def save_groups(kind: str, folder: Path, changes: dict[str, Any]) -> Path:
+    """A policy of GR00T's with changes to its second group of actions, which is relative."""
+    directory = eefs.save("arm", folder) if kind == "groot eef" else relatives.save(kind, folder)
     relatives.change_group(directory, 1, changes)
-    if message is None:
-        chunk = load_checkpoint_policy(directory)[1].chunk
-        assert chunk.relative == Relative(STATE, (3, None, None, None, None))
-        assert chunk.normalizer is not None
-        assert chunk.normalizer.scale.shape == (5,)
-        return
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(directory)
+    return directory
+
+
+@pytest.mark.parametrize(("kind", "changes", "message"), refusals(GROUPS))
+def test_groups_that_are_not_rebuilt_are_named(
+    tmp_path: Path, kind: str, changes: dict[str, Any], message: str
+) -> None:
+    assert_not_read(save_groups(kind, tmp_path, changes), message)
+
+
+def test_other_ways_to_say_what_groups_are(tmp_path: Path) -> None:
+    """One that is absolute after all; and small letters."""
+    chunk = load_checkpoint_policy(save_groups("groot", tmp_path / "absolute", {"rep": "ABSOLUTE"}))[1].chunk
+    assert chunk.relative == Relative(STATE, (3, None, None, None, None))
+    assert chunk.normalizer is not None
+    assert chunk.normalizer.scale.shape == (5,)
+    expected = load_checkpoint_policy(eefs.save("arm", tmp_path / "arm"))[1].chunk.relative
+    small = {"format": "xyz+rot6d", "type": "eef", "rep": "relative"}
+    assert load_checkpoint_policy(save_groups("groot eef", tmp_path / "small", small))[1].chunk.relative == expected
 
 
 def test_the_state_is_added_once(tmp_path: Path) -> None:
@@ -223,5 +238,4 @@ def test_the_state_is_added_once(tmp_path: Path) -> None:
         for step in steps:
             step["config"] |= {"normalize_min_max": False} if "pack" in step["registry_name"] else {}
         change_json(path, steps=steps)
-    with pytest.raises(CheckpointError, match="groot_n1_7_action_decode_v1 and the steps after it add the state"):
-        load_checkpoint_policy(directory)
+    assert_not_read(directory, "groot_n1_7_action_decode_v1 and the steps after it add the state")

@@ -8,7 +8,7 @@ from torch import nn
 from transformers import ResNetConfig, ResNetModel
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
-from ttscompile.policies.networks.resnet import CHANNELS, DEPTHS, SHRINKS, group_norm, resnet
+from ttscompile.policies.networks.resnet import CHANNELS, DEPTHS, SHRINKS, resnet
 
 
 @pytest.mark.parametrize("name", DEPTHS)
@@ -39,10 +39,3 @@ def test_another_implementation_gives_the_same(name: str) -> None:
         expected = other(images).last_hidden_state
     assert found.shape == (2, CHANNELS, -(-70 // SHRINKS), -(-45 // SHRINKS))
     assert_equal_but_for_rounding(found, expected, counted.terms)
-
-
-def test_group_norm_has_groups_of_16_channels() -> None:
-    """As Diffusion Policy and LeRobot put it into the place of batch norm."""
-    norm = group_norm(64)
-    assert isinstance(norm, nn.GroupNorm)
-    assert (norm.num_groups, norm.num_channels) == (4, 64)

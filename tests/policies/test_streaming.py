@@ -7,19 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 import ttscompile
-from tests.families.support import record
+from tests.families.support import record, stored_program
 from tests.rounding import PROMISED
-from ttscompile.cli import main
-from ttscompile.errors import CheckpointError, ObservationError, SpecError
+from ttscompile.artifact import load_artifact
+from ttscompile.errors import ObservationError, SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.policies.diffusion_policy.streaming import Buffer, StreamingDenoiser
 
 from . import streams
+from .authors import by_one_command
+from .refused import Refusals, assert_not_read, refusals
 
 Arrays = dict[str, np.ndarray]
 
@@ -100,11 +101,8 @@ def test_a_buffer_by_hand() -> None:
 @pytest.mark.parametrize(("variant", "what"), [("two_chunks", "low-dimensional"), ("images", "robomimic's encoder")])
 def test_one_command_compiles_a_policy_that_goes_on_from_call_to_call(variant: str, what: str, tmp_path: Path) -> None:
     """In both runtimes; its row of the support table."""
-    compiled = tmp_path / "compiled"
-    path = streams.save(tmp_path / "policy.ckpt", variant)
-    result = CliRunner().invoke(main, ["convert", str(path), "-o", str(compiled)])
-    assert result.exit_code == 0, result.output
-    spec = load_checkpoint_policy(path)[1]
+    compiled = by_one_command(streams.save(tmp_path / "policy.ckpt", variant))
+    spec = load_artifact(compiled).manifest.spec
     for runtime in ("onnxruntime", "reference"):
         policy = ttscompile.load(compiled, runtime=runtime)
 
@@ -120,65 +118,64 @@ def test_one_command_compiles_a_policy_that_goes_on_from_call_to_call(variant: s
         f"Streaming Diffusion Policy, {what}",
         "actions that the original gave, call after call, 1e-5 of the range",
         "streaming 5",
-        ttscompile.convert(path, tmp_path / "again"),
+        stored_program(load_artifact(compiled)),
     )
 
 
 def test_it_has_one_loop(tmp_path: Path) -> None:
     path = streams.save(tmp_path / "policy.ckpt", "two_chunks")
     for options in (LoadOptions(sampler="ddim"), LoadOptions(steps=4), LoadOptions(spacing="trailing")):
-        with pytest.raises(SpecError, match="has one loop: its buffer is cleaner by 5 steps after each call"):
-            load_checkpoint_policy(path, options=options)
+        assert_not_read(
+            path, "has one loop: its buffer is cleaner by 5 steps after each call", error=SpecError, options=options
+        )
     assert not load_checkpoint_policy(path, options=LoadOptions(loops=[("ddim", 3)]))[1].loops
 
 
-REFUSED: list[tuple[dict[str, Any], str]] = [
-    ({"noise_scheduler": {"_target_": "a.DDIMTEDiScheduler"}}, "_target_ is DDIMTEDiScheduler; expected DDPMTEDi"),
-    ({"noise_scheduler": {"num_train_timesteps": 20}}, "num_inference_steps is 10; expected 20, the timesteps of the"),
-    ({"noise_scheduler": {"num_train_timesteps": 10**6}}, "num_train_timesteps is 1000000; expected a positive whole"),
-    ({"noise_scheduler": {"variance_type": "learned"}}, "variance_type is 'learned'; expected fixed_small or"),
-    ({"noise_scheduler": {"beta_schedule": "x"}}, r"noise_scheduler: diffusers refuses the settings"),
-    ({"noise_scheduler": {"clip_sample": 1}}, "clip_sample is 1; expected true or false"),
-    ({"obs_as_global_cond": False}, "obs_as_global_cond is false; expected true: its inpainting is not rebuilt"),
-    ({"obs_as_local_cond": True}, "obs_as_local_cond is True; expected false: another is not rebuilt here"),
-    ({"oa_step_convention": False}, "oa_step_convention is False; expected true"),
-    ({"buffer_init": "denoise"}, "buffer_init is 'denoise'; expected zero or constant: the first call"),
-    ({"n_action_steps": 2}, r"horizon = 8 holds 3 chunks of n_action_steps = 2, and 10 timesteps; expected"),
-    ({"n_action_steps": 8}, "horizon = 8 holds 0 chunks of n_action_steps = 8"),
-    ({"horizon": 12, "n_action_steps": 5}, r"model\.horizon is 8; expected 12, the policy's"),
-    (
-        {"horizon": 10**6, "model": {"horizon": 10**6}},
-        "policy.horizon is 1000000; expected a positive whole number, 4096 at most",
-    ),
-    ({"model": {"input_dim": 4}}, r"model\.input_dim is 4; expected 3 with action_dim = 3"),
-    ({"model": {"input_dim": None}}, r"model\.input_dim is missing"),
-    ({"model": {"more": 1}}, r"cfg\.policy\.model has settings that ConditionalUnet1D does not know: more"),
-    ({"model": {"diffusion_step_embed_dim": 10**6}}, "diffusion_step_embed_dim or horizon asks for at least"),
-    ({"model": {"down_dims": [16, 24, 32]}}, r"missing model\.down_modules\.1\.2\."),
-    ({"model": {"down_dims": [16] * 5}}, "horizon is 8; expected a multiple of 16"),
-    ({"eta": 0.1}, r"cfg\.policy has settings that are not known: eta\. The policy was changed"),
-]
-
-
-@pytest.mark.parametrize(("changes", "message"), REFUSED)
-def test_what_is_no_such_policy_is_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
-    path = streams.save(tmp_path / "policy.ckpt", "two_chunks", **changes)
-    with pytest.raises(CheckpointError, match=message) as caught:
-        load_checkpoint_policy(path)
-    assert str(path) in str(caught.value)
-
-
-def test_what_is_no_such_policy_on_images_is_refused(tmp_path: Path) -> None:
-    pos = {"shape": [4]}
-    cases: list[tuple[dict[str, Any], str]] = [
+REFUSED: Refusals = {
+    "two_chunks/noise_scheduler": [
+        ({"_target_": "a.DDIMTEDiScheduler"}, "_target_ is DDIMTEDiScheduler; expected DDPMTEDi"),
+        ({"num_train_timesteps": 20}, "num_inference_steps is 10; expected 20, the timesteps of the"),
+        ({"num_train_timesteps": 10**6}, "num_train_timesteps is 1000000; expected a positive whole"),
+        ({"variance_type": "learned"}, "variance_type is 'learned'; expected fixed_small or"),
+        ({"beta_schedule": "x"}, r"noise_scheduler: diffusers refuses the settings"),
+        ({"clip_sample": 1}, "clip_sample is 1; expected true or false"),
+    ],
+    "two_chunks": [
+        ({"obs_as_global_cond": False}, "obs_as_global_cond is false; expected true: its inpainting is not rebuilt"),
+        ({"obs_as_local_cond": True}, "obs_as_local_cond is True; expected false: another is not rebuilt here"),
+        ({"oa_step_convention": False}, "oa_step_convention is False; expected true"),
+        ({"buffer_init": "denoise"}, "buffer_init is 'denoise'; expected zero or constant: the first call"),
+        ({"n_action_steps": 2}, r"horizon = 8 holds 3 chunks of n_action_steps = 2, and 10 timesteps; expected"),
+        ({"n_action_steps": 8}, "horizon = 8 holds 0 chunks of n_action_steps = 8"),
+        ({"horizon": 12, "n_action_steps": 5}, r"model\.horizon is 8; expected 12, the policy's"),
+        (
+            {"horizon": 10**6, "model": {"horizon": 10**6}},
+            "policy.horizon is 1000000; expected a positive whole number, 4096 at most",
+        ),
+        ({"eta": 0.1}, r"cfg\.policy has settings that are not known: eta\. The policy was changed"),
+    ],
+    "two_chunks/model": [
+        ({"input_dim": 4}, r"model\.input_dim is 4; expected 3 with action_dim = 3"),
+        ({"input_dim": None}, r"model\.input_dim is missing"),
+        ({"more": 1}, r"cfg\.policy\.model has settings that ConditionalUnet1D does not know: more"),
+        ({"diffusion_step_embed_dim": 10**6}, "diffusion_step_embed_dim or horizon asks for at least"),
+        ({"down_dims": [16, 24, 32]}, r"missing model\.down_modules\.1\.2\."),
+        ({"down_dims": [16] * 5}, "horizon is 8; expected a multiple of 16"),
+    ],
+    "images": [
         ({"obs_as_global_cond": False}, "obs_as_global_cond is false"),
         (
-            {"shape_meta": {"obs": {"buffer": pos}, "action": {"shape": [3]}}},
+            {"shape_meta": {"obs": {"buffer": {"shape": [4]}}, "action": {"shape": [3]}}},
             "shape_meta.obs names buffer, which stands",
         ),
         ({"down_dims": [16, 24, 32]}, r"missing model\.down_modules\.1\.2"),
         ({"more": 1}, "has settings that are not known: more"),
-    ]
-    for changes, message in cases:
-        with pytest.raises(CheckpointError, match=message):
-            load_checkpoint_policy(streams.save(tmp_path / "policy.ckpt", "images", **changes))
+    ],
+}
+
+
+@pytest.mark.parametrize(("place", "changes", "message"), refusals(REFUSED))
+def test_what_is_no_such_policy_is_refused(place: str, changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    variant, _, entry = place.partition("/")
+    path = streams.save(tmp_path / "policy.ckpt", variant, **({entry: changes} if entry else changes))
+    assert_not_read(path, message, names=path)

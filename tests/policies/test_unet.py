@@ -12,8 +12,7 @@ import pytest
 import torch
 
 import ttscompile
-from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding, bound
-from ttscompile.artifact import load_artifact
+from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
@@ -21,12 +20,11 @@ from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.ir.program import Program
 from ttscompile.policies.diffusion_policy import family as diffusion_policy
-from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
-from ..runtimes.agreement import call_terms, largest_difference
 from . import unets
-from .originals import as_seen, assert_actions, golden
+from .originals import as_seen, assert_actions, assert_compiled_acts, golden
+from .refused import Refusals, refusals
 
 GIVEN = {"local": "local condition", "inpainting": "inpainting", "hybrid_inpainting": "inpainting"}
 SAVED_BY_THE_ORIGINAL = {"global": "global condition", "local": "local condition", "inpainting": "inpainting"}
@@ -118,51 +116,6 @@ def test_the_observed_steps_have_their_place(build: Build) -> None:
         assert torch.equal(found, network(short, t, global_cond=obs.reshape(1, -1)))
 
 
-@pytest.mark.parametrize(
-    ("variant", "given", "message"),
-    [
-        ("local", {"horizon": 7}, r"cfg\.policy\.horizon is 7; expected a multiple of 2, because a U-Net of 2 levels"),
-        ("steps_only", {"n_action_steps": 6}, r"cfg\.policy\.n_action_steps is 6; expected a multiple of 4"),
-        ("local", {"horizon": 10**9}, r"cfg\.policy\.horizon is 1000000000; expected .* 4096 at most"),
-        ("local", {"horizon": None}, r"cfg\.policy\.horizon is None; expected a positive whole number"),
-        ("local", {"horizon": 2}, r"n_obs_steps = 2 leaves nothing of horizon = 2"),
-        ("inpainting", {"horizon": 2, "n_obs_steps": 4, "oa_step_convention": True}, r"n_obs_steps = 4 leaves nothing"),
-        ("local", {"obs_as_global_cond": True}, "both true; the original refuses this, too"),
-        ("local", {"pred_action_steps_only": True}, "pred_action_steps_only needs obs_as_global_cond"),
-        ("local", {"oa_step_convention": "yes"}, r"oa_step_convention is 'yes'; expected true or false"),
-        (
-            "local",
-            {"obs_as_local_cond": False},
-            r"model\.input_dim is 3; expected 8 with the observation as inpainting",
-        ),
-        ("local", {"obs_dim": 6}, r"model\.local_cond_dim is 5; expected 6 with the observation as local condition"),
-        ("steps_only", {"n_obs_steps": 3}, r"model\.global_cond_dim is 10; expected 15 with"),
-        ("local", {"model": {"input_dim": None}}, r"model\.input_dim is missing"),
-        ("local", {"model": {"input_dim": "3"}}, r"input_dim of the U-Net is '3'"),
-        (
-            "local",
-            {"model": {"down_dims": [8 * 10**6, 8 * 10**6]}},
-            r"asks for at least \d+ weights; the checkpoint holds",
-        ),
-        ("local", {"model": {"down_dims": [16, 20]}}, r"model\.\S+ has shape \(24,.*; expected \(20,"),
-        ("local", {"model": {"kernel_size": 4}}, r"kernel_size of the U-Net is 4; expected an odd number"),
-        (
-            "local",
-            {"model": {"cond_predict_scale": False}},
-            r"cond_encoder\S+ has shape \(32, 16\); expected \(16, 16\)",
-        ),
-        ("local", {"model": {"attention": True}}, "settings that ConditionalUnet1D does not know: attention"),
-        ("local", {"model": {"_target_": "fork.Unet"}}, "network is Unet; expected ConditionalUnet1D"),
-        ("local", {"guidance": 2.0}, r"cfg\.policy has settings that are not known: guidance"),
-        ("local", {"weights": {"model.extra": torch.zeros(2)}}, r"unexpected model\.extra"),
-    ],
-)
-def test_settings_that_do_not_fit(build: Build, variant: str, given: dict[str, Any], message: str) -> None:
-    """Each is named, with what was expected."""
-    with pytest.raises(CheckpointError, match=message):
-        build(variant, **given)
-
-
 def test_the_centre_is_looked_at(build: Build) -> None:
     """Of images that are resized first, where that is asked for; margins of 4.5 and 7.5 are rounded to even numbers."""
     module, _ = build("images", encoder={"crop_shape": [36, 35], "resize_shape": [45, 50]})
@@ -188,32 +141,6 @@ _GET_RESNET = {"_target_": "a.get_resnet", "name": "resnet50"}
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"_target_": "umi.TimmObsEncoder"}, r"obs_encoder is TimmObsEncoder; expected MultiImageObsEncoder"),
-        ({"dropout": 0.1}, r"settings that MultiImageObsEncoder does not know: dropout"),
-        ({"rgb_model": _GET_RESNET}, r"rgb_model\.name is 'resnet50'; expected resnet18 or resnet34"),
-        (
-            {"rgb_model": _GET_RESNET | {"name": ["resnet18"]}},
-            r"rgb_model\.name is \['resnet18'\]; expected resnet18 or",
-        ),
-        ({"rgb_model": {"_target_": "torchvision.models.vit"}}, r"rgb_model is made by vit; expected get_resnet"),
-        ({"rgb_model": _GET_RESNET | {"name": "resnet34"}}, r"torchvision's ResNets: missing \S+layer1\.2\.conv1"),
-        ({"crop_shape": [41, 30]}, r"crop_shape is \[41, 30\], and the images of 'front' are 41 x 43"),
-        ({"crop_shape": 36}, r"crop_shape is 36; expected \[height, width\]"),
-        ({"resize_shape": [10**6, 10**6]}, r"resize_shape is .* of 4096 pixels at most"),
-        ({"use_group_norm": False}, r"missing obs_encoder\.key_model_map\.front\.bn1\.running_mean"),
-        ({"share_rgb_model": True}, r"missing obs_encoder\.key_model_map\.rgb\.conv1\.weight"),
-        ({"imagenet_norm": "yes"}, r"obs_encoder\.imagenet_norm is 'yes'; expected true or false"),
-    ],
-)
-def test_image_encoders_that_do_not_fit(build: Build, given: dict[str, Any], message: str) -> None:
-    """Each is named, with what was expected."""
-    with pytest.raises(CheckpointError, match=message):
-        build("images", encoder=given)
-
-
-@pytest.mark.parametrize(
     ("key", "entry", "message"),
     [
         ("wrist", {"shape": [4, 41, 43], "type": "rgb"}, r"obs\.wrist\.shape is .*; expected 3 channels"),
@@ -231,9 +158,57 @@ def test_observations_that_do_not_fit(build: Build, key: str, entry: dict[str, A
         build("images", encoder={"shape_meta": meta})
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
+_NO_COLOUR = {"point_cloud": {"shape": [20, 2]}, "agent_pos": {"shape": [4]}}
+_CLOUD = {"in_channels": 3, "out_channels": 24, "use_layernorm": True, "final_norm": "layernorm"}
+
+
+REFUSED: Refusals = {
+    "local": [
+        ({"horizon": 7}, r"cfg\.policy\.horizon is 7; expected a multiple of 2, because a U-Net of 2 levels"),
+        ({"horizon": 10**9}, r"cfg\.policy\.horizon is 1000000000; expected .* 4096 at most"),
+        ({"horizon": None}, r"cfg\.policy\.horizon is None; expected a positive whole number"),
+        ({"horizon": 2}, r"n_obs_steps = 2 leaves nothing of horizon = 2"),
+        ({"obs_as_global_cond": True}, "both true; the original refuses this, too"),
+        ({"pred_action_steps_only": True}, "pred_action_steps_only needs obs_as_global_cond"),
+        ({"oa_step_convention": "yes"}, r"oa_step_convention is 'yes'; expected true or false"),
+        ({"obs_as_local_cond": False}, r"model\.input_dim is 3; expected 8 with the observation as inpainting"),
+        ({"obs_dim": 6}, r"model\.local_cond_dim is 5; expected 6 with the observation as local condition"),
+        ({"guidance": 2.0}, r"cfg\.policy has settings that are not known: guidance"),
+        ({"weights": {"model.extra": torch.zeros(2)}}, r"unexpected model\.extra"),
+    ],
+    "steps_only": [
+        ({"n_action_steps": 6}, r"cfg\.policy\.n_action_steps is 6; expected a multiple of 4"),
+        ({"n_obs_steps": 3}, r"model\.global_cond_dim is 10; expected 15 with"),
+    ],
+    "inpainting": [({"horizon": 2, "n_obs_steps": 4, "oa_step_convention": True}, r"n_obs_steps = 4 leaves nothing")],
+    "local/model": [
+        ({"input_dim": None}, r"model\.input_dim is missing"),
+        ({"input_dim": "3"}, r"input_dim of the U-Net is '3'"),
+        ({"down_dims": [8 * 10**6, 8 * 10**6]}, r"asks for at least \d+ weights; the checkpoint holds"),
+        ({"down_dims": [16, 20]}, r"model\.\S+ has shape \(24,.*; expected \(20,"),
+        ({"kernel_size": 4}, r"kernel_size of the U-Net is 4; expected an odd number"),
+        ({"cond_predict_scale": False}, r"cond_encoder\S+ has shape \(32, 16\); expected \(16, 16\)"),
+        ({"attention": True}, "settings that ConditionalUnet1D does not know: attention"),
+        ({"_target_": "fork.Unet"}, "network is Unet; expected ConditionalUnet1D"),
+    ],
+    "images/encoder": [
+        ({"_target_": "umi.TimmObsEncoder"}, r"obs_encoder is TimmObsEncoder; expected MultiImageObsEncoder"),
+        ({"dropout": 0.1}, r"settings that MultiImageObsEncoder does not know: dropout"),
+        ({"rgb_model": _GET_RESNET}, r"rgb_model\.name is 'resnet50'; expected resnet18 or resnet34"),
+        (
+            {"rgb_model": _GET_RESNET | {"name": ["resnet18"]}},
+            r"rgb_model\.name is \['resnet18'\]; expected resnet18 or",
+        ),
+        ({"rgb_model": {"_target_": "torchvision.models.vit"}}, r"rgb_model is made by vit; expected get_resnet"),
+        ({"rgb_model": _GET_RESNET | {"name": "resnet34"}}, r"torchvision's ResNets: missing \S+layer1\.2\.conv1"),
+        ({"crop_shape": [41, 30]}, r"crop_shape is \[41, 30\], and the images of 'front' are 41 x 43"),
+        ({"crop_shape": 36}, r"crop_shape is 36; expected \[height, width\]"),
+        ({"resize_shape": [10**6, 10**6]}, r"resize_shape is .* of 4096 pixels at most"),
+        ({"use_group_norm": False}, r"missing obs_encoder\.key_model_map\.front\.bn1\.running_mean"),
+        ({"share_rgb_model": True}, r"missing obs_encoder\.key_model_map\.rgb\.conv1\.weight"),
+        ({"imagenet_norm": "yes"}, r"obs_encoder\.imagenet_norm is 'yes'; expected true or false"),
+    ],
+    "images": [
         ({"horizon": 7}, r"cfg\.policy\.horizon is 7; expected a multiple of 2"),
         ({"n_obs_steps": 3}, r"cond_encoder\.1\.weight has shape \(32, 2074\); expected \(32, 3103\)"),
         ({"kernel_size": 4}, r"kernel_size of the U-Net is 4"),
@@ -246,61 +221,41 @@ def test_observations_that_do_not_fit(build: Build, key: str, entry: dict[str, A
             r"params_dict\.front has 3 entries; expected one for the whole image",
         ),
     ],
-)
-def test_policies_on_images_that_do_not_fit(build: Build, given: dict[str, Any], message: str) -> None:
-    """Each is named, with what was expected."""
-    with pytest.raises(CheckpointError, match=message):
-        build("images", **given)
-
-
-_NO_COLOUR = {"point_cloud": {"shape": [20, 2]}, "agent_pos": {"shape": [4]}}
-_CLOUD = {"in_channels": 3, "out_channels": 24, "use_layernorm": True, "final_norm": "layernorm"}
-
-
-@pytest.mark.parametrize(
-    ("variant", "given", "message"),
-    [
+    "dp3": [
+        ({"condition_type": "cross_attention_film"}, r"is 'cross_attention_film'; expected film or add or mlp_film"),
+        ({"condition_type": "film"}, r"missing model\S+cond_encoder|unexpected model\S+cond_encoder"),
+        ({"condition_type": ["film"]}, r"condition_type is \['film'\]; expected film or add"),
+        ({"obs_as_global_cond": False}, r"obs_as_global_cond is false; expected true"),
+        ({"eta": 0.5}, r"cfg\.policy has settings that 3D Diffusion Policy does not know: eta"),
+        ({"use_up_condition": 1}, r"cfg\.policy\.use_up_condition is 1; expected true or false"),
+        ({"pointnet_type": "transformer"}, r"pointnet_type is 'transformer'; expected pointnet"),
+        ({"pointcloud_encoder_cfg": None}, r"pointcloud_encoder_cfg is None; expected settings by name"),
+        ({"pointcloud_encoder_cfg": _CLOUD | {"final_norm": "batch"}}, r"final_norm is 'batch'; expected none or"),
+        ({"pointcloud_encoder_cfg": _CLOUD | {"use_layernorm": False}}, r"unexpected obs_encoder\S+mlp\.1\."),
+        ({"pointcloud_encoder_cfg": _CLOUD | {"out_channels": 10**9}}, r"out_channels asks for at least"),
+        ({"encoder_output_dim": 32}, r"encoder_output_dim is 32; expected 24, which its PointNet gives"),
+        ({"use_pc_color": True, "horizon": 8}, r"extractor\.mlp\.9\.weight|mlp\.0\.weight has shape"),
+        ({"shape_meta": {"obs": _NO_COLOUR, "action": {"shape": [3]}}}, r"\[20, 2\]; expected .*\[points, 3\]"),
         (
-            "dp3",
-            {"condition_type": "cross_attention_film"},
-            r"is 'cross_attention_film'; expected film or add or mlp_film",
-        ),
-        ("dp3", {"condition_type": "film"}, r"missing model\S+cond_encoder|unexpected model\S+cond_encoder"),
-        ("dp3", {"condition_type": ["film"]}, r"condition_type is \['film'\]; expected film or add"),
-        ("dp3", {"obs_as_global_cond": False}, r"obs_as_global_cond is false; expected true"),
-        ("dp3", {"eta": 0.5}, r"cfg\.policy has settings that 3D Diffusion Policy does not know: eta"),
-        ("dp3", {"use_up_condition": 1}, r"cfg\.policy\.use_up_condition is 1; expected true or false"),
-        ("dp3", {"pointnet_type": "transformer"}, r"pointnet_type is 'transformer'; expected pointnet"),
-        ("dp3", {"pointcloud_encoder_cfg": None}, r"pointcloud_encoder_cfg is None; expected settings by name"),
-        (
-            "dp3",
-            {"pointcloud_encoder_cfg": _CLOUD | {"final_norm": "batch"}},
-            r"final_norm is 'batch'; expected none or",
-        ),
-        ("dp3", {"pointcloud_encoder_cfg": _CLOUD | {"use_layernorm": False}}, r"unexpected obs_encoder\S+mlp\.1\."),
-        ("dp3", {"pointcloud_encoder_cfg": _CLOUD | {"out_channels": 10**9}}, r"out_channels asks for at least"),
-        ("dp3", {"encoder_output_dim": 32}, r"encoder_output_dim is 32; expected 24, which its PointNet gives"),
-        ("dp3", {"use_pc_color": True, "horizon": 8}, r"extractor\.mlp\.9\.weight|mlp\.0\.weight has shape"),
-        ("dp3_add", {"use_pc_color": True}, r"obs\.point_cloud is \[20, 3\]; expected the shape \[points, 6\]"),
-        ("dp3", {"shape_meta": {"obs": _NO_COLOUR, "action": {"shape": [3]}}}, r"\[20, 2\]; expected .*\[points, 3\]"),
-        (
-            "dp3",
             {"shape_meta": {"obs": _NO_COLOUR | {"point_cloud": {"shape": [10**9, 3]}}, "action": {"shape": [3]}}},
             "expected the shape .*, 65536 points at most",
         ),
-        (
-            "dp3",
-            {"shape_meta": {"obs": {"agent_pos": {"shape": [4]}}, "action": {"shape": [3]}}},
-            "point_cloud is missing",
-        ),
-        ("simple_dp3", {"horizon": 6}, r"horizon is 6; expected a multiple of 4"),
-        ("simple_dp3", {"_target_": "a.DP3"}, r"missing model\.down_modules"),
+        ({"shape_meta": {"obs": {"agent_pos": {"shape": [4]}}, "action": {"shape": [3]}}}, "point_cloud is missing"),
     ],
-)
-def test_point_cloud_policies_that_do_not_fit(build: Build, variant: str, given: dict[str, Any], message: str) -> None:
-    """Each is named, with what was expected."""
+    "dp3_add": [({"use_pc_color": True}, r"obs\.point_cloud is \[20, 3\]; expected the shape \[points, 6\]")],
+    "simple_dp3": [
+        ({"horizon": 6}, r"horizon is 6; expected a multiple of 4"),
+        ({"_target_": "a.DP3"}, r"missing model\.down_modules"),
+    ],
+}
+
+
+@pytest.mark.parametrize(("place", "given", "message"), refusals(REFUSED))
+def test_settings_that_do_not_fit(build: Build, place: str, given: dict[str, Any], message: str) -> None:
+    """Of a variant, or of an entry of its configuration: each is named, with what was expected."""
+    variant, _, entry = place.partition("/")
     with pytest.raises(CheckpointError, match=message):
-        build(variant, **given)
+        build(variant, **({entry: given} if entry else given))
 
 
 # Compiled
@@ -326,19 +281,9 @@ def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 @pytest.mark.slow
 def test_compiled_is_the_original(compiled: tuple[str, Program, Path]) -> None:
-    """From raw observations to actions, through the artifact, in both runtimes; which agree on random plans, too."""
     variant, program, directory = compiled
-    numbers, observation = golden(f"unet_{variant}"), unets.observation(variant)
-    for runtime in ("onnxruntime", "reference"):
-        policy = ttscompile.load(directory, runtime=runtime)
-        out = policy.predict_action(observation, noise=Noise(*unets.noise(program.spec.sample)), plan="dense")
-        for name in ("action", "action_pred"):
-            assert out[name].shape == numbers[name].shape
-            assert np.abs(out[name] - numbers[name]).max() < PROMISED * np.ptp(numbers["action_pred"])
-    artifact = load_artifact(directory)
-    runtimes = open_runtime(artifact, "onnxruntime"), open_runtime(artifact, "reference")
-    found = largest_difference(artifact, *runtimes, np.random.default_rng(0), 2, calls=3)
-    assert found < bound(call_terms(artifact))
+    noise = Noise(*unets.noise(program.spec.sample))
+    assert_compiled_acts(directory, unets.observation(variant), noise, golden(f"unet_{variant}"))
     record(
         COMPILED[variant],
         "predictions at three timesteps and actions that the original gave, 1e-5 of the range",

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import ttscompile
-from tests.once import Once
 from ttscompile.core.spec import Noise
 from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -16,8 +15,9 @@ from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.policies.lerobot.files import files_beside
 
+from .originals import assert_agreement_on_random_plans
 from .vlas import MASK, STATE, TOKENS, Array
-from .whole_vlas import WHOLE, Whole, assert_agreement_on_random_plans, assert_refused
+from .whole_vlas import WHOLE, Whole, assert_refused
 
 BY_NAME = [pytest.param(one, id=one.name) for one in WHOLE]
 
@@ -26,16 +26,6 @@ BY_NAME = [pytest.param(one, id=one.name) for one in WHOLE]
 def whole(request: pytest.FixtureRequest) -> Whole:
     found: Whole = request.param
     return found
-
-
-@pytest.fixture(scope="module")
-def golden(whole: Whole) -> Mapping[str, Array]:
-    return whole.golden()
-
-
-@pytest.fixture(scope="module")
-def compiled(whole: Whole, once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return whole.compiled(once, tmp_path_factory.mktemp("saved"))[0]
 
 
 @pytest.mark.parametrize(

@@ -3,17 +3,13 @@
 ``golden/make_lerobot_vla_jepa.py`` wrote the folders, and gave lerobot the same weights, observations and noise.
 """
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 
 from . import groots
-from .lerobot_tiny import change_json
-from .vlas import CAMERAS, STATE, Array
+from .vlas import CAMERAS, STATE, Array, drawn_frame, see, unpack
 
 KINDS = ("libero", "plain")
 """The first has a world model and LIBERO's rule of the gripper, and resizes its images; the second has half of that
@@ -28,16 +24,9 @@ SIZES = {"libero": (((24, 32), (24, 32)), ((30, 21), (64, 40))), "plain": (((24,
 
 def save(kind: str, folder: Path, call: int = 0) -> Path:
     """A policy, for images of this call, and, beside it, the files of its backbone. Returns its directory."""
-    shutil.copytree(SAVED / kind, folder, dirs_exist_ok=True)
-    directory = folder / "policy"
-    shapes = json.loads((directory / groots.SHAPES).read_text())
-    (directory / groots.SHAPES).unlink()
-    save_file(weights(shapes), directory / "model.safetensors")
+    directory = unpack(SAVED / kind, folder, weights)
     if kind == "plain":
-        features = json.loads((directory / "config.json").read_text())["input_features"]
-        for key, size in zip(CAMERAS, SIZES[kind][call], strict=True):
-            features[key]["shape"] = [3, *size]
-        change_json(directory / "config.json", input_features=features)
+        see(directory, dict(zip(CAMERAS, SIZES[kind][call], strict=True)))
     return directory
 
 
@@ -50,12 +39,8 @@ def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
 
 def observation(kind: str, call: int) -> dict[str, Array]:
     """One frame; of the second call's images the sizes are others, and so is the state."""
-    rng = np.random.RandomState(call + 3)
-    found: dict[str, Array] = {STATE: rng.standard_normal(STATE_DIM).astype(np.float32)}
-    if kind == "plain":
-        found = {}
-    pairs = zip(CAMERAS, SIZES[kind][call], strict=True)
-    return found | {key: rng.uniform(0, 1, (3, *size)).astype(np.float32) for key, size in pairs}
+    found = drawn_frame(call + 3, STATE_DIM, dict(zip(CAMERAS, SIZES[kind][call], strict=True)))
+    return {key: value for key, value in found.items() if key != STATE or kind == "libero"}
 
 
 def noise() -> Array:

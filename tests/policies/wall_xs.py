@@ -3,17 +3,13 @@
 ``golden/make_lerobot_wall_x.py`` wrote the folders, and gave lerobot the same weights, observations and noise.
 """
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 
 from . import groots
-from .lerobot_tiny import change_json
-from .vlas import STATE, Array
+from .vlas import STATE, Array, see, unpack
 
 KINDS = ("flow", "nested")
 """The first is as wall-oss-flow but for its size; the second has the configuration that transformers writes now, images
@@ -40,15 +36,8 @@ HORIZON = {"flow": 6, "nested": 5}
 
 def save(kind: str, folder: Path, call: int = 0) -> Path:
     """A policy, for images of this call, and, beside it, the files of its base. Returns its directory."""
-    shutil.copytree(SAVED / kind, folder, dirs_exist_ok=True)
-    directory = folder / "policy"
-    shapes = json.loads((directory / groots.SHAPES).read_text())
-    (directory / groots.SHAPES).unlink()
-    save_file(weights(shapes), directory / "model.safetensors")
-    features = json.loads((directory / "config.json").read_text())["input_features"]
-    for key, size in zip(CAMERAS[kind], SIZES[kind][call], strict=True):
-        features[key]["shape"] = [3, *size]
-    change_json(directory / "config.json", input_features=features)
+    directory = unpack(SAVED / kind, folder, weights)
+    see(directory, dict(zip(CAMERAS[kind], SIZES[kind][call], strict=True)))
     return directory
 
 

@@ -5,14 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 import ttscompile
 from tests.once import Once
-from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import ChunkSpec, Noise
 from ttscompile.core.tokenizer import Tokenizer, padded
 from ttscompile.errors import CheckpointError
@@ -20,12 +17,10 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.ir.program import Program
-from ttscompile.runtimes import open_runtime
 
 from ..families.support import record
-from ..rounding import bound
-from ..runtimes.agreement import call_terms, largest_difference
 from . import eo1s, evo1s, groots, originals, vla_jepas, wall_xs, xvlas
+from .refused import Refusals as Refusals, assert_not_read, refusals as refusals
 from .vlas import CAMERAS, MASK, TOKENS, Array, as_given
 
 
@@ -218,14 +213,6 @@ def eager_chunk(
     return spec.chunk, spec.chunk.unnormalized(sample, spec.chunk.reference(seen))
 
 
-def assert_agreement_on_random_plans(compiled: Path, runtime: str) -> None:
-    """Two calls of two streams with random legal plans are the reference's, but for rounding."""
-    artifact = load_artifact(compiled)
-    runtimes = [open_runtime(artifact, name) for name in (runtime, "reference")]
-    rng = np.random.default_rng(3)
-    assert largest_difference(artifact, runtimes[0], runtimes[1], rng, streams=2, calls=2) < bound(call_terms(artifact))
-
-
 def rename_weight(directory: Path, before: str, after: str) -> None:
     """Save a policy's weights with another name for one of them."""
     path = directory / "model.safetensors"
@@ -235,20 +222,9 @@ def rename_weight(directory: Path, before: str, after: str) -> None:
     save_file(weights, path)
 
 
-Refusals = Mapping[str, Sequence[tuple[Mapping[str, object], str]]]
-"""By the place of ``assert_refused``: changes, and the message."""
-
-
-def refusals(table: Refusals) -> list[object]:
-    """For ``parametrize``: what is changed at each place, and what is said of it."""
-    return [
-        pytest.param(place, changes, message, id=f"{place} {message}")
-        for place, rows in table.items()
-        for changes, message in rows
-    ]
-
-
-def assert_refused(directory: Path, place: str, changes: Mapping[str, object], message: str) -> None:
+def assert_refused(
+    directory: Path, place: str, changes: Mapping[str, object], message: str, names: Path | None = None
+) -> None:
     """A policy is refused with a message where entries of a file, or of a step around it, are others.
 
     Args:
@@ -256,6 +232,7 @@ def assert_refused(directory: Path, place: str, changes: Mapping[str, object], m
         place: ``FILE.json``, ``FILE.json/ENTRY/ENTRY`` of what is inside, or ``step/PART`` of a step's name.
         changes: entries there; ``registry_name`` is the name of a step.
         message: regular expression.
+        names: the place that the message begins with, where it is told.
     """
     if place.startswith("step/"):
         change_step(directory, place.removeprefix("step/"), changes)
@@ -267,8 +244,7 @@ def assert_refused(directory: Path, place: str, changes: Mapping[str, object], m
             own = own[part]
         own.update(changes)
         file.write_text(json.dumps(entries))
-    with pytest.raises(CheckpointError, match=message):
-        load_checkpoint_policy(directory)
+    assert_not_read(directory, message, names=names)
 
 
 def change_step(directory: Path, name: str, changes: Mapping[str, object]) -> None:

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from .hybrid import fill
 from .lerobot_tiny import change_json
-from .vlas import CAMERAS, STATE, Array
+from .vlas import CAMERAS, Array, drawn_frame
 
 KINDS = ("ee6d", "auto", "so101")
 """The second has other entries where there is a choice, and files as earlier versions of lerobot wrote them."""
@@ -54,10 +54,7 @@ def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
 
 def observation(call: int, kind: str = "ee6d") -> dict[str, Array]:
     """One frame; of the second call the state is another, and so is the size of images that are resized."""
-    rng = np.random.RandomState(call)
-    found: dict[str, Array] = {STATE: rng.standard_normal(STATE_DIM).astype(np.float32)}
-    size = SIZES[call if kind == "ee6d" else 0]
-    return found | {key: rng.uniform(0, 1, (3, *size)).astype(np.float32) for key in CAMERAS}
+    return drawn_frame(call, STATE_DIM, dict.fromkeys(CAMERAS, SIZES[call if kind == "ee6d" else 0]))
 
 
 def noise(kind: str) -> Array:

@@ -9,6 +9,7 @@ import pytest
 
 import ttscompile
 from tests.calibration import policies
+from tests.once import Once
 from tests.plans import store_schedules
 from tests.runtimes.plans import random_reading
 from ttscompile.artifact.load import load_artifact
@@ -21,10 +22,10 @@ from . import policy
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Program]:
+def made(once: Once) -> tuple[Path, Program]:
     """An artifact that is not calibrated, and the program that it holds."""
-    directory = tmp_path_factory.mktemp("made") / "compiled"
-    return directory, ttscompile.compile_denoiser(policy.Network().eval(), policy.spec(), directory)
+    network = policy.Network().eval()
+    return once.compiled("verified", lambda to: ttscompile.compile_denoiser(network, policy.spec(), to))
 
 
 @pytest.fixture(scope="session")
@@ -40,15 +41,19 @@ def program(made: tuple[Path, Program]) -> Program:
 
 
 @pytest.fixture(scope="session")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(once: Once) -> Path:
     """Six episodes."""
-    return policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
+
+    def record(folder: Path) -> None:
+        folder.mkdir()
+        policies.record(folder / "calls.npz")
+
+    return once.folder("six episodes", record) / "calls.npz"
 
 
-@pytest.fixture(scope="session")
-def sound(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibrate(compiled: Path, directory: Path) -> None:
     """The same with a corrected schedule, its default, another one, and plans that the pruner makes."""
-    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("sound") / "compiled"))
+    shutil.copytree(compiled, directory)
     corrected = no_correction(policy.STEPS, (policy.HORIZON, policy.CHANNELS))
     corrected.weights[2:] += np.random.default_rng(0).normal(0, 0.002, corrected.weights[2:].shape)
     corrected.anchors[[0, 4, 8]] = True
@@ -67,16 +72,24 @@ def sound(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         corrections={"schedule": corrected},
         golden=record_plans,
     )
-    return directory
 
 
 @pytest.fixture(scope="session")
-def quick(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sound(compiled: Path, once: Once) -> Path:
+    """As ``calibrate`` leaves it."""
+    return once.folder("verified and sound", lambda directory: calibrate(compiled, directory))
+
+
+@pytest.fixture(scope="session")
+def quick(compiled: Path, once: Once) -> Path:
     """The same with one plan, which saves so much that it is the faster one beside any other work."""
-    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("quick") / "compiled"))
-    plan = policy.sparsest()
-    store_schedules(directory, None, {"schedule": plan}, "schedule", {"strategy": "by hand"}, golden=record_plans)
-    return directory
+
+    def calibrate_once(directory: Path) -> None:
+        plans = {"schedule": policy.sparsest()}
+        shutil.copytree(compiled, directory)
+        store_schedules(directory, None, plans, "schedule", {"strategy": "by hand"}, golden=record_plans)
+
+    return once.folder("verified and quick", calibrate_once)
 
 
 @pytest.fixture

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.policies.act.modeling_act import ACTPolicy
-from lerobot.processor import PolicyProcessorPipeline
-from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
 from safetensors.torch import load_file
 
 from .. import acts
+from ..vlas import pipelines
 
 
 def main() -> None:
@@ -37,13 +36,7 @@ def run(directory: Path, variant: str) -> dict[str, Any]:
     own, saved = policy.state_dict(), load_file(directory / "model.safetensors")
     assert sorted(own) == sorted(saved), sorted(set(own) ^ set(saved))
     assert all(torch.equal(value, saved[name]) for name, value in own.items())
-    before = PolicyProcessorPipeline.from_pretrained(directory, config_filename="policy_preprocessor.json")
-    after = PolicyProcessorPipeline.from_pretrained(
-        directory,
-        config_filename="policy_postprocessor.json",
-        to_transition=policy_action_to_transition,
-        to_output=transition_to_policy_action,
-    )
+    before, after = pipelines(directory)
     given = {key: torch.from_numpy(value[:, 0]) for key, value in acts.observation(variant).items()}
     batch = {key: value for key, value in before(given).items() if key.startswith("observation.")}
     # lerobot asks this entry on which device to compute, of policies that do not read it, too.

@@ -31,17 +31,8 @@ from transformers import (
 
 from .. import eo1s, groots
 from ..vlas import CAMERAS, STATE
-from .make_lerobot_groot import SPECIAL, of_bytes
+from .make_lerobot_groot import SPECIAL, TEMPLATE, of_bytes
 
-TEMPLATE = """{%- for message in messages -%}
-{{- '<|im_start|>' + message.role + '\\n' -}}
-{%- for content in message.content -%}
-{%- if content.type == 'image' -%}{{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
-{%- elif 'text' in content -%}{{- content.text -}}{%- endif -%}
-{%- endfor -%}
-{{- '<|im_end|>\\n' -}}
-{%- endfor -%}"""
-"""What Qwen2.5-VL's says of messages of which the first is the system's."""
 ADDED = 7
 """Tokens that lerobot adds, which have to have rows in the embedding."""
 VISION: dict[str, Any] = {

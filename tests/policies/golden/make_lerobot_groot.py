@@ -34,7 +34,7 @@ TEMPLATE = """{%- for message in messages -%}
 {%- endfor -%}
 {{- '<|im_end|>\\n' -}}
 {%- endfor -%}"""
-"""What Qwen3-VL's says of a message of a user."""
+"""What Qwen3-VL's says of a message of a user, and Qwen2.5-VL's of messages of which the first is the system's."""
 BACKBONE = f"./nvidia/{groots.BACKBONE}"
 """Where lerobot looks for a tokenizer, whatever the base model says."""
 RESIZE = "torchvision.transforms.v2.functional._geometry._do_native_uint8_resize_on_cpu"

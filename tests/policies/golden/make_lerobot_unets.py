@@ -20,13 +20,12 @@ import torch
 from safetensors.torch import load_file
 
 from .. import lerobot_unets
+from ..vlas import pipelines
 
 # What it says of operations that its compiled part would have.
 sys.modules["torchvision._meta_registrations"] = ModuleType("torchvision._meta_registrations")
 
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy  # noqa: E402
-from lerobot.processor import PolicyProcessorPipeline  # noqa: E402
-from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action  # noqa: E402
 
 PROBES = (53, 4)
 
@@ -50,13 +49,7 @@ def run(directory: Path, variant: str) -> dict[str, Any]:
     saved = load_file(directory / "model.safetensors")
     assert sorted(own) == sorted(saved), sorted(set(own) ^ set(saved))
     assert all(torch.equal(value, saved[name]) for name, value in own.items())
-    before = PolicyProcessorPipeline.from_pretrained(directory, config_filename="policy_preprocessor.json")
-    after = PolicyProcessorPipeline.from_pretrained(
-        directory,
-        config_filename="policy_postprocessor.json",
-        to_transition=policy_action_to_transition,
-        to_output=transition_to_policy_action,
-    )
+    before, after = pipelines(directory)
     given = {key: torch.from_numpy(value) for key, value in lerobot_unets.observation(variant).items()}
     batch = {key: value for key, value in before(given).items() if key.startswith("observation.")}
     if policy.config.image_features:
