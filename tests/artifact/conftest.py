@@ -1,14 +1,15 @@
 """The artifact that the tests of this folder take apart."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.artifact.tiny import write_tiny
+from tests.once import Once
 
 
 @pytest.fixture
-def written(tmp_path: Path) -> Path:
-    """A freshly written artifact."""
-    write_tiny(tmp_path / "compiled")
-    return tmp_path / "compiled"
+def written(once: Once, tmp_path: Path) -> Path:
+    """The policy of two blocks as it was written: a copy for each test."""
+    return shutil.copytree(once.folder("two blocks", write_tiny), tmp_path / "compiled")

@@ -11,7 +11,9 @@ import pytest
 
 import ttscompile
 from tests.once import Once
-from ttscompile.calibration import regression, trials, tts
+from tests.plans import store_schedules
+from ttscompile.calibration import regression, step_counts, trials, tts
+from ttscompile.core.lattice import uniform_plan
 
 from . import policies, tasks
 
@@ -20,9 +22,13 @@ EPOCHS = regression.EPOCHS
 
 @pytest.fixture(autouse=True, scope="package")
 def _short_search() -> Iterator[None]:
-    """Intervals of all phases, and few of them; networks of corrections learn for a while; few draws of noise."""
+    """Intervals of all phases, and few of them; networks of corrections learn for a while; few draws of noise.
+
+    Of ten steps, all placements of two are tried; of more than two, steps are moved.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trials, "MOST_DRAWS", trials.DRAWS)
+        patch.setattr(step_counts, "FEW", 9)
         patch.setattr(tts, "DISTANCES", (1,))
         patch.setattr(regression, "EPOCHS", 10)
         yield
@@ -64,6 +70,15 @@ def scheduled(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPath
     """``compiled`` with a schedule that computes two of its ten steps; not to be changed."""
     directory = shutil.copytree(compiled, tmp_path_factory.mktemp("scheduled") / "compiled")
     return policies.whole_steps(Path(directory), recording)
+
+
+@pytest.fixture(scope="session")
+def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``compiled`` with a plan, ``half``."""
+    directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("planned") / "compiled"))
+    record = {"episodes": {"validation": [0, 1]}}
+    store_schedules(directory, None, {"half": uniform_plan(10, 6, 5)}, "half", record)
+    return directory
 
 
 @pytest.fixture(scope="session")

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.calibration.calls import Calls, prepare_calls, sample_calls
+from ttscompile.calibration.calls import Calls, load_episodes, prepare_calls, sample_calls
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.schedule import open_search, search_plan
+from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.task import Found, Task
+from ttscompile.calibration.trials import Trials
+from ttscompile.measure.points import pairs, rooted
 from ttscompile.trajectories import load_trajectories
 from ttscompile.trajectories.episodes import Episode
 
@@ -34,6 +38,19 @@ def make_task(
     prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
     prepared = replace(prepared, path=executor.run_dense(prepared))
     return Task.of(executor, prepared, budget, seed)
+
+
+def trials_of(directory: Path, recording: Path, state: Path, **fields: Any) -> Trials:
+    """Of an artifact; what they find out is kept in the folder ``state``."""
+    artifact = load_artifact(directory)
+    episodes = load_episodes(artifact.manifest.spec, [recording], None)
+    return Trials.of(artifact, episodes, StateFile(state, {}), **fields)
+
+
+def distance(x: np.ndarray, y: np.ndarray) -> float:
+    """Of answers to the same observations, as plans are judged by it."""
+    h, apart = pairs(x, y)
+    return rooted(float(h.mean()), float(apart.mean()))
 
 
 def found_by(name: str, task: Task, intervals: int | None = None) -> Found:

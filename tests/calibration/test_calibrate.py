@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import ttscompile
+from tests.artifact.folders import contents
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import split_episodes
 from ttscompile.calibration.execute import Executor
@@ -41,10 +42,6 @@ def calibrated(
     """A calibrated artifact and the result; not to be changed."""
     directory = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("calibrated") / "compiled"))
     return directory, quick(directory, recording, max_intervals=None)
-
-
-def contents(directory: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
 @pytest.mark.slow
@@ -112,7 +109,7 @@ def test_the_record_is_in_the_artifact(calibrated: tuple[Path, CalibrationResult
 def test_another_seed_gives_another_split(
     calibrated: tuple[Path, CalibrationResult], artifact: Path, recording: Path
 ) -> None:
-    other = quick(artifact, recording, max_intervals=1, seed=3)
+    other = quick(artifact, recording, strategy="interval", seed=3)
     assert other.episodes != calibrated[1].episodes
 
 

@@ -35,16 +35,6 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="session")
-def planned(compiled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small policy with a plan, ``half``."""
-    directory = tmp_path_factory.mktemp("planned") / "compiled"
-    shutil.copytree(compiled, directory)
-    record = {"episodes": {"validation": [0, 1]}}
-    store_schedules(directory, None, {"half": uniform_plan(10, 6, 5)}, "half", record)
-    return directory
-
-
-@pytest.fixture(scope="session")
 def other_sampler(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same network with a deterministic sampler of five steps."""
     spec = policies.spec(noise=0.0)

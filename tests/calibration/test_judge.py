@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from math import erf
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,22 +38,12 @@ from ttscompile.measure.points import pairs, rooted
 from ttscompile.samplers.flow import flow_matching_table
 
 from . import policies
-
-
-def trials_of(directory: Path, recording: Path, state: Path, **fields: Any) -> Trials:
-    artifact = load_artifact(directory)
-    episodes = load_episodes(artifact.manifest.spec, [recording], None)
-    return Trials.of(artifact, episodes, StateFile(state, {}), **fields)
+from .tasks import distance, trials_of
 
 
 @pytest.fixture
 def trials(compiled: Path, recording: Path, tmp_path: Path) -> Trials:
     return trials_of(compiled, recording, tmp_path)
-
-
-def distance(x: np.ndarray, y: np.ndarray) -> float:
-    h, apart = pairs(x, y)
-    return rooted(float(h.mean()), float(apart.mean()))
 
 
 def test_by_hand() -> None:

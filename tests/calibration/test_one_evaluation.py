@@ -1,5 +1,6 @@
 """Policies of one evaluation, without noise: what is learned, in which unit it is judged, and what is said of it."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,12 @@ from tests.once import Once
 from ttscompile import ChunkSpec, DirectDenoiser, Noise, ObservationSpec, PolicySpec, direct_table
 from ttscompile.artifact.ceiling import NOTHING, few_steps, uncalibrated
 from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.judge import judge, other_noise
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.state import StateFile
-from ttscompile.calibration.trials import Trials
-from ttscompile.measure.points import TENTH, pairs, rooted
+from ttscompile.measure.points import TENTH
 from ttscompile.report import facts
+
+from .tasks import distance, trials_of
 
 SPEC = PolicySpec(
     sample=(4, 2), observations={"state": ObservationSpec((1, 3))}, sampler=direct_table(), chunk=ChunkSpec(2, 0, 3)
@@ -58,11 +58,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def distance(x: np.ndarray, y: np.ndarray) -> float:
-    h, apart = pairs(x, y)
-    return rooted(float(h.mean()), float(apart.mean()))
-
-
 def test_by_hand() -> None:
     """Answers to two observations are 10 apart, whatever the draw; the plan is 0.3 and 0.4 off. A tenth of 10 is 1."""
     y = np.array([[[0.0], [0.0]], [[10.0], [10.0]]])
@@ -100,12 +95,10 @@ def test_the_noise_is_not_read(made: Path) -> None:
 
 def test_there_is_no_other_noise(made: Path, recorded: Path, tmp_path: Path) -> None:
     """So the original is at no distance, and eight bits are at some."""
-    artifact = load_artifact(made)
-    episodes = load_episodes(artifact.manifest.spec, [recorded], None)
-    trials = Trials.of(artifact, episodes, StateFile(tmp_path, {}))
+    trials = trials_of(made, recorded, tmp_path)
     assert other_noise(trials) == 0
-    assert judge(trials, artifact.plans["dense"]).distance < 1e-3
-    score = judge(trials, artifact.plans["full"])
+    assert judge(trials, trials.artifact.plans["dense"]).distance < 1e-3
+    score = judge(trials, trials.artifact.plans["full"])
     assert 1e-3 < score.distance < 10
     assert (score.sparsity, score.flops_sparsity) == (0, 0)
 
@@ -116,8 +109,7 @@ def test_precision_is_learned_and_nothing_is_reused(
 ) -> None:
     """As ``build`` does it: eight bits where they are near enough. The record says why no schedule was looked for."""
     monkeypatch.setattr("ttscompile.calibration.proposers.precision.Precision.margin", allowed)
-    directory = tmp_path / "artifact"
-    copy(made, directory)
+    directory = shutil.copytree(made, tmp_path / "artifact")
     result = calibrate(directory, [recorded], learn=("loops", "precision"), max_distance=allowed, progress=False)
     plan = load_artifact(directory).plans[result.default_plan]
     assert result.told["precision"].startswith(told)
@@ -128,13 +120,6 @@ def test_precision_is_learned_and_nothing_is_reused(
     assert any("Noise changes nothing here" in line for line in facts.remarks(record))
     rungs = {rung.name: rung for rung in ttscompile.verify(directory, trajectories=[recorded]).rungs}
     assert {rungs[name].status for name in ("plans", "engaged")} == {"skipped"}
-
-
-def copy(source: Path, target: Path) -> None:
-    """An artifact of its own for a test that changes it."""
-    target.mkdir()
-    for file in source.iterdir():
-        (target / file.name).write_bytes(file.read_bytes())
 
 
 def test_what_is_said_of_one_step(made: Path) -> None:

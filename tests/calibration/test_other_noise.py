@@ -15,16 +15,14 @@ import torch
 import ttscompile
 from tests.once import Once
 from ttscompile.artifact.ceiling import FARTHEST
-from ttscompile.artifact.load import load_artifact
-from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.judge import Score, other_noise, other_observations
 from ttscompile.calibration.pipeline import UNHEARD, CalibrationResult, heeds
 from ttscompile.calibration.progress import Bar
-from ttscompile.calibration.state import StateFile
-from ttscompile.calibration.trials import DRAWS, Trials
+from ttscompile.calibration.trials import DRAWS
 from ttscompile.report import facts
 
 from . import policies
+from .tasks import trials_of
 
 NOISE = 0.05
 
@@ -47,16 +45,10 @@ def answer(initial: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return sample[:, 1:5] / np.array([0.5, 2.0])
 
 
-def trials_of(directory: Path, recording: Path, state: Path, seed: int, most: int = 32) -> Trials:
-    artifact = load_artifact(directory)
-    episodes = load_episodes(artifact.manifest.spec, [recording], None)
-    return Trials.of(artifact, episodes, StateFile(state, {}), seed=seed, observations=most)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [2, 5, 32])
 def test_the_distance_of_known_answers(constant: Path, recording: Path, tmp_path: Path, most: int) -> None:
-    trials = trials_of(constant, recording, tmp_path, 7, most)
+    trials = trials_of(constant, recording, tmp_path, seed=7, observations=most)
     sample, spec = trials.held_out, trials.artifact.manifest.spec
     assert 1 <= len(sample.calls) <= most
     apart = []
@@ -67,8 +59,8 @@ def test_the_distance_of_known_answers(constant: Path, recording: Path, tmp_path
         apart += [np.abs(answers[i] - answers[j]).mean() for i, j in combinations(range(DRAWS), 2)]
     assert other_noise(trials) == pytest.approx(np.mean(apart), rel=1e-4)
     assert other_noise(trials) > 0.01
-    assert other_noise(trials) == other_noise(trials_of(constant, recording, tmp_path, 7, most))
-    assert other_noise(trials) != other_noise(trials_of(constant, recording, tmp_path, 8, most))
+    same, other = (trials_of(constant, recording, tmp_path, seed=seed, observations=most) for seed in (7, 8))
+    assert other_noise(trials) == other_noise(same) != other_noise(other)
 
 
 def result(other_noise: float | None) -> CalibrationResult:

@@ -16,25 +16,13 @@ from typing import Any
 import pytest
 
 import ttscompile
-from tests.once import Once
 from ttscompile.calibration import pipeline
 from ttscompile.errors import ClusterError, RuntimeUnavailableError
 from ttscompile.pool import Here, RayPool, Work
 
-from . import policies
 from .pools import Elsewhere, needs_ray
 
 SEARCH: dict[str, Any] = {"target_sparsity": 0.7, "max_intervals": 6, "progress": False}
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
-
-
-@pytest.fixture
-def artifact(once: Once, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(policies.compiled(once), tmp_path / "compiled"))
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -74,9 +62,9 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Callable[[Elsewhere], None]:
 
 
 @pytest.fixture(scope="module")
-def alone(once: Once, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def alone(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What this process makes of it without a pool."""
-    folder = Path(shutil.copytree(policies.compiled(once), tmp_path_factory.mktemp("alone") / "compiled"))
+    folder = Path(shutil.copytree(compiled, tmp_path_factory.mktemp("alone") / "compiled"))
     ttscompile.calibrate(folder, [recording], **SEARCH)
     return folder
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ttscompile.calibration import whole_steps
+from ttscompile.calibration import step_counts, whole_steps
 from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.calibration.step_counts import FEW, other_placements, spacings
 from ttscompile.calibration.task import Task
@@ -122,7 +122,10 @@ def test_what_was_not_of_use_for_longest_is_forgotten_first(task: Task, counted:
 @pytest.mark.parametrize(
     ("steps", "count", "placements"), [(16, 3, 105), (16, 2, 15), (9, 9, 1), (9, 1, 1), (16, 4, 0)]
 )
-def test_where_there_are_few_placements_all_are_tried(steps: int, count: int, placements: int) -> None:
+def test_where_there_are_few_placements_all_are_tried(
+    steps: int, count: int, placements: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(step_counts, "FEW", FEW)
     others = other_placements(steps, count)
     if not placements:
         assert others is None

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,10 @@ import pytest
 
 import ttscompile
 from ttscompile.calibration.pruner import paper
-from ttscompile.calibration.schedule import open_search
+from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, strategy_of
 from ttscompile.calibration.strategy import Strategy
-from ttscompile.calibration.task import Found, Search
+from ttscompile.calibration.task import Found, Search, Task
 from ttscompile.core.lattice import Source, illegal_cells
 from ttscompile.errors import CalibrationError
 from ttscompile.rivals import evo, gates, online
@@ -26,21 +28,27 @@ BUDGET = 34
 """Of 10 x 6 cells: enough for all strategies."""
 
 
-@pytest.fixture(autouse=True)
-def short_searches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gates.Gates, "intervals", 4)
-    monkeypatch.setattr(evo.Evo, "intervals", 4)
-    monkeypatch.setattr(paper.Paper, "intervals", 4)
-    monkeypatch.setattr(evo, "POPULATION", 16)
-    monkeypatch.setattr(online, "HALVINGS", 5)
+@pytest.fixture(autouse=True, scope="module")
+def short_searches() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gates.Gates, "intervals", 4)
+        patch.setattr(evo.Evo, "intervals", 4)
+        patch.setattr(paper.Paper, "intervals", 4)
+        patch.setattr(evo, "POPULATION", 16)
+        patch.setattr(online, "HALVINGS", 5)
+        yield
 
 
-def run(search: Search, first: int = 0) -> Found:
-    for interval in range(first, search.intervals):
-        if search.done:
-            break
-        search.advance(interval)
-    return search.found()
+@pytest.fixture(scope="module")
+def whole(make_task: MakeTask) -> Callable[[str, int], tuple[Found, Task]]:
+    """What a search that nothing interrupts finds within a budget, and for which task; each is made once."""
+
+    @cache
+    def found(name: str, budget: int) -> tuple[Found, Task]:
+        task = make_task(budget, calls=8)
+        return found_by(name, task), task
+
+    return found
 
 
 @pytest.mark.slow
@@ -48,9 +56,10 @@ def run(search: Search, first: int = 0) -> Found:
     ("name", "budget"),
     [*((name, BUDGET) for name in NAMES), ("bac", 59), ("delta-dit", 59), ("deepcache", 59), ("sag", 7)],
 )
-def test_a_plan_is_legal_and_within_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
-    task = make_task(budget, calls=8)
-    found = found_by(name, task)
+def test_a_plan_is_legal_and_within_the_budget(
+    whole: Callable[[str, int], tuple[Found, Task]], name: str, budget: int
+) -> None:
+    found, task = whole(name, budget)
     model = task.executor.model
     assert found.schedule.shape == (model.steps, model.blocks)
     assert found.schedule.dtype == np.int8
@@ -61,9 +70,10 @@ def test_a_plan_is_legal_and_within_the_budget(make_task: MakeTask, name: str, b
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"interval"}))
-def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, name: str) -> None:
-    whole = run(open_search(name, make_task(BUDGET, calls=8)))
-    task = make_task(BUDGET, calls=8)
+def test_going_on_from_a_state_ends_where_another_run_ends(
+    make_task: MakeTask, whole: Callable[[str, int], tuple[Found, Task]], name: str
+) -> None:
+    expected, task = whole(name, BUDGET)[0], make_task(BUDGET, calls=8)
     stopped = open_search(name, task)
     stopped.advance(0)
     if not stopped.done:
@@ -73,9 +83,9 @@ def test_going_on_from_a_state_ends_where_another_run_ends(make_task: MakeTask, 
     resumed.restore({key: value.copy() for key, value in state.items()})
     assert resumed.done == stopped.done
     np.testing.assert_array_equal(resumed.plan, stopped.plan)
-    found = run(resumed, first=2)
-    np.testing.assert_array_equal(found.schedule, whole.schedule)
-    assert found.notes == whole.notes
+    found = search_plan(resumed, task.clock, first=2)[0]
+    np.testing.assert_array_equal(found.schedule, expected.schedule)
+    assert found.notes == expected.notes
 
 
 @pytest.mark.slow

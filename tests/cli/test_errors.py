@@ -15,8 +15,6 @@ from click.testing import CliRunner
 import ttscompile
 from ttscompile.cli import main
 from ttscompile.cli.output import print_json
-from ttscompile.errors import TrajectoryError
-from ttscompile.trajectories import read_npz
 
 
 @pytest.fixture
@@ -66,7 +64,6 @@ def test_what_is_no_artifact(command: str, made: bool, tmp_path: Path) -> None:
         (["inspect", "out", "-o", "plan.png", "--verify"], "--verify is for a page (.html)"),
         (["bench", "out", "--encoders", "."], "--encoders is for --checkpoint: give it too"),
         (["bench", "out", "--plot", "f.png"], "--plot is for --trajectories: give it too"),
-        (["bench", "out", "--runtime", "tensorrt"], "'tensorrt' is not one of onnxruntime, torch"),
         (["bench", "out", "--runtime", ""], "--runtime: nothing was given"),
         (["predict", "out", "--seed", "-1"], "-1 is not in the range 0<=x<="),
         (["serve", "out"], "give --control-hz HZ to drive one robot, or --copies N or --openpi to answer many"),
@@ -83,13 +80,6 @@ def test_bad_usage(arguments: list[str], reason: str) -> None:
     assert result.stdout == ""
     assert reason in result.stderr
     assert "Traceback" not in result.stderr
-
-
-def test_a_target_that_cannot_be(toy_compiled: Path) -> None:
-    arguments = [str(toy_compiled), "--trajectories", str(toy_compiled), "--target-sparsity", "1"]
-    result = CliRunner().invoke(main, ["calibrate", *arguments])
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "above 0 and below 1" in result.stderr and "Traceback" not in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -143,15 +133,6 @@ def test_a_picture_takes_the_place_of_files_alone(toy_compiled: Path, tmp_path: 
     assert sorted(tmp_path.iterdir()) == sorted([folder, null, picture])
 
 
-def test_arrays_that_cannot_be_read(tmp_path: Path) -> None:
-    corrupt, single = tmp_path / "corrupt.npz", tmp_path / "single.npy"
-    corrupt.write_bytes(b"PK\x03\x04 and nothing else")
-    np.save(single, np.zeros(3))
-    for path in (corrupt, single):
-        with pytest.raises(TrajectoryError, match=path.name):
-            read_npz(path)
-
-
 def test_what_the_system_refuses_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "out/x")
@@ -161,19 +142,6 @@ def test_what_the_system_refuses_is_one_message(monkeypatch: pytest.MonkeyPatch)
     assert (result.exit_code, result.stdout) == (2, "")
     told = "error: [Errno 28] No space left on device: 'out/x'. Make space where the results go, and run this again.\n"
     assert result.stderr == told
-
-
-@pytest.mark.parametrize(("command", "hint"), [("inspect", ""), ("calibrate", "; the same command with --resume goes")])
-def test_an_interruption_is_no_failed_check(command: str, hint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sys.modules["ttscompile.cli.inspect"], "load_artifact", interrupted)
-    monkeypatch.setattr(sys.modules["ttscompile.cli.calibrate"], "manifest_of", interrupted)
-    arguments = ["--trajectories", "calls.npz"] if command == "calibrate" else []
-    result = CliRunner().invoke(main, [command, "out", *arguments])
-    assert result.exit_code == 130
-    assert result.stderr.startswith(f"interrupted{hint}")
 
 
 def test_a_folder_of_something_else_is_refused_before_the_checkpoint_is_read(no_checkpoint: Path) -> None:

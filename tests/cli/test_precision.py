@@ -81,19 +81,13 @@ def test_fp32_is_the_default_and_inspect_says_so(toy_compiled: Path) -> None:
     assert "fp32" in run("inspect", toy_compiled).stdout
 
 
-def test_bf16_is_refused_before_the_checkpoint_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["bf16", "int3"])
+def test_a_precision_that_there_is_not_is_refused_before_the_checkpoint_is_read(tmp_path: Path, name: str) -> None:
     (tmp_path / "empty.ckpt").touch()
-    result = run("convert", tmp_path / "empty.ckpt", "-o", tmp_path / "compiled", "--precision", "bf16")
+    result = run("convert", tmp_path / "empty.ckpt", "-o", tmp_path / "compiled", "--precision", name)
     assert result.exit_code == 2
-    message = " ".join(result.stderr.split())
-    assert "'bf16' is not one of 'fp32', 'int8'" in message
+    assert f"'{name}' is not one of 'fp32', 'int8', 'int4'" in " ".join(result.stderr.split())
     assert not (tmp_path / "compiled").exists()
-
-
-def test_a_precision_that_there_is_not_is_a_usage_error(tmp_path: Path) -> None:
-    result = run("convert", tmp_path / "missing.ckpt", "-o", tmp_path / "compiled", "--precision", "int3")
-    assert result.exit_code == 2
-    assert "'int3' is not one of 'fp32', 'int8', 'int4'" in result.stderr
 
 
 @pytest.mark.slow

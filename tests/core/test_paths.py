@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
+from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import load_artifact
@@ -63,8 +65,8 @@ def inside(folder: Path) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def artifact(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written_artifact(toy_program(), tmp_path_factory.mktemp("toy") / "artifact").path
+def artifact(once: Once) -> Path:
+    return once.folder("toy", lambda directory: written_artifact(toy_program(), directory))
 
 
 FOUND = r"endless: expected a file or a directory; found a (pipe|socket|device)\. Give "
@@ -116,8 +118,8 @@ def test_commands_that_take_a_path(artifact: Path, tmp_path: Path, command: list
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "weights.safetensors", "stem.onnx", "program.json"])
-def test_inside_an_artifact(tmp_path: Path, name: str) -> None:
-    path = written_artifact(toy_program(), tmp_path / "artifact").path / name
+def test_inside_an_artifact(artifact: Path, tmp_path: Path, name: str) -> None:
+    path = shutil.copytree(artifact, tmp_path / "artifact") / name
     path.unlink()
     make("pipe", path)
     with pytest.raises(ArtifactError, match=rf"{name}: cannot be read: expected a file; found something else"):

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.calibration.conftest import artifact, compiled, planned, recording
 from tests.once import Once
+
+__all__ = ["artifact", "compiled", "planned", "recording"]
 
 for _folder in ("ablation", "benchmark", "evaluation", "pusht"):
     sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / _folder))

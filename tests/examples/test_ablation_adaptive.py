@@ -13,13 +13,7 @@ from click.testing import CliRunner
 from nested import Nested
 
 from tests.calibration import policies
-from tests.once import Once
 from ttscompile.errors import CalibrationError
-
-
-@pytest.fixture(scope="module")
-def compiled(once: Once) -> Path:
-    return policies.compiled(once)
 
 
 @pytest.fixture(scope="module")

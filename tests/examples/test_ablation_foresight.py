@@ -13,19 +13,8 @@ from choosing import AFTER, OBSERVATION, SINGLE
 from foresight import Oracle, oracle, placements
 
 from tests.calibration import policies
-from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import CalibrationError
-
-
-@pytest.fixture(scope="module")
-def compiled(once: Once) -> Path:
-    return policies.compiled(once)
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return policies.record(tmp_path_factory.mktemp("calls") / "calls.npz")
 
 
 @pytest.fixture(scope="module")

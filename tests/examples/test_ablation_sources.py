@@ -11,21 +11,14 @@ import sources
 import torch
 from click.testing import CliRunner
 
-from tests.calibration import policies
 from tests.calibration.tasks import make_task
-from tests.once import Once
 from ttscompile.calibration.calls import Actions
 from ttscompile.core.lattice import uniform_plan
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return policies.record(tmp_path_factory.mktemp("calls") / "calls.npz")
-
-
-@pytest.fixture(scope="module")
-def study(once: Once, recorded: Path) -> sources.Study:
-    task = make_task(policies.compiled(once), recorded)
+def study(compiled: Path, recording: Path) -> sources.Study:
+    task = make_task(compiled, recording)
     spec = task.executor.view.manifest.spec
     return sources.Study(task.executor, Actions(spec), task.calls, task.calls, 0)
 
@@ -65,8 +58,8 @@ def test_maps_are_the_best_linear_ones(study: sources.Study) -> None:
 
 
 @pytest.mark.slow
-def test_the_script_prints_a_row_for_each_way(once: Once, recorded: Path) -> None:
-    asked = [str(policies.compiled(once)), "-t", str(recorded), "--computed-steps", "3", "--calls", "8"]
+def test_the_script_prints_a_row_for_each_way(compiled: Path, recording: Path) -> None:
+    asked = [str(compiled), "-t", str(recording), "--computed-steps", "3", "--calls", "8"]
     made = CliRunner().invoke(sources.main, [*asked, "--json"])
     assert made.exit_code == 0, made.output
     rows = json.loads(made.stdout)["rows"]

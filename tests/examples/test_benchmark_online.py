@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import online
 import pytest
 from click.testing import CliRunner
 
-from tests.calibration import policies
-from tests.once import Once
-
 
 @pytest.fixture(scope="module")
-def arguments(once: Once, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    recording = policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
+def arguments(compiled: Path, recording: Path) -> list[str]:
     limits = ["--calls", "6", "--learned-calls", "12", "--rounds", "2"]
-    return [str(policies.compiled(once)), "-t", str(recording), "--sparsities", "0.5,0.8", *limits]
+    return [str(compiled), "-t", str(recording), "--sparsities", "0.5,0.8", *limits]
 
 
 @pytest.mark.slow

@@ -14,41 +14,19 @@ import torch
 from searches import ComparisonState, Searches, Searching, plan_of
 
 import ttscompile
-from tests.calibration import policies
+from tests.artifact.folders import contents
 from tests.calibration.pools import Elsewhere, needs_ray
-from tests.once import Once
-from tests.plans import store_schedules
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.compare import compare as measure
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import DRAWS
-from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import CalibrationError, ClusterError
 from ttscompile.measure.points import Comparison, MeasuredPoint
 from ttscompile.pool import Here, RayPool
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
-
-
-@pytest.fixture
-def artifact(once: Once, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(policies.compiled(once), tmp_path / "compiled"))
-
-
-@pytest.fixture(scope="module")
-def planned(once: Once, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small policy with a plan, ``half``."""
-    directory = Path(shutil.copytree(policies.compiled(once), tmp_path_factory.mktemp("planned") / "compiled"))
-    record = {"episodes": {"validation": [0, 1]}}
-    store_schedules(directory, None, {"half": uniform_plan(10, 6, 5)}, "half", record)
-    return directory
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +76,6 @@ def test_what_cannot_be_asked_for_is_refused(planned: Path, recording: Path) -> 
         compare(planned, [recording], ["magic"], [0.5])
     with pytest.raises(CalibrationError, match=r"at most 0\.9 of the 10 x 6"):
         compare(planned, [recording], ["tts"], [0.95])
-
-
-def test_nothing_is_written(planned: Path, recording: Path) -> None:
-    before = {path.name: path.read_bytes() for path in planned.iterdir()}
-    compare(planned, [recording], ["interval"], [0.5], calls=1)
-    assert {path.name: path.read_bytes() for path in planned.iterdir()} == before
 
 
 def test_rivals_take_part_with_a_correction_of_their_own(planned: Path, recording: Path) -> None:
@@ -177,12 +149,14 @@ def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
 
 
 def test_without_resume_it_begins_anew(planned: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(planned)
     interrupted_after(1, monkeypatch)
     with pytest.raises(Gone):
         compare(planned, [recording], ["interval"], [0.5, 0.8], calls=1)
     begun = interrupted_after(9, monkeypatch)
     compare(planned, [recording], ["interval"], [0.5, 0.8], calls=1)
     assert begun == ["interval", "interval"]
+    assert contents(planned) == before, "a comparison that came to its end leaves nothing"
 
 
 def test_why_there_is_no_plan_is_kept_too_and_a_damaged_state_is_refused(
@@ -201,7 +175,9 @@ def test_why_there_is_no_plan_is_kept_too_and_a_damaged_state_is_refused(
         again()
     state.write_bytes(content)
     begun = interrupted_after(9, monkeypatch)
-    assert "computes at least 24" in again().skipped["deepcache 0.8"]
+    found = again()
+    assert {point.series for point in found.points} == {"this artifact", "interval"}
+    assert "computes at least 24 of the 10 x 6 cells" in found.skipped["deepcache 0.8"]
     assert begun == ["interval"]
 
 
@@ -250,12 +226,6 @@ def test_it_says_who_does_not_take_part_as_he_is(planned: Path, recording: Path)
     assert found.warnings[1].startswith("tts-paper: one plan for all calls takes part")
     found = compare(planned, [recording], ["interval"], [], calls=1)
     assert found.warnings[1] == "no strategy takes part: no share of the cells was given for K = 10."
-
-
-def test_a_strategy_that_cannot_reach_a_sparsity_is_left_out_with_the_reason(planned: Path, recording: Path) -> None:
-    found = compare(planned, [recording], ["deepcache"], [0.8], calls=1)
-    assert {point.series for point in found.points} == {"this artifact"}
-    assert "computes at least 24 of the 10 x 6 cells" in found.skipped["deepcache 0.8"]
 
 
 def test_a_comparison_whose_cluster_goes_goes_on_in_this_process(

@@ -9,15 +9,12 @@ import pytest
 from click.testing import CliRunner
 from strategies import default_sparsities, main
 
-from tests.calibration import policies
-from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 
 
 @pytest.fixture(scope="module")
-def arguments(once: Once, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    recording = policies.record(tmp_path_factory.mktemp("recording") / "calls.npz")
-    return [str(policies.compiled(once)), "-t", str(recording), "--calls", "2"]
+def arguments(compiled: Path, recording: Path) -> list[str]:
+    return [str(compiled), "-t", str(recording), "--calls", "2"]
 
 
 def run(*words: str) -> Any:

@@ -14,7 +14,6 @@ from typing import Any
 import onnx
 import pytest
 
-from tests.artifact.tiny import write_tiny
 from tests.hostile.forged import forge, rehash
 from tests.hostile.fuzz import LIMIT
 from tests.hostile.guard import MORE_BYTES, address_space
@@ -30,12 +29,6 @@ from ttscompile.core.untrusted_json import MAX_VALUES, parse_json
 from ttscompile.core.zip_files import MAX_DIRECTORY, MAX_ENTRIES, open_zip
 from ttscompile.errors import ArtifactError, TrajectoryError
 from ttscompile.trajectories.episodes import read_npz
-
-
-@pytest.fixture
-def written(tmp_path: Path) -> Path:
-    write_tiny(tmp_path / "compiled")
-    return tmp_path / "compiled"
 
 
 def refused(load: Callable[[], object], message: str) -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.artifact.tiny import write_tiny
 from tests.hostile import swollen
 from tests.hostile.corpus import make
 from tests.hostile.fuzz import LIMIT
 from tests.hostile.guard import MORE_BYTES, Violation, address_space
 from tests.hostile.targets import Accepted, outcome
+from tests.once import Once
 
 ROOT = Path(__file__).resolve().parents[2]
 CASES = 120
@@ -26,10 +26,10 @@ CASES = 120
     ("target", "cases", "each"),
     [("mixed", CASES, 10), ("structured", 80, 3), pytest.param("structured", 50_000, 2_000, marks=pytest.mark.soak)],
 )
-def test_nothing_but_errors_of_its_own(target: str, cases: int, each: int, tmp_path: Path) -> None:
+def test_nothing_but_errors_of_its_own(target: str, cases: int, each: int, once: Once) -> None:
     """More than ``each`` are refused, and more than that accepted."""
-    make(tmp_path / "corpus")
-    command = [sys.executable, "-m", "tests.hostile.fuzz", "--corpus", str(tmp_path / "corpus"), "--processes", "1"]
+    corpus = once.folder("corpus", make)
+    command = [sys.executable, "-m", "tests.hostile.fuzz", "--corpus", str(corpus), "--processes", "1"]
     command += ["--target", target, "--cases", str(cases), "--seed", "1"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300 + cases)
     lines = [json.loads(line) for line in result.stdout.splitlines()]
@@ -39,10 +39,9 @@ def test_nothing_but_errors_of_its_own(target: str, cases: int, each: int, tmp_p
 
 
 @pytest.mark.parametrize("case", range(8))
-def test_an_artifact_that_is_swollen_takes_no_more_than_is_promised(tmp_path: Path, case: int) -> None:
+def test_an_artifact_that_is_swollen_takes_no_more_than_is_promised(written: Path, case: int) -> None:
     """The first cases of many: ``python -m tests.hostile.fuzz --target swollen --cases 1400``."""
-    write_tiny(tmp_path / "compiled")
-    use = swollen.artifact(random.Random(case), tmp_path / "compiled")
+    use = swollen.artifact(random.Random(case), written)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (address_space() + MORE_BYTES, hard))
     began = time.process_time()
@@ -65,7 +64,6 @@ def test_the_guard_sees_what_must_not_happen(tmp_path: Path) -> None:
     """In a process of its own, because an audit hook stays."""
     code = f"""
 import os, pathlib, pickle, sys
-from tests.hostile.corpus import make
 from tests.hostile.guard import Guard, Violation
 inside = pathlib.Path({str(tmp_path)!r}) / "inside"
 inside.mkdir()

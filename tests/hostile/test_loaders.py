@@ -14,7 +14,6 @@ import pytest
 import torch
 
 import ttscompile
-from tests.artifact.tiny import write_tiny
 from tests.hostile.forged import forge
 from tests.policies.conftest import _config, _weights
 from ttscompile.artifact import load_artifact
@@ -25,12 +24,6 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.checkpoint import plain_config
 from ttscompile.policies.diffusion_policy.interpolation import Config
 from ttscompile.trajectories import frames as trajectories_frames, load_trajectories
-
-
-@pytest.fixture
-def written(tmp_path: Path) -> Path:
-    write_tiny(tmp_path / "compiled")
-    return tmp_path / "compiled"
 
 
 def external(path: Path, name: str, **entries: str) -> None:

@@ -9,7 +9,6 @@ import pytest
 from onnx import TensorProto
 from onnx.helper import make_function, make_graph, make_node, make_opsetid, make_tensor_value_info
 
-from tests.artifact.tiny import write_tiny
 from tests.hostile.forged import forge
 from ttscompile.artifact import load_artifact
 from ttscompile.errors import ArtifactError
@@ -81,23 +80,21 @@ def devices(model: onnx.ModelProto) -> None:
 
 
 @pytest.mark.parametrize("change", [endless, hidden, nested, of_others, of_onnxruntime, function, training, devices])
-def test_what_convert_never_writes(change: Callable[[onnx.ModelProto], None], tmp_path: Path) -> None:
-    write_tiny(tmp_path / "compiled")
-    path = tmp_path / "compiled" / "stem.onnx"
+def test_what_convert_never_writes(change: Callable[[onnx.ModelProto], None], written: Path) -> None:
+    path = written / "stem.onnx"
     model = onnx.load(path, load_external_data=False)
     change(model)
     path.write_bytes(model.SerializeToString())
-    forge(path.parent)
+    forge(written)
     with pytest.raises(ArtifactError, match=r"stem\.onnx: expected an ONNX model; found .*which convert never writes"):
-        load_artifact(path.parent)
+        load_artifact(written)
 
 
-def test_a_name_twice_is_no_way_round(tmp_path: Path) -> None:
+def test_a_name_twice_is_no_way_round(written: Path) -> None:
     """Of a field that is there twice the last one counts for some readers, the first for others."""
-    write_tiny(tmp_path / "compiled")
-    path = tmp_path / "compiled" / "stem.onnx"
+    path = written / "stem.onnx"
     node = b"\x22\x04Loop\x22\x08Identity"
     path.write_bytes(path.read_bytes() + b"\x3a" + bytes([len(node) + 2]) + b"\x0a" + bytes([len(node)]) + node)
-    forge(path.parent)
+    forge(written)
     with pytest.raises(ArtifactError, match="the operator ':Identity/Loop'"):
-        load_artifact(path.parent)
+        load_artifact(written)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
 
 from .served import Hub, serving
@@ -34,9 +35,9 @@ def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Hub]:
 
 
 @pytest.fixture(scope="session")
-def toy_artifact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toy_artifact(once: Once) -> Path:
     """A small artifact that was not calibrated."""
-    return written_artifact(toy_program(), tmp_path_factory.mktemp("hub") / "artifact").path
+    return once.folder("toy", lambda directory: written_artifact(toy_program(), directory))
 
 
 @pytest.fixture

@@ -74,12 +74,6 @@ def test_decisions_do_not_hold_on_to_the_feature() -> None:
     assert decisions.decide(1, feature)[0, 1] == Source.COMPUTE
 
 
-@pytest.mark.parametrize("rule", [TEACACHE, DBCACHE])
-def test_a_criterion_survives_json(rule: Criterion) -> None:
-    record = json.loads(json.dumps(rule.record()))
-    assert Criterion(**{**record, "polynomial": tuple(record["polynomial"])}) == rule
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [

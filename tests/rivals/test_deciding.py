@@ -22,10 +22,7 @@ from ttscompile.rivals.deciding import Deciding
 from ttscompile.rivals.online import Criterion, decide
 from ttscompile.runtimes.open import open_runtime
 
-RULES = [
-    Criterion("teacache", 0, 0.5, (1.0, 0.0), accumulates=True, warmup=1, closes=True),
-    Criterion("dbcache", 2, 0.5, (1.0, 0.0), accumulates=False, warmup=2, closes=False),
-]
+from .rules import RULES
 
 STREAMS = 6
 

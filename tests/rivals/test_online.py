@@ -11,22 +11,12 @@ import torch
 from tests.calibration.tasks import MakeTask, found_by
 from tests.rounding import FLOAT64, Counted, assert_equal_but_for_rounding, bound
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.task import Found
 from ttscompile.core.lattice import PlanArray, Source
 from ttscompile.errors import CalibrationError
 from ttscompile.rivals.online import Criterion, Decisions, dbcache, decide, dense_changes, proposal, proposals, within
 from ttscompile.runtimes.reference.model import ReferenceModel
 
-RULES = [
-    Criterion("teacache", 0, 0.5, (1.0, 0.0), accumulates=True, warmup=1, closes=True),
-    Criterion("dbcache", 2, 0.5, (1.0, 0.0), accumulates=False, warmup=2, closes=False),
-]
-
-
-def criterion_of(found: Found) -> Criterion:
-    """The criterion in the notes of what was found."""
-    record = found.notes["criterion"]
-    return Criterion(**{**record, "polynomial": tuple(record["polynomial"])})
+from .rules import RULES
 
 
 def decided_by_the_reference(model: ReferenceModel, calls: Calls, rule: Criterion) -> tuple[torch.Tensor, PlanArray]:
@@ -93,7 +83,7 @@ def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criteri
 def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: int) -> None:
     task = make_task(budget, calls=24)
     found = found_by(name, task)
-    rule = criterion_of(found)
+    rule = Criterion.of_record(found.notes["criterion"])
     assert rule.name == name
     assert found.notes["criterion"] == rule.record()
     cells = decide(task.executor, rule, task.calls).cells
@@ -107,7 +97,7 @@ def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: i
 def test_the_schedule_is_the_best_decision(make_task: MakeTask, name: str) -> None:
     task = make_task(30, calls=12)
     found = found_by(name, task)
-    plans = within(decide(task.executor, criterion_of(found), task.calls).plans, 30)
+    plans = within(decide(task.executor, Criterion.of_record(found.notes["criterion"]), task.calls).plans, 30)
     errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 1
     np.testing.assert_array_equal(found.schedule, plans[int(np.argmin(errors))])

@@ -118,6 +118,14 @@ def vanish(call: Any) -> None:
     call._socket.close()
 
 
+def wait_until(there: Any) -> None:
+    for _ in range(1000):
+        if there():
+            return
+        time.sleep(0.005)
+    raise AssertionError("it did not come")
+
+
 def still_serves(url: str, **key: Any) -> None:
     with connected(url, **key) as call:
         assert call("info")["n_obs_steps"] == 2

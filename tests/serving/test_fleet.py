@@ -2,8 +2,8 @@
 
 import asyncio
 import importlib.util
+import shutil
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from tests.plans import store_schedules
-from tests.runtimes.toys import toy_program, written_artifact
-from tests.serving.serving import LIMITS, Client, ServerError, connected, listening, vanish
+from tests.serving.serving import LIMITS, Client, ServerError, connected, listening, vanish, wait_until
 from tests.serving.watching import figures, get
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.artifact.load import load_artifact
@@ -215,19 +214,11 @@ def test_a_plan_that_cannot_run_is_refused_before_it_starts(planned: Path, plan:
         Plans.of(load_artifact(planned), plan)
 
 
-def test_a_pruner_that_may_read_the_call_before_is_left_out(tmp_path: Path) -> None:
+def test_a_pruner_that_may_read_the_call_before_is_left_out(toy_compiled: Path, tmp_path: Path) -> None:
     """Each request begins an episode: such a plan would quietly be another one than was calibrated."""
-    made = written_artifact(toy_program(), tmp_path / "artifact")
-    store_schedules(made.path, dict(made.pruner), {"evenly": uniform_plan(5, 5, 2)}, "tts", {})
-    artifact = load_artifact(made.path)
+    path = shutil.copytree(toy_compiled, tmp_path / "artifact")
+    store_schedules(path, dict(load_artifact(path).pruner), {"evenly": uniform_plan(5, 5, 2)}, "tts", {})
+    artifact = load_artifact(path)
     assert Plans.of(artifact, "evenly").names == ("dense", "evenly")
     with pytest.raises(IllegalPlanError, match="another robot's"):
         Plans.of(artifact)
-
-
-def wait_until(there: Any) -> None:
-    for _ in range(1000):
-        if there():
-            return
-        time.sleep(0.005)
-    raise AssertionError("it did not come")

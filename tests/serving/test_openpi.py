@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -17,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
-from tests.serving.serving import LIMITS, handshake, listening, raw
+from tests.serving.serving import LIMITS, handshake, listening, raw, wait_until
 from tests.serving.watching import figures, get
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.cli import main
@@ -199,14 +198,6 @@ def test_calls_are_made_one_by_one_and_a_client_that_vanishes_is_not_computed_fo
         for each in (clients[0], clients[2]):
             assert "actions" in received(each)
         assert [seen["obs"][0, 0] for seen in policy.seen] == [1.0, 3.0]
-
-
-def wait_until(there: Any) -> None:
-    for _ in range(1000):
-        if there():
-            return
-        time.sleep(0.005)
-    raise AssertionError("it did not come")
 
 
 def test_who_does_not_answer_pings_is_found_long_before_the_idle_timeout(planned: Path, monkeypatch: Any) -> None:

@@ -203,7 +203,7 @@ def test_changed_data_is_refused(file: Path) -> None:
 def test_other_files_are_refused(tmp_path: Path) -> None:
     single = tmp_path / "one.npy"
     np.save(single, np.zeros(3))
-    with pytest.raises(TrajectoryError, match=r"found a single one\. Use np\.savez"):
+    with pytest.raises(TrajectoryError, match=r"one\.npy: .*found a single one\. Use np\.savez"):
         load(single)
     cut = tmp_path / "cut.npz"
     np.savez(cut, obs=np.zeros(30))

@@ -56,14 +56,31 @@ def recorded(path: Path, shaking: float = 0.0) -> list[Path]:
     return [path]
 
 
-def tried(folder: Path, recordings: list[Path], **fields: float) -> tuple[Trials, Proposal]:
-    trials = trials_of(folder, recordings)
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The camera does not move."""
+    return recorded(tmp_path_factory.mktemp("still") / "calls.npz")
+
+
+@pytest.fixture(scope="module")
+def trials(once: Once, files: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Trials:
+    """Of ``files``; an artifact and answers that no test changes."""
+    folder = tmp_path_factory.mktemp("tokens") / "own"
+    return trials_of(shutil.copytree(cameras.compiled_tokens(once) / "artifact", folder), files)
+
+
+@pytest.fixture(scope="module")
+def found(trials: Trials) -> Proposal:
+    """What is proposed for them."""
+    return tried(trials)
+
+
+def tried(trials: Trials, **fields: float) -> Proposal:
     (found,) = proposed(Tokens(request(**fields)), trials, trials.base)
-    return trials, found
+    return found
 
 
-def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_path: Path) -> None:
-    trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
+def test_what_is_proposed_saves_and_is_near_on_other_episodes(trials: Trials, found: Proposal) -> None:
     assert found.plan.tokens is not None and found.shared == {"tokens": found.plan.tokens}
     assert found.plan.tokens.refresh == 6, "that of 64 was never seen in episodes of six calls"
     assert (found.name, found.margin) == (FULL, Tokens.margin)
@@ -75,7 +92,7 @@ def test_what_is_proposed_saves_and_is_near_on_other_episodes(folder: Path, tmp_
 
 
 def test_tokens_that_no_chosen_plan_reuses_are_said_to_be_of_no_use(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Looking for changes takes longer than a small encoder, so that no plan may take what was learned."""
 
@@ -85,15 +102,16 @@ def test_tokens_that_no_chosen_plan_reuses_are_said_to_be_of_no_use(
     monkeypatch.setattr("ttscompile.calibration.choose.timed", timed)
     for slower, ends in ((20.0, "are computed, and no chosen plan is faster by it"), (5.0, "are computed")):
         own = shutil.copytree(folder, tmp_path / f"{slower}")
-        files = recorded(tmp_path / "calls.npz")
         result = calibrate(own, files, learn=("loops", "tokens"), progress=False, max_distance=0.9)
         assert result.told["tokens"].endswith(ends)
         assert any(plan.tokens for plan in load_artifact(own).plans.values()) is (slower == 5.0)
 
 
-def test_a_call_is_timed_after_another_picture(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_call_is_timed_after_another_picture(
+    trials: Trials, found: Proposal, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One is timed with all tokens, since a robot may wait for such a call."""
-    (trials, found), predict, counted = tried(folder, recorded(tmp_path / "calls.npz")), Runtime.predict, list[float]()
+    predict, counted = Runtime.predict, list[float]()
 
     def told(self: Runtime, obs: Any, noise: Any, plan: Plan) -> Any:
         made = predict(self, obs, noise, plan)
@@ -108,8 +126,8 @@ def test_a_call_is_timed_after_another_picture(folder: Path, tmp_path: Path, mon
     assert max(counted) < 0.5 < whole, "its first picture is whole, and the second of the window is not"
 
 
-def test_a_plan_that_is_given_what_another_learned_is_judged_anew(folder: Path, tmp_path: Path) -> None:
-    artifact, files = load_artifact(folder), recorded(tmp_path / "calls.npz")
+def test_a_plan_that_is_given_what_another_learned_is_judged_anew(folder: Path, files: list[Path]) -> None:
+    artifact = load_artifact(folder)
     fields = {"distance": 9.0, "interval": [9.0, 9.0], "sparsity": 0.0, "flops_sparsity": 0.0}
     record = {"plans": {"other": fields}}
     update_plans(folder, {**artifact.plans, "other": replace(artifact.default, repair=True)}, FULL, record)
@@ -122,7 +140,7 @@ def test_a_plan_that_is_given_what_another_learned_is_judged_anew(folder: Path, 
 
 
 def test_what_does_not_hold_on_other_episodes_is_told(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, files: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It has the name of a plan that is kept, so that nothing else says that it was tried."""
 
@@ -130,15 +148,13 @@ def test_what_does_not_hold_on_other_episodes_is_told(
         return "is no better." if score.tokens < 1 else None
 
     monkeypatch.setattr(Kept, "_no_better", no_better)
-    files = recorded(tmp_path / "calls.npz")
     result = calibrate(folder, files, learn=("loops", "tokens"), max_distance=0.9)
     assert result.told["tokens"] == "" and result.skipped["tokens"] == "is no better."
     assert "'tokens' is left out: it is no better." in " ".join(capsys.readouterr().err.split())
     assert not any(plan.tokens for plan in load_artifact(folder).plans.values())
 
 
-def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
-    files = recorded(tmp_path / "calls.npz")
+def test_what_is_learned_is_written(folder: Path, files: list[Path], tmp_path: Path) -> None:
     result = calibrate(folder, files, learn=("tokens",), progress=False)
     artifact = load_artifact(folder)
     plan = artifact.default
@@ -152,21 +168,18 @@ def test_what_is_learned_is_written(folder: Path, tmp_path: Path) -> None:
     computed, of = rung.details["spot"]
     assert 0 < computed < of == 2 * 2 * 37, "of two streams, and two cameras"
     before = (folder / "manifest.json").read_bytes()
-    files = recorded(tmp_path / "calls.npz", shaking=0.5)
-    with pytest.raises(CalibrationFailedError, match="does not pay"):
-        calibrate(folder, files, learn=("tokens",), progress=False)
+    shaking = recorded(tmp_path / "calls.npz", shaking=0.5)
+    with pytest.raises(CalibrationFailedError, match=r"does not pay: it would compute \d+% of the tokens"):
+        calibrate(folder, shaking, learn=("tokens",), progress=False)
     assert (folder / "manifest.json").read_bytes() == before
 
 
-def test_what_does_not_pay_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CalibrationFailedError, match=r"does not pay: it would compute \d+% of the tokens"):
-        tried(folder, recorded(tmp_path / "calls.npz", shaking=0.5))
+def test_what_does_not_pay_is_refused(trials: Trials) -> None:
     with pytest.raises(CalibrationFailedError, match="does not pay: the actions are .* further off at least, and -1"):
-        tried(folder, recorded(tmp_path / "calls.npz"), margin=-1.0)
+        tried(trials, margin=-1.0)
 
 
-def test_what_computes_too_much_on_other_episodes_is_refused_there(folder: Path, tmp_path: Path) -> None:
-    trials, found = tried(folder, recorded(tmp_path / "calls.npz"))
+def test_what_computes_too_much_on_other_episodes_is_refused_there(trials: Trials, found: Proposal) -> None:
     score = judge(trials, found.plan, HELD_OUT)
     assert found.refusal(score, {}) is None
     assert "80% of the tokens" in str(found.refusal(replace(score, tokens=0.8), {}))
@@ -186,24 +199,21 @@ def scripted(monkeypatch: pytest.MonkeyPatch, limits: dict[TokenReuse, tuple[flo
     monkeypatch.setattr(tokens, "THRESHOLDS", (0.0, 0.1, 0.2))
 
 
-def test_the_fewest_tokens_within_the_upper_limit_are_taken(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fewest_tokens_within_the_upper_limit_are_taken(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     """A setting whose mean is within the margin, and whose limit over episodes is not, was lucky."""
     near, lucky = 0.9 * Tokens.margin, 1.9 * Tokens.margin
     limits = {TokenReuse(0.0, 6): (0.6, 0.0), TokenReuse(0.1, 6): (0.3, near), TokenReuse(0.2, 6): (0.1, lucky)}
     scripted(monkeypatch, {**limits, TokenReuse(0.0, 4): (0.5, 0.0)})
-    _, found = tried(folder, recorded(tmp_path / "calls.npz"))
-    assert found.plan.tokens == TokenReuse(0.1, 6)
+    assert tried(trials).plan.tokens == TokenReuse(0.1, 6)
     scripted(monkeypatch, {**limits, TokenReuse(0.0, 4): (0.29, 0.0)})
-    assert tried(folder, recorded(tmp_path / "calls.npz"))[1].plan.tokens == TokenReuse(0.0, 4)
+    assert tried(trials).plan.tokens == TokenReuse(0.0, 4)
 
 
 def test_a_larger_threshold_than_one_that_is_far_off_is_not_tried(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trials: Trials, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scripted(monkeypatch, {TokenReuse(0.0, 6): (0.6, 0.0), TokenReuse(0.2, 6): (0.1, 0.0)})
-    assert tried(folder, recorded(tmp_path / "calls.npz"))[1].plan.tokens == TokenReuse(0.0, 6)
+    assert tried(trials).plan.tokens == TokenReuse(0.0, 6)
 
 
 def test_an_encoder_without_tokens_is_refused(once: Once) -> None:

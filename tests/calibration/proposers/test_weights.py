@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import ttscompile
+from tests.artifact.folders import contents
 from tests.calibration import policies
 from tests.calibration.killed import killed
 from tests.once import Once
@@ -65,10 +66,6 @@ def distilled(scheduled: Path, recording: Path, tmp_path_factory: pytest.TempPat
 @pytest.fixture
 def copied(scheduled: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(scheduled, tmp_path / "compiled"))
-
-
-def contents(directory: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(directory.iterdir())}
 
 
 def call(seed: int, streams: int = 3) -> tuple[dict[str, Any], Noise]:

@@ -1,0 +1,5 @@
+"""The artifact that is made hostile."""
+
+from tests.artifact.conftest import written
+
+__all__ = ["written"]
