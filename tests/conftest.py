@@ -6,6 +6,7 @@ import gc
 import importlib.util
 import logging
 import re
+import signal
 import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -40,6 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
     Where the processor has no integer dot products, every policy with blocks of eight or four bits warns that it is
     slow there. That is no error of the test that loads it; that it warns, a test of its own checks.
     """
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has what it runs in the background ignore it
     if not has_integer_dot_product():
         config.addinivalue_line("filterwarnings", "ignore:precision 'int[48]' is fast on a processor:UserWarning")
     if importlib.util.find_spec("hypothesis") is not None:
