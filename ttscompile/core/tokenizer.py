@@ -112,7 +112,7 @@ class Tokenizer:
         """The token of each of these words; those that are none yet become one, as transformers adds them."""
         known = self._tokenizer
         missing = dict.fromkeys(word for word in words if known.token_to_id(word) is None)
-        known.add_special_tokens(list(missing))  # at once: it reads all of them again each time
+        known.add_special_tokens(list(missing))  # at once: each time it reads again all that it has
         return [known.token_to_id(word) for word in words]
 
     def __call__(self, text: str, most: int | None = None) -> list[int]:
