@@ -50,8 +50,9 @@ types: $(READY)
 	cd $(TYPED) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache .
 
 # On all cores, each with a file at a time; then, one by one, what takes times. The first case of each test of make
-# quick is measured on the way: what share of the core's lines they run.
-TOGETHER := -n logical --dist loadfile --benchmark-disable
+# quick is measured on the way: what share of the core's lines they run. Pytest's plugin for logs would go through
+# all loggers six times a test.
+TOGETHER := -n logical --dist loadfile --benchmark-disable -p no:logging
 pytest: together
 	$(MAKE) alone
 	$(BIN)/python tests/covered.py

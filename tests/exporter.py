@@ -12,6 +12,7 @@ from tempfile import NamedTemporaryFile
 import onnx
 import pytest
 import torch
+from torch._export import utils as export_utils
 from torch.onnx._internal.exporter import _fx_passes
 from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torch.onnx._internal.fx.passes.type_promotion import TypePromotionTable, get_type_promotion_rule
@@ -51,6 +52,8 @@ def exported_once(directory: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(program, "_export", once)
         patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib)))
+        operations = export_utils._materialize_cpp_cia_ops  # looks each up by its name, sixteen times a trace
+        patch.setattr(export_utils, "_materialize_cpp_cia_ops", cache(operations))
         patch.setattr(_fx_passes, "insert_type_promotion_nodes", where_needed(_fx_passes.insert_type_promotion_nodes))
         yield
 

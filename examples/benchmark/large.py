@@ -8,7 +8,7 @@
     python examples/benchmark/large.py --pi0 --precision int4                   # LeRobot's pi0, whole; or --pi05
     python examples/benchmark/large.py --groot --precision int4                 # LeRobot's GR00T N1.7, whole
     python examples/benchmark/large.py --evo1                                   # LeRobot's evo1, whole
-    python examples/benchmark/large.py --eo1                                    # LeRobot's eo1, whole
+    python examples/benchmark/large.py --eo1                                    # LeRobot's eo1, whole; or --wall-x
     python examples/benchmark/large.py --vla-jepa                               # LeRobot's vla_jepa, whole
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
@@ -16,8 +16,8 @@
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
-four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1, whose
-original is timed before, they are three.
+four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1 and
+wall_x, whose originals are timed before, they are three.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ WHOLE = {
     "groot": "LeRobot's groot, GR00T N1.7",
     "evo1": "LeRobot's evo1",
     "eo1": "LeRobot's eo1",
+    "wall_x": "LeRobot's wall_x",
     "vla_jepa": "LeRobot's vla_jepa",
     "xvla": "LeRobot's xvla",
     "rdt": "RDT-170M",
@@ -61,8 +62,11 @@ WHOLE = {
 }
 """Policies that are compiled from what is saved of them, in place of the transformer; LeRobot's are whole."""
 
-ALONE = ("eo1",)
+ALONE = ("eo1", "wall_x")
 """Of these the original is timed before, in a process of its own: 24 GiB do not hold it and the artifact in fp32."""
+
+TOLD = ("evo1", "eo1", "wall_x", "groot", "vla_jepa")
+"""Into these an instruction is compiled."""
 
 MOST_FILES = 3
 """Whose sizes are printed by name."""
@@ -165,15 +169,16 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     import large_rdt
     import large_smolvla
     import large_vla_jepa
+    import large_wall_x
     import large_xvla
 
     directory = folder / name
     if not directory.exists():
         pi05 = partial(large_pi0.save, adaptive=True)
-        others = (large_groot, large_evo1, large_eo1, large_vla_jepa, large_xvla, large_rdt, large_octo)
+        others = [large_groot, large_evo1, large_eo1, large_wall_x, large_vla_jepa, large_xvla, large_rdt, large_octo]
         saves = [large_smolvla.save, large_pi0.save, pi05, *(each.save for each in others)]
         dict(zip(WHOLE, saves, strict=True))[name](directory)
-    return directory, large_evo1.TASK if name in ("evo1", "eo1", "groot", "vla_jepa") else None
+    return directory, large_evo1.TASK if name in TOLD else None
 
 
 def convert_clip(folder: Path) -> None:

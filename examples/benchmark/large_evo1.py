@@ -72,9 +72,15 @@ def save(directory: Path) -> None:
     save_file(weights, directory / "model.safetensors")
 
 
-def save_letters(folder: Path, marks: Mapping[str, int]) -> None:
-    """A tokenizer of which each letter is a token, since this is nobody's text, and marks by their numbers."""
+def save_letters(folder: Path, marks: Mapping[str, int], size: int = 0) -> None:
+    """A tokenizer of which each letter is a token, since this is nobody's text, and marks by their numbers.
+
+    Args:
+        size: it has as many tokens, most of which nothing is; 0 for those that there are.
+    """
     letters = {chr(code): code for code in range(32, 127)}
+    taken = {*letters.values(), *marks.values()}
+    letters |= {f"nothing {number}": number for number in range(size) if number not in taken}
     known = [{"id": number, "content": text, "special": True} for text, number in marks.items()]
     flags = dict.fromkeys(("single_word", "lstrip", "rstrip", "normalized"), False)
     split = {"type": "Split", "pattern": {"Regex": "."}, "behavior": "Isolated", "invert": False}

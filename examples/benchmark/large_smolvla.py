@@ -90,14 +90,14 @@ def random_weight(name: str, shape: torch.Size, draw: torch.Generator) -> torch.
     return torch.ones(shape) if name.endswith("weight") else torch.zeros(shape)  # a norm's, whatever it is called
 
 
-def save_drawn(path: Path, shapes: Mapping[str, torch.Size], halved: str | None = None) -> None:
+def save_drawn(path: Path, shapes: Mapping[str, torch.Size], halved: str | tuple[str, ...] = ()) -> None:
     """Write random weights one after the other, so that they need no memory that a machine may not have.
 
     Args:
-        halved: how names begin of those that are in bf16; None for none.
+        halved: how names begin of those that are in bf16.
     """
     header, end = dict[str, Any](), 0
-    half = {name: halved is not None and name.startswith(halved) for name in shapes}
+    half = {name: name.startswith(halved) for name in shapes}
     for name, shape in shapes.items():
         start, end = end, end + (2 if half[name] else 4) * shape.numel()
         header[name] = {"dtype": "BF16" if half[name] else "F32", "shape": list(shape), "data_offsets": [start, end]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Any
 from unittest.mock import Mock
@@ -11,6 +10,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.heard import heard
 from tests.passes.specs import toy_spec
 from ttscompile.capture import export
 from ttscompile.capture.export import capture
@@ -76,19 +76,11 @@ def test_what_cannot_be_compiled_is_refused(then: Callable[..., object], message
         lambda y, t, o: y @ torch.zeros(5, 5),  # torch logs the traceback
     ],
 )
-def test_the_error_is_all_that_is_said(
-    then: Callable[..., object], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    loggers = [logging.getLogger(name) for name in ("torch._subclasses.fake_tensor", "torch.fx")]
-    for logger in loggers:
-        logger.addHandler(caplog.handler)
-    try:
-        with pytest.raises(CaptureError, match=r" at test_export.py:\d+ in <lambda>: ") as caught:
-            capture(Denoiser(then), toy_spec())
-    finally:
-        for logger in loggers:
-            logger.removeHandler(caplog.handler)
-    assert (*capsys.readouterr(), caplog.text) == ("", "", "")
+def test_the_error_is_all_that_is_said(then: Callable[..., object], capsys: pytest.CaptureFixture[str]) -> None:
+    message, loggers = r" at test_export.py:\d+ in <lambda>: ", ("", "torch._subclasses.fake_tensor", "torch.fx")
+    with heard(*loggers) as told, pytest.raises(CaptureError, match=message) as caught:
+        capture(Denoiser(then), toy_spec())
+    assert (*capsys.readouterr(), told) == ("", "", [])
     assert "TORCH" not in str(caught.value)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.heard import heard
 from tests.runtimes.executor.simulation import FakeClock
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor
@@ -38,11 +39,7 @@ V4, V6 = ("127.0.0.1",), ("::1",)
     ],
 )
 def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
-    addresses: list[tuple[str]],
-    broken: dict[str, int],
-    left: list[str] | None,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    addresses: list[tuple[str]], broken: dict[str, int], left: list[str] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
 
@@ -86,10 +83,11 @@ def test_a_name_s_addresses_have_one_port_and_absent_ones_are_left_out(
                 asyncio.run(listen(server))
             assert all(each.fileno() == -1 for each in made)
             return
-        entrances = asyncio.run(listen(server))
+        with heard() as told:
+            entrances = asyncio.run(listen(server))
     assert [each.asked[0] for each in entrances] == left  # type: ignore[attr-defined]
     assert len({each.getsockname()[1] for each in entrances}) == 1
-    assert [each.message for each in caplog.records] == (["not listening on ::1: scripted"] if broken else [])
+    assert told == (["not listening on ::1: scripted"] if broken else [])
     for each in entrances:
         socket.create_connection(each.getsockname(), 5).close()  # it listens already
     for each in made:

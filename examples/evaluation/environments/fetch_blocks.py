@@ -90,7 +90,7 @@ _SCENE = """
 <mujoco>
   <compiler angle="radian" meshdir="{assets}/stls/fetch" texturedir="{assets}/textures"/>
   <option timestep="0.002"/>
-  <visual><quality shadowsize="0" offsamples="0"/><global offwidth="480" offheight="480"/></visual>
+  <visual><quality shadowsize="0" offsamples="0"/><global offwidth="640" offheight="640"/></visual>
   <include file="{assets}/fetch/shared.xml"/>
   <worldbody>
     <geom name="floor0" pos="0.8 0.75 0" size="0.85 0.7 1" type="plane" condim="3" material="floor_mat"/>

@@ -1,0 +1,147 @@
+"""A whole policy one of whose cameras moves with the gripper: how many tokens a call computes, and what it then takes.
+
+    python examples/benchmark/large.py --smolvla --output DIR
+    MUJOCO_GL=osmesa python examples/benchmark/in_motion.py DIR
+
+The pictures are rendered: of the arm over three blocks that the small SmolVLA of ``examples/policies/vla`` was trained
+with, one camera stands in front of it and the other hangs on its gripper. Scripted experts drive it, and a call comes
+after as many steps as that policy executes. A call with all tokens and one with those that changed take turns, of two
+computed steps. Seconds are the processor's, and all calls have one thread.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import click
+import numpy as np
+import numpy.typing as npt
+from beside import COMPUTED
+from large_calls import lowered, plans_of
+from large_smolvla import CAMERAS, call
+
+from ttscompile import Noise, Plan
+from ttscompile.artifact.load import load_artifact
+from ttscompile.core.plan import TokenReuse
+from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.policy import CompiledPolicy
+
+sys.path.insert(1, str(Path(__file__).parents[1] / "evaluation"))
+sys.path.insert(2, str(Path(__file__).parents[1] / "policies" / "vla"))
+
+from environments.fetch_blocks import TASKS, FetchBlocks
+from experts import act
+
+Array = npt.NDArray[np.float32]
+
+STEPS = 8
+"""Of the world between two calls: actions that the trained policy executes of a chunk."""
+
+
+@dataclass
+class Calls:
+    """Of one way to call.
+
+    Attributes:
+        seconds: of each call.
+        shares: of the tokens of its new frames that were computed, by camera.
+        off: by how much its actions differ from those with all tokens, on average.
+    """
+
+    seconds: list[float] = field(default_factory=list)
+    shares: list[list[float]] = field(default_factory=list)
+    off: list[float] = field(default_factory=list)
+
+
+def pictures(sizes: Sequence[tuple[int, int]]) -> Iterator[list[Array] | None]:
+    """What both cameras see at each call ``[3, H, W]``, episode after episode; None where one begins."""
+    world, side = FetchBlocks(), max(map(max, sizes))
+    for number, task in enumerate(TASKS):
+        world.reset(number, task)
+        yield None
+        while not world.done:
+            seen = [world.view(camera, side) for camera in ("front", "wrist")]
+            yield [_middle(one, *size).astype(np.float32) / 255 for one, size in zip(seen, sizes, strict=True)]
+            for _ in range(STEPS):
+                if not world.done:
+                    world.step(act(world, task))
+
+
+def _middle(picture: npt.NDArray[np.uint8], height: int, width: int) -> npt.NDArray[np.uint8]:
+    top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
+    return np.moveaxis(picture[top : top + height, left : left + width], -1, 0)
+
+
+def measured(folder: Path, thresholds: Sequence[float], count: int) -> dict[str, Calls]:
+    """Calls of each way by its name, after the first of each episode, which computes all.
+
+    Args:
+        folder: with the artifact.
+        thresholds: of ``TokenReuse``.
+        count: calls of each way.
+    """
+    artifact = load_artifact(folder / "compiled")
+    bits, (obs, noise) = lowered(artifact), call(artifact.manifest.spec)
+    settings = {"all tokens": None, **{f"threshold {one:g}": TokenReuse(one, 10**6) for one in thresholds}}
+    plans = {name: list(plans_of(artifact, bits, COMPUTED, one).values())[-1] for name, one in settings.items()}
+    opened = {name: open_policy(artifact, seed=0, plan=plan) for name, plan in plans.items()}
+    other = Noise(np.random.default_rng(1).standard_normal(noise.initial.shape, dtype=np.float32))
+    found = {name: Calls() for name in [*plans, "other noise"]}
+    begun = False
+    for shown in pictures([obs[key].shape[-2:] for key in CAMERAS]):
+        if shown is None:
+            for policy in opened.values():
+                policy.reset()
+            begun = True
+            continue
+        obs = {**obs, **{key: one[None, None] for key, one in zip(CAMERAS, shown, strict=True)}}
+        expected: Array | None = None
+        for name, policy in opened.items():
+            actions, seconds = _timed(policy, obs, noise, plans[name])
+            expected = actions if expected is None else expected
+            if not begun:
+                found[name].seconds.append(seconds)
+                found[name].shares.append([float(one.computed.mean()) for one in policy.seen()])
+                found[name].off.append(float(np.abs(actions - expected).mean()))
+        if not begun:
+            again, _ = _timed(opened["all tokens"], obs, other, plans["all tokens"])
+            assert expected is not None
+            found["other noise"].off.append(float(np.abs(again - expected).mean()))
+        begun = False
+        if len(found["all tokens"].seconds) == count:
+            break
+    return found
+
+
+def _timed(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan: Plan) -> tuple[Array, float]:
+    """The actions, and seconds."""
+    start = time.process_time()
+    made = policy.predict_action(obs, noise=noise, plan=plan)["action"]
+    return np.asarray(made), time.process_time() - start
+
+
+@click.command(context_settings={"show_default": True})
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--thresholds", default="0.02,0.05,0.1,0.2", help="Of token reuse.")
+@click.option("--calls", default=24, type=click.IntRange(1), help="Of each way.")
+def main(folder: Path, thresholds: str, calls: int) -> None:
+    """Time calls of the policy in FOLDER."""
+    found = measured(folder, [float(one) for one in thresholds.split(",")], calls)
+    whole = statistics.median(found["all tokens"].seconds)
+    for name, one in found.items():
+        told = f"{statistics.mean(one.off):8.3f}  actions off those with all tokens"
+        if one.seconds:
+            seconds = statistics.median(one.seconds)
+            shares = ", ".join(f"{statistics.mean(own):.0%}" for own in zip(*one.shares, strict=True))
+            told += f"; {seconds:.2f} s, {seconds / whole:.2f} of all tokens"
+            told += f"; computed, by camera: {shares}" if shares else ""
+        print(f"{told}: {name}")
+
+
+if __name__ == "__main__":
+    main()
