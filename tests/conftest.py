@@ -112,14 +112,15 @@ def once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="session", autouse=True)
 def tracers(once: Once) -> Iterator[None]:
-    """Torch's tracer and its exporter are what most tests of compiled policies would wait for."""
+    """Torch's tracer, its exporter and diffusers' schedulers are what most tests of policies would wait for."""
     if importlib.util.find_spec("torch") is None:
         yield
         return
     from .capturer import captured_once
     from .exporter import exported_once
+    from .loops_once import measured_once
 
-    with captured_once(once.directory / "captures"), exported_once(once.directory / "exports"):
+    with captured_once(once.directory / "captures"), exported_once(once.directory / "exports"), measured_once():
         yield
 
 

@@ -66,15 +66,17 @@ def pictures(sizes: Sequence[tuple[int, int]]) -> Iterator[list[Array] | None]:
         yield None
         while not world.done:
             seen = [world.view(camera, side) for camera in ("front", "wrist")]
-            yield [_middle(one, *size).astype(np.float32) / 255 for one, size in zip(seen, sizes, strict=True)]
+            yield [_middle(one, *size) for one, size in zip(seen, sizes, strict=True)]
             for _ in range(STEPS):
                 if not world.done:
                     world.step(act(world, task))
 
 
-def _middle(picture: npt.NDArray[np.uint8], height: int, width: int) -> npt.NDArray[np.uint8]:
+def _middle(picture: npt.NDArray[np.uint8], height: int, width: int) -> Array:
+    """What is in the middle of a square picture, in 0..1."""
     top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
-    return np.moveaxis(picture[top : top + height, left : left + width], -1, 0)
+    cut = np.moveaxis(picture[top : top + height, left : left + width], -1, 0)
+    return np.divide(cut, 255, dtype=np.float32)
 
 
 def measured(folder: Path, thresholds: Sequence[float], count: int) -> dict[str, Calls]:

@@ -23,7 +23,9 @@ BASE = "wall-oss-flow"
 _TOKENS = 151936
 _MARKS = {"<|endoftext|>": 151643, "<|im_start|>": 151644, "<|im_end|>": 151645, "<|vision_start|>": 151652}
 _MARKS |= {"<|vision_end|>": 151653, "<|image_pad|>": 151655, "<|propri|>": 151665, "<|action|>": 151666}
-_EXPERTS = [{"hidden_size": 2048, "hidden_act": "silu", "intermediate_size": width} for width in (11008, 2048)]
+_EXPERTS: list[dict[str, Any]] = [
+    {"hidden_size": 2048, "hidden_act": "silu", "intermediate_size": width} for width in (11008, 2048)
+]
 """The feed-forward layers of words and pictures, and of actions. The second's width is an assumption: the released
 configuration could not be had here."""
 _MOE = {"mlp_moe": True, "num_experts": 2, "dim_inputs": [2048, 2048], "experts": _EXPERTS}
