@@ -3,7 +3,6 @@ import types
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -224,8 +223,11 @@ def test_other_documents(content: bytes) -> None:
 
 def test_arrays_are_read_where_numpy_has_a_type_statement_for_them() -> None:
     """numpy 2.5 on Python 3.12: the origin of ``NDArray[float32]`` is the alias, which knows what it stands for."""
-    alias = SimpleNamespace(__value__=np.ndarray[Any, Any])
-    kind = types.GenericAlias(alias, (np.float32,))  # type: ignore[arg-type]  # as Python 3.12 makes one
+
+    class Alias:
+        __value__ = np.ndarray[Any, Any]
+
+    kind = types.GenericAlias(Alias, (np.float32,))  # as Python 3.12 makes one
     found = read_as(kind | None, Value([1.0, 2.0], "a"))
     assert found.dtype == np.float32 and found.tolist() == [1.0, 2.0]
     assert read_as(kind | None, Value(None, "a")) is None

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from ..core.untrusted_json import MAX_VALUES, parse_json
 from ..errors import ArtifactError
@@ -14,8 +13,7 @@ MAX_BYTES = 64 * 2**20
 REMEDY = "The file was changed or damaged; copy the artifact again, or convert the checkpoint again."
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """A value of a parsed document together with where it stands.
 
     Attributes:

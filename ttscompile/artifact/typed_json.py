@@ -27,6 +27,14 @@ from ..ir.graph import Batch, Size, TensorType
 from .strict_json import REMEDY, Value
 
 Record = TypeVar("Record")
+Reader = Callable[[Value], Any]
+_PLAIN: Mapping[Any, Reader] = {
+    int: Value.integer,
+    float: Value.number,
+    str: Value.text,
+    bool: Value.boolean,
+    Any: lambda value: value.data,
+}
 _BATCH = re.compile(r"(?:([1-9][0-9]{0,8})\*)?B")
 
 
@@ -63,40 +71,31 @@ def from_json(kind: type[Record], value: Value) -> Record:
 
 def read_as(kind: Any, value: Value) -> Any:
     """A value of any type that a field of a record may have; see ``from_json``."""
+    return _reader(kind)(value)
+
+
+@cache
+def _reader(kind: Any) -> Reader:
+    """What reads values of a type. A manifest has a thousand, of some dozen types, so each is looked into once."""
     origin, arguments = _origin(kind), get_args(kind)
     if origin is Annotated:
-        found = read_as(arguments[0], value)
-        for rule in arguments[1:]:
-            if not rule.holds(found):
-                value.fail(rule.expected)
-        return found
+        return _held_to(arguments[1:], _reader(arguments[0]))
     if origin in (Union, types.UnionType):
-        return _read_either(arguments, value)
+        return _either(arguments)
     if origin is Literal:
-        return value.text(*arguments)
+        return lambda value: value.text(*arguments)
     if origin is np.ndarray:
-        return _array(value)
+        return _array
     if origin is tuple:
-        return _tuple(arguments, value)
+        return _tuple(arguments)
     if origin is not None and issubclass(origin, Mapping):
-        key, item = arguments
-        return {read_as(key, Value(name, value.path)): read_as(item, one) for name, one in value.members().items()}
+        return _mapping(*map(_reader, arguments))
     if kind is TensorType:
-        parts = value.keys("dtype", "shape")
-        return TensorType(tuple(map(_size, parts["shape"].items(MAX_RANK))), read_as(DType, parts["dtype"]))
+        return _tensor_type
     if isinstance(kind, enum.EnumMeta):
         members = {str(one.value): one for one in cast(type[enum.Enum], kind)}
-        return members[value.text(*members)]
-    if is_dataclass(kind):
-        return _record(kind, value)
-    plain: Mapping[Any, Callable[[], Any]] = {
-        int: value.integer,
-        float: value.number,
-        str: value.text,
-        bool: value.boolean,
-        Any: lambda: value.data,
-    }
-    return plain[kind]()
+        return lambda value: members[value.text(*members)]
+    return _record(kind) if is_dataclass(kind) else _PLAIN[kind]
 
 
 def _origin(kind: Any) -> Any:
@@ -105,40 +104,68 @@ def _origin(kind: Any) -> Any:
     return get_origin(getattr(origin, "__value__", None)) or origin
 
 
-def _record(kind: Any, value: Value) -> Any:
-    hints = _hints(kind)
-    left_out = {field.name for field in fields(kind) if field.metadata.get("omitted")} - value.members().keys()
-    members = value.keys(*(name for name in hints if name not in left_out))
-    read = {name: read_as(hints[name], member) for name, member in members.items()}
-    try:
-        return kind(**read)
-    except SpecError as error:
-        raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error
+def _held_to(rules: tuple[Any, ...], read: Reader) -> Reader:
+    def reader(value: Value) -> Any:
+        found = read(value)
+        for rule in rules:
+            if not rule.holds(found):
+                value.fail(rule.expected)
+        return found
+
+    return reader
 
 
-@cache
-def _hints(kind: type) -> dict[str, Any]:
+def _record(kind: Any) -> Reader:
     hints = get_type_hints(kind, include_extras=True)
-    return {field.name: hints[field.name] for field in fields(kind)}
+    omitted = {field.name for field in fields(kind) if field.metadata.get("omitted")}
+
+    def reader(value: Value) -> Any:
+        left_out = omitted - value.members().keys() if omitted else omitted
+        members = value.keys(*(field.name for field in fields(kind) if field.name not in left_out))
+        read = {name: read_as(hints[name], member) for name, member in members.items()}
+        try:
+            return kind(**read)
+        except SpecError as error:
+            raise ArtifactError(f"{value.path}: {error} {REMEDY}") from error
+
+    return reader
 
 
-def _read_either(kinds: tuple[Any, ...], value: Value) -> Any:
+def _mapping(key: Reader, item: Reader) -> Reader:
+    return lambda value: {key(Value(name, value.path)): item(one) for name, one in value.members().items()}
+
+
+def _either(kinds: tuple[Any, ...]) -> Reader:
     """One of several types, told apart by what JSON has: null, a list, or something else."""
-    if value.data is None and types.NoneType in kinds:
-        return None
     rest = [kind for kind in kinds if kind is not types.NoneType]
     listed = [kind for kind in rest if _origin(kind) in (tuple, np.ndarray)]
     single = [kind for kind in rest if kind not in listed]
-    return read_as((listed if listed and (isinstance(value.data, list) or not single) else single)[0], value)
+
+    def reader(value: Value) -> Any:
+        if value.data is None and types.NoneType in kinds:
+            return None
+        return read_as((listed if listed and (isinstance(value.data, list) or not single) else single)[0], value)
+
+    return reader
 
 
-def _tuple(kinds: tuple[Any, ...], value: Value) -> tuple[Any, ...]:
-    items = value.items()
+def _tuple(kinds: tuple[Any, ...]) -> Reader:
     if kinds[1:] == (...,):
-        return tuple(read_as(kinds[0], item) for item in items)
-    if len(items) != len(kinds):
-        value.fail(f"a list of {len(kinds)}")
-    return tuple(read_as(kind, item) for kind, item in zip(kinds, items, strict=True))
+        each = _reader(kinds[0])
+        return lambda value: tuple(map(each, value.items()))
+
+    def reader(value: Value) -> Any:
+        items = value.items()
+        if len(items) != len(kinds):
+            value.fail(f"a list of {len(kinds)}")
+        return tuple(map(read_as, kinds, items))
+
+    return reader
+
+
+def _tensor_type(value: Value) -> TensorType:
+    parts = value.keys("dtype", "shape")
+    return TensorType(tuple(map(_size, parts["shape"].items(MAX_RANK))), read_as(DType, parts["dtype"]))
 
 
 def _array(value: Value) -> npt.NDArray[Any]:
