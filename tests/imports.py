@@ -91,7 +91,7 @@ def _import_nodes(tree: ast.AST, eager: bool) -> Iterator[tuple[ast.Import | ast
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             yield from _import_nodes(ast.Module(node.body, []), eager=False)
             yield from _import_nodes(ast.Module(node.orelse, []), eager)
-        else:
+        elif not isinstance(node, ast.expr):  # in which nothing is imported, and which most nodes are
             inside = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
             yield from _import_nodes(node, eager and not inside)
 

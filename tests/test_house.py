@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,6 @@ from .structure import FLOORS, arrows_up, circles, doors_of, drawing
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
-GRAPH = {name: imports(name, path) for name, path in MODULES.items()}
 
 BASE = {"core", "errors", "measure"}
 """What everything may import; neither knows more than the other parts of this set."""
@@ -89,6 +89,12 @@ def part(module: str) -> str:
     return module.removeprefix("ttscompile").lstrip(".").partition(".")[0]
 
 
+@cache
+def graph() -> dict[str, list[Import]]:
+    """What each module imports."""
+    return {name: imports(name, path) for name, path in MODULES.items()}
+
+
 def direction_errors(found: list[Import], known: set[str]) -> list[str]:
     """Imports against the direction, one line each."""
     errors = []
@@ -115,13 +121,13 @@ def test_every_part_of_the_package_has_its_place_in_the_direction() -> None:
 
 
 def test_imports_go_one_way() -> None:
-    found = [each for each_module in GRAPH.values() for each in each_module]
+    found = [each for each_module in graph().values() for each in each_module]
     assert len(found) > 100, "the walk over the source found hardly anything"
     assert direction_errors(found, set(MODULES)) == []
 
 
 def test_rivals_read_what_is_listed() -> None:
-    read = {home(each.target, MODULES) for name, found in GRAPH.items() if part(name) == "rivals" for each in found}
+    read = {home(each.target, MODULES) for name, found in graph().items() if part(name) == "rivals" for each in found}
     assert read >= RIVALS_READ, "rivals read less: shorten the list"
 
 
@@ -129,7 +135,7 @@ def test_no_modules_import_each_other() -> None:
     """Not even in functions, or for types alone: what depends on each other is one module, or is cut elsewhere."""
     ahead = {
         name: {target: 1 for each in found if (target := home(each.target, MODULES)) not in (None, name)}
-        for name, found in GRAPH.items()
+        for name, found in graph().items()
     }
     assert circles(ahead) == []
 
@@ -202,7 +208,7 @@ def test_the_runtime_side_needs_nothing_of_the_compilers() -> None:
     light = [name for name in MODULES if not compiles(name)]
     assert "ttscompile.runtimes.runtime" in light
     for name in light:
-        chains = eager_closure(name, GRAPH)
+        chains = eager_closure(name, graph())
         heavy = {foreign: " -> ".join(chain) for foreign, chain in chains.items() if foreign in COMPILERS_ONLY}
         assert heavy == {}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+from functools import cache
 from pathlib import Path
 
 import click
@@ -50,7 +51,11 @@ def raised(source: str) -> list[tuple[int, str]]:
     ]
 
 
-MESSAGES = [(f"{name}:{line}", text) for name, path in modules(ROOT).items() for line, text in raised(path.read_text())]
+@cache
+def messages() -> list[tuple[str, str]]:
+    """Where each stands, and its text."""
+    found = ((name, raised(path.read_text())) for name, path in modules(ROOT).items())
+    return [(f"{name}:{line}", text) for name, own in found for line, text in own]
 
 
 def lines_of(text: str) -> int:
@@ -87,12 +92,12 @@ def exists(name: str) -> bool:
 
 
 def test_an_error_takes_at_most_three_lines() -> None:
-    assert len(MESSAGES) > 400, "the walk over the source found hardly anything"
-    assert {where: text for where, text in MESSAGES if lines_of(text) > LINES} == {}
+    assert len(messages()) > 400, "the walk over the source found hardly anything"
+    assert {where: text for where, text in messages() if lines_of(text) > LINES} == {}
 
 
 def test_an_error_names_nothing_that_does_not_exist() -> None:
-    assert {where: names for where, text in MESSAGES if (names := stale(text))} == {}
+    assert {where: names for where, text in messages() if (names := stale(text))} == {}
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@
 
 The pictures are rendered: of the arm over three blocks that the small SmolVLA of ``examples/policies/vla`` was trained
 with, one camera stands in front of it and the other hangs on its gripper. Scripted experts drive it, and a call comes
-after as many steps as that policy executes. A call with all tokens and one with those that changed take turns, of two
-computed steps. Seconds are the processor's, and all calls have one thread.
+after as many steps as that policy executes. The table is white, so much of what the gripper's camera sees stays as it
+was; with ``--patterned`` all of it is new in every call. A call with all tokens and one with those that changed take
+turns, of two computed steps. Seconds are the processor's, and all calls have one thread.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy.typing as npt
 from beside import COMPUTED
 from large_calls import lowered, plans_of
 from large_smolvla import CAMERAS, call
+from moving import picture
 
 from ttscompile import Noise, Plan
 from ttscompile.artifact.load import load_artifact
@@ -58,7 +60,7 @@ class Calls:
     off: list[float] = field(default_factory=list)
 
 
-def pictures(sizes: Sequence[tuple[int, int]]) -> Iterator[list[Array] | None]:
+def views(sizes: Sequence[tuple[int, int]]) -> Iterator[list[Array] | None]:
     """What both cameras see at each call ``[3, H, W]``, episode after episode; None where one begins."""
     world, side = FetchBlocks(), max(map(max, sizes))
     for number, task in enumerate(TASKS):
@@ -79,28 +81,32 @@ def _middle(picture: npt.NDArray[np.uint8], height: int, width: int) -> Array:
     return np.divide(cut, 255, dtype=np.float32)
 
 
-def measured(folder: Path, thresholds: Sequence[float], count: int) -> dict[str, Calls]:
+def measured(folder: Path, thresholds: Sequence[float], count: int, patterned: bool) -> dict[str, Calls]:
     """Calls of each way by its name, after the first of each episode, which computes all.
 
     Args:
         folder: with the artifact.
         thresholds: of ``TokenReuse``.
         count: calls of each way.
+        patterned: whether the second camera sees another picture in every call.
     """
     artifact = load_artifact(folder / "compiled")
     bits, (obs, noise) = lowered(artifact), call(artifact.manifest.spec)
     settings = {"all tokens": None, **{f"threshold {one:g}": TokenReuse(one, 10**6) for one in thresholds}}
     plans = {name: list(plans_of(artifact, bits, COMPUTED, one).values())[-1] for name, one in settings.items()}
     opened = {name: open_policy(artifact, seed=0, plan=plan) for name, plan in plans.items()}
-    other = Noise(np.random.default_rng(1).standard_normal(noise.initial.shape, dtype=np.float32))
+    rng = np.random.default_rng(1)
+    other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
     found = {name: Calls() for name in [*plans, "other noise"]}
     begun = False
-    for shown in pictures([obs[key].shape[-2:] for key in CAMERAS]):
+    for shown in views([obs[key].shape[-2:] for key in CAMERAS]):
         if shown is None:
             for policy in opened.values():
                 policy.reset()
             begun = True
             continue
+        if patterned:
+            shown[1] = picture(max(shown[1].shape), rng)[:, : shown[1].shape[1], : shown[1].shape[2]]
         obs = {**obs, **{key: one[None, None] for key, one in zip(CAMERAS, shown, strict=True)}}
         expected: Array | None = None
         for name, policy in opened.items():
@@ -130,10 +136,11 @@ def _timed(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan:
 @click.command(context_settings={"show_default": True})
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--thresholds", default="0.02,0.05,0.1,0.2", help="Of token reuse.")
-@click.option("--calls", default=24, type=click.IntRange(1), help="Of each way.")
-def main(folder: Path, thresholds: str, calls: int) -> None:
+@click.option("--calls", default=16, type=click.IntRange(1), help="Of each way.")
+@click.option("--patterned", is_flag=True, help="All that the gripper's camera sees is new in every call.")
+def main(folder: Path, thresholds: str, calls: int, patterned: bool) -> None:
     """Time calls of the policy in FOLDER."""
-    found = measured(folder, [float(one) for one in thresholds.split(",")], calls)
+    found = measured(folder, [float(one) for one in thresholds.split(",")], calls, patterned)
     whole = statistics.median(found["all tokens"].seconds)
     for name, one in found.items():
         told = f"{statistics.mean(one.off):8.3f}  actions off those with all tokens"
