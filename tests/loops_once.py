@@ -10,20 +10,21 @@ import pytest
 
 from ttscompile.core.spec import SamplerTable
 from ttscompile.frontends import scheduler
+from ttscompile.samplers.table import sampler_table
 
 
 @contextmanager
 def measured_once() -> Iterator[None]:
     """Keep the tables of checkpoints' schedulers; where a setting is none that JSON has, each is measured."""
-    measure, known = scheduler.sampler_table, dict[str, SamplerTable]()
+    known = dict[str, SamplerTable]()
 
     def once(own: Any, steps: int, *, step_arguments: Mapping[str, Any] | None = None, **more: Any) -> SamplerTable:
         given = [*own.config.items(), *(step_arguments or {}).items(), *more.items()]
         if not all(isinstance(value, bool | int | float | str | list | tuple | None) for _, value in given):
-            return measure(own, steps, step_arguments=step_arguments, **more)
+            return sampler_table(own, steps, step_arguments=step_arguments, **more)
         key = repr((type(own), steps, sorted(given, key=repr), step_arguments is None))
         if key not in known:
-            known[key] = measure(own, steps, step_arguments=step_arguments, **more)
+            known[key] = sampler_table(own, steps, step_arguments=step_arguments, **more)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -16,8 +16,8 @@
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
-four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1 and
-wall_x, whose originals are timed before, they are three.
+four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1, wall_x
+and pi05, whose originals are timed before, they are three.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ WHOLE = {
 }
 """Policies that are compiled from what is saved of them, in place of the transformer; LeRobot's are whole."""
 
-ALONE = ("eo1", "wall_x")
+ALONE = ("eo1", "wall_x", "pi05")
 """Of these the original is timed before, in a process of its own: 24 GiB do not hold it and the artifact in fp32."""
 
 TOLD = ("evo1", "eo1", "wall_x", "groot", "vla_jepa")
