@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from beside import COMPUTED
 from large_calls import lowered, plans_of
-from large_smolvla import CAMERAS, call
+from large_smolvla import call
 from moving import picture
 
 from ttscompile import Noise, Plan
@@ -32,12 +32,6 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.core.plan import TokenReuse
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
-
-sys.path.insert(1, str(Path(__file__).parents[1] / "evaluation"))
-sys.path.insert(2, str(Path(__file__).parents[1] / "policies" / "vla"))
-
-from environments.fetch_blocks import TASKS, FetchBlocks
-from experts import act
 
 Array = npt.NDArray[np.float32]
 
@@ -62,6 +56,11 @@ class Calls:
 
 def views(sizes: Sequence[tuple[int, int]]) -> Iterator[list[Array] | None]:
     """What both cameras see at each call ``[3, H, W]``, episode after episode; None where one begins."""
+    sys.path.insert(1, str(Path(__file__).parents[1] / "evaluation"))
+    sys.path.insert(2, str(Path(__file__).parents[1] / "policies" / "vla"))
+    from environments.fetch_blocks import TASKS, FetchBlocks
+    from experts import act
+
     world, side = FetchBlocks(), max(map(max, sizes))
     for number, task in enumerate(TASKS):
         world.reset(number, task)
@@ -92,6 +91,7 @@ def measured(folder: Path, thresholds: Sequence[float], count: int, patterned: b
     """
     artifact = load_artifact(folder / "compiled")
     bits, (obs, noise) = lowered(artifact), call(artifact.manifest.spec)
+    cameras = [key for key, one in artifact.manifest.spec.observations.items() if one.image]
     settings = {"all tokens": None, **{f"threshold {one:g}": TokenReuse(one, 10**6) for one in thresholds}}
     plans = {name: list(plans_of(artifact, bits, COMPUTED, one).values())[-1] for name, one in settings.items()}
     opened = {name: open_policy(artifact, seed=0, plan=plan) for name, plan in plans.items()}
@@ -99,7 +99,7 @@ def measured(folder: Path, thresholds: Sequence[float], count: int, patterned: b
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
     found = {name: Calls() for name in [*plans, "other noise"]}
     begun = False
-    for shown in views([obs[key].shape[-2:] for key in CAMERAS]):
+    for shown in views([obs[key].shape[-2:] for key in cameras]):
         if shown is None:
             for policy in opened.values():
                 policy.reset()
@@ -107,7 +107,8 @@ def measured(folder: Path, thresholds: Sequence[float], count: int, patterned: b
             continue
         if patterned:
             shown[1] = picture(max(shown[1].shape), rng)[:, : shown[1].shape[1], : shown[1].shape[2]]
-        obs = {**obs, **{key: one[None, None] for key, one in zip(CAMERAS, shown, strict=True)}}
+        for key, one in zip(cameras, shown, strict=True):
+            obs[key] = np.stack([one] * obs[key].shape[1])[None]
         expected: Array | None = None
         for name, policy in opened.items():
             actions, seconds = _timed(policy, obs, noise, plans[name])

@@ -23,13 +23,9 @@ BASE = "wall-oss-flow"
 _TOKENS = 151936
 _MARKS = {"<|endoftext|>": 151643, "<|im_start|>": 151644, "<|im_end|>": 151645, "<|vision_start|>": 151652}
 _MARKS |= {"<|vision_end|>": 151653, "<|image_pad|>": 151655, "<|propri|>": 151665, "<|action|>": 151666}
-_EXPERTS: list[dict[str, Any]] = [
-    {"hidden_size": 2048, "hidden_act": "silu", "intermediate_size": width} for width in (11008, 2048)
-]
-"""The feed-forward layers of words and pictures, and of actions. The second's width is an assumption: the released
-configuration could not be had here."""
-_MOE = {"mlp_moe": True, "num_experts": 2, "dim_inputs": [2048, 2048], "experts": _EXPERTS}
-MODEL: dict[str, Any] = {**QWEN, "text_config": {**QWEN["text_config"], **_MOE}}
+EXPERT = 2048
+"""Width inside the feed-forward layers of actions, which is an assumption: the released configuration could not be had
+here. Those of words and pictures are Qwen's."""
 _PADDED, _HORIZON = 20, 32
 """Numbers of a state and of an action, and actions of a chunk: lerobot's own."""
 _SAVED = (
@@ -41,12 +37,21 @@ _SAVED = (
 )
 
 
+def model() -> dict[str, Any]:
+    """What the base's ``config.json`` has."""
+    text: dict[str, Any] = QWEN["text_config"]
+    width, sizes = text["hidden_size"], (text["intermediate_size"], EXPERT)
+    experts = [{"hidden_size": width, "hidden_act": "silu", "intermediate_size": each} for each in sizes]
+    own = {"mlp_moe": True, "num_experts": 2, "dim_inputs": [width, width], "experts": experts}
+    return {**QWEN, "text_config": {**text, **own}}
+
+
 def save(directory: Path) -> None:
     """What lerobot's ``save_pretrained`` writes of a wall_x with its default configuration, most in bf16."""
     base = directory.parent / BASE
     for each in (directory, base):
         each.mkdir(parents=True, exist_ok=True)
-    write_json(base / "config.json", MODEL)
+    write_json(base / "config.json", model())
     colours = {"image_mean": list(MEAN), "image_std": list(DEVIATION), "patch_size": 14, "merge_size": 2}
     write_json(base / "preprocessor_config.json", colours)
     save_letters(base, _MARKS, _TOKENS)
@@ -64,8 +69,8 @@ def save(directory: Path) -> None:
     write_processors(directory)
     path = directory / "policy_preprocessor.json"
     write_json(path, {"steps": [{"registry_name": SENTENCE, "config": {}}, *read_json(path)["steps"]]})
-    shared, language = read_vla_config(directory, entries, AS_SAVED), read_qwen25(Settings(MODEL, ""))
-    expert = replace(language.text, hidden=_EXPERTS[1]["intermediate_size"])
+    shared, language = read_vla_config(directory, entries, AS_SAVED), read_qwen25(Settings(model(), ""))
+    expert = replace(language.text, hidden=EXPERT)
     config = WallXConfig(language, expert, shared.state_dim, _PADDED, shared.action_dim, _PADDED)
     with torch.device("meta"):
         shapes = {f"model.{_saved(name)}": each.shape for name, each in WallX(config, ()).state_dict().items()}

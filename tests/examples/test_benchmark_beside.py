@@ -2,11 +2,12 @@
 
 import ctypes
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import beside
+import in_motion
 import numpy as np
 import onnx
 import pytest
@@ -63,6 +64,28 @@ def test_everybody_sees_new_pictures_and_is_told_beside_the_first(
     assert list(off) == (["late", "dense, int8"] if fp32 else [])
     if fp32:
         assert off["late"] < 1e-6 < off["dense, int8"]
+
+
+def test_of_a_camera_that_moves_all_is_computed_and_of_a_still_one_what_changed(
+    once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
+
+    def views(sizes: list[tuple[int, int]]) -> Iterator[list[Array] | None]:
+        yield None
+        for seen in (0.0, 0.4, 0.8):
+            front, gripper = (np.full((3, *size), seen, np.float32) for size in sizes)
+            front[:, 1:] = 0.5  # all but its first row of pixels stands still
+            yield [front, gripper]
+
+    monkeypatch.setattr(in_motion, "views", views)
+    found = in_motion.measured(tmp_path, [0.01], count=2, patterned=False)
+    assert list(found) == ["all tokens", "threshold 0.01", "other noise"]
+    assert found["all tokens"].shares == [[], []] and found["all tokens"].off == [0, 0]
+    assert all(0 < still <= 0.5 and moves == 1 for still, moves in found["threshold 0.01"].shares)
+    assert max(found["threshold 0.01"].off) < min(found["other noise"].off)
+    patterned = in_motion.measured(tmp_path, [0.01], count=2, patterned=True)
+    assert all(moves == 1 for _, moves in patterned["threshold 0.01"].shares)
 
 
 def test_medians_are_of_the_calls_that_count() -> None:

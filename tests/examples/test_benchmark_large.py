@@ -10,6 +10,7 @@ import large_octo
 import large_pi0
 import large_qwen3_vl
 import large_smolvla
+import large_wall_x
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -38,6 +39,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     rope = {"rope_type": "default", "mrope_section": [2, 2, 2]}
     monkeypatch.setitem(inside, "text_config", {**inside["text_config"], **text, "rope_parameters": rope})
     monkeypatch.setitem(inside, "vision_config", vision)
+    monkeypatch.setattr(large_wall_x, "EXPERT", 16)
     both: dict[str, Any] = {"layers": 2, "heads": 2, "channels": 8, "hidden": 24}
     monkeypatch.setattr(large_pi0, "GEMMA", replace(large_pi0.GEMMA, width=24, **both))
     monkeypatch.setattr(large_pi0, "EXPERT", replace(large_pi0.EXPERT, width=16, **both))
@@ -57,7 +59,14 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("name", "shape"),
-    [("vla_jepa", (1, 7, 6)), ("eo1", (1, 8, 32)), ("pi0", (1, 50, 32)), ("pi05", (1, 50, 32)), ("octo", (1, 4, 7))],
+    [
+        ("vla_jepa", (1, 7, 6)),
+        ("eo1", (1, 8, 32)),
+        ("wall_x", (1, 32, 20)),
+        ("pi0", (1, 50, 32)),
+        ("pi05", (1, 50, 32)),
+        ("octo", (1, 4, 7)),
+    ],
 )
 def test_what_is_written_is_read(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
     directory, task = large.saved(tmp_path, name)

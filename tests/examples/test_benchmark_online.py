@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import online
@@ -11,9 +12,11 @@ from click.testing import CliRunner
 
 
 @pytest.fixture(scope="module")
-def arguments(compiled: Path, recording: Path) -> list[str]:
+def arguments(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Of a copy, since a search keeps its state in the artifact's folder."""
+    copy = shutil.copytree(compiled, tmp_path_factory.mktemp("searched") / "compiled")
     limits = ["--calls", "6", "--learned-calls", "12", "--rounds", "2"]
-    return [str(compiled), "-t", str(recording), "--sparsities", "0.5,0.8", *limits]
+    return [str(copy), "-t", str(recording), "--sparsities", "0.5,0.8", *limits]
 
 
 @pytest.mark.slow

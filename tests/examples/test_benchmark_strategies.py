@@ -1,6 +1,7 @@
 """The script that compares strategies: what it prints, and what it refuses; and the one of calls in a row."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from ttscompile.artifact.load import load_artifact
 
 
 @pytest.fixture(scope="module")
-def arguments(compiled: Path, recording: Path) -> list[str]:
-    return [str(compiled), "-t", str(recording), "--calls", "2"]
+def arguments(compiled: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Of a copy, since a search keeps its state in the artifact's folder."""
+    copy = shutil.copytree(compiled, tmp_path_factory.mktemp("searched") / "compiled")
+    return [str(copy), "-t", str(recording), "--calls", "2"]
 
 
 def run(*words: str) -> Any:
