@@ -27,13 +27,13 @@ kept gets its new rows where it is."""
 Lane: TypeAlias = bytes
 """One camera of one stream."""
 
-PARTS = (8, 4, 2)
-"""A frame is computed for an eighth, a quarter or half of its tokens, or for all: few shapes, each with its memory."""
+EIGHTHS = (1, 2, 3, 4, 6)
+"""A frame is computed for so many eighths of its tokens, or for all: few shapes, so that one was met before."""
 
 
 def sizes_of(tokens: int) -> tuple[int, ...]:
     """For how many of a tower's tokens a frame may be computed, ascending."""
-    return (*(-(-tokens // part) for part in PARTS), tokens)
+    return (*(-(-tokens * count // 8) for count in EIGHTHS), tokens)
 
 
 @dataclass(frozen=True)

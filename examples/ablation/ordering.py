@@ -30,7 +30,6 @@ from ttscompile.cli.output import print_json, results_console, run, say, table
 from ttscompile.cli.sections import SectionedCommand, Sources, trajectories_options
 from ttscompile.core.coercion import integer
 from ttscompile.errors import CalibrationError
-from ttscompile.runtimes.tokens import sizes_of
 from ttscompile.trajectories.episodes import Episode
 
 Errors = npt.NDArray[np.float64]
@@ -148,7 +147,7 @@ def ordering(
         torch.cat([one[2] for one in told]),
         seed,
     )
-    judging, sizes = Chains(policy, number, others, seed), sizes_of(policy.tower.tokens)[:-1]
+    judging, sizes = Chains(policy, number, others, seed), [-(-policy.tower.tokens // part) for part in (8, 4, 2)]
     unit, rows = judging.other_noise(seed), []
     asked = [(size, way) for size in sizes for way in dict.fromkeys([FIRST, *ways])]
     errors = dict[tuple[int, str], Errors]()

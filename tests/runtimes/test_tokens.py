@@ -95,15 +95,15 @@ def computed_literally(artifact: Artifact, changes: tuple[int, ...]) -> list[int
 
 def test_what_it_gives_is_what_the_tokens_literally_give(artifact: Artifact) -> None:
     seen = computed_literally(artifact, (0, 3, 12, 1, 6, 30, 0, 17, 2))
-    # A frame is computed for an eighth, a quarter, half or all of its tokens; every sixth new frame for all.
-    assert seen == [37, 5, 19, 5, 10, 37, 0, 19, 5]
-    assert sizes_of(37) == (5, 10, 19, 37)
+    # A frame is computed for one, two, three, four, six or all eighths of its tokens; every sixth new frame for all.
+    assert seen == [37, 5, 14, 5, 10, 37, 0, 19, 5]
+    assert sizes_of(37) == (5, 10, 14, 19, 28, 37)
 
 
 def test_a_tower_of_windows_has_masks_that_go_with_its_tokens(tmp_path: Path) -> None:
     ttscompile.compile_denoiser(*cameras.policy("windows"), tmp_path / "artifact", precision="int8")
     artifact = load_artifact(tmp_path / "artifact")
-    assert computed_literally(artifact, (0, 3, 12, 1, 0, 30, 2)) == [36, 5, 18, 5, 0, 36, 5]
+    assert computed_literally(artifact, (0, 3, 12, 1, 0, 30, 2)) == [36, 5, 14, 5, 0, 36, 5]
     reused = replace(artifact.plan("dense@int8"), tokens=REUSE)
     some, whole = (open_policy(artifact, seed=0, plan=each) for each in (reused, replace(reused, tokens=None)))
     first, other = frame((picture(1), picture(2))), frame((moved(picture(1), 3), picture(2)))
