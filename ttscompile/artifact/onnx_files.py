@@ -81,14 +81,17 @@ def _places(
         raise ValueError("messages too deep in each other")
     fields, entries, parts = _FIELDS[kind], dict[str, str](), _read(message, left)
     if kind == "node":
-        names, domains = ({str(value, "utf-8") for number, value in parts if number == one} for one in _OF_NODE)
+        parts = iter(known := list(parts))
+        names, domains = ({bytes(v).decode() for n, v in known if n == one and v is not None} for one in _OF_NODE)
         _require_known(names, domains, scanned)
         scanned = scanned or SCAN in names
     for number, value in parts:
+        if value is None:
+            continue
         if number in fields:
             yield from _places(value, fields[number], depth + 1, left, scanned)
         elif kind == "tensor" and number == _EXTERNAL_DATA:
-            texts = {n: str(text, "utf-8") for n, text in _read(value, left)}
+            texts = {n: bytes(v).decode() for n, v in _read(value, left) if v is not None}
             if texts.get(1, "") in entries:
                 raise ValueError("an entry twice")
             entries[texts.get(1, "")] = texts.get(2, "")
@@ -115,36 +118,32 @@ def _fits(place: Mapping[str, str], files: Mapping[str, FileRecord]) -> bool:
     return int(offset) + int(length) <= files[location].bytes
 
 
-def _read(message: memoryview, left: Iterator[int]) -> list[tuple[int, memoryview]]:
-    """Number and content of each field that is no number itself."""
-    position, end, found = 0, len(message), list[tuple[int, memoryview]]()
+def _read(message: memoryview, left: Iterator[int]) -> Iterator[tuple[int, memoryview | None]]:
+    """Number and content of each field; None for numbers."""
+    position, end = 0, len(message)
     while position < end:
         if next(left, None) is None:
             raise ValueError(f"more than {MAX_FIELDS:,} fields in the models of one artifact")
-        # Nearly all numbers have one byte, and a policy's models tens of thousands of numbers: that one is read here.
-        key, position = message[position], position + 1
-        if key & 0x80:
-            key, position = _varint(message, position - 1)
+        key, position = _varint(message, position)
         number, wire = key >> 3, key & 7
         if number == 0:
             raise ValueError("a field without a number")
         if wire == _BYTES:
-            size, position = message[position], position + 1
-            if size & 0x80:
-                size, position = _varint(message, position - 1)
+            size, position = _varint(message, position)
             if size > end - position:
                 raise ValueError("a field beyond the message's end")
-            found.append((number, message[position : position + size]))
+            yield number, message[position : position + size]
             position += size
-        elif wire == _VARINT:
-            position = position + 1 if message[position] < 0x80 else _varint(message, position)[1]
+            continue
+        if wire == _VARINT:
+            _, position = _varint(message, position)
         elif wire in (_FIXED64, _FIXED32):
             position += 8 if wire == _FIXED64 else 4
         else:
             raise ValueError("a group, which onnx does not use")
+        yield number, None
     if position != end:
         raise ValueError("a field beyond the message's end")
-    return found
 
 
 def _varint(message: memoryview, position: int) -> tuple[int, int]:

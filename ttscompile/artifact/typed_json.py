@@ -28,6 +28,7 @@ from .strict_json import REMEDY, Value
 
 Record = TypeVar("Record")
 Reader = Callable[[Value], Any]
+"""Makes of a JSON value what it says, of one type; raises ArtifactError where it is of another."""
 _PLAIN: Mapping[Any, Reader] = {
     int: Value.integer,
     float: Value.number,
