@@ -59,6 +59,16 @@ def pytest_configure(config: pytest.Config) -> None:
         torch.set_warn_always(True)  # a warning that is given once is an error of whichever test comes first
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Where pytest listens to logs, it hears warnings: torch's tracer tells a page a test at lower levels.
+
+    The entry ``log_level`` would say so, but it is unknown where ``make test`` leaves the plugin out.
+    """
+    if (logs := session.config.pluginmanager.get_plugin("logging-plugin")) is not None:
+        for handler in (logs.caplog_handler, logs.report_handler):
+            handler.setLevel(logging.WARNING)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """What is imported stays: Python need not look through it for garbage again, which takes a tenth of a run."""
