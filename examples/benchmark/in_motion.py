@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 
 import click
@@ -25,7 +26,7 @@ import numpy.typing as npt
 from beside import COMPUTED
 from large_calls import lowered, plans_of
 from large_smolvla import call
-from moving import picture
+from moving import backgrounds
 
 from ttscompile import Noise, Plan
 from ttscompile.artifact.load import load_artifact
@@ -34,6 +35,8 @@ from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 
 Array = npt.NDArray[np.float32]
+
+WHOLE, OTHER = "all tokens", "all tokens, other noise"
 
 STEPS = 8
 """Of the world between two calls: actions that the trained policy executes of a chunk."""
@@ -54,75 +57,74 @@ class Calls:
     off: list[float] = field(default_factory=list)
 
 
-def views(sizes: Sequence[tuple[int, int]]) -> Iterator[list[Array] | None]:
-    """What both cameras see at each call ``[3, H, W]``, episode after episode; None where one begins."""
+def views(sizes: Sequence[tuple[int, int]]) -> Iterator[tuple[bool, list[Array]]]:
+    """Of each call whether it is the first of an episode, and what both cameras see, ``[3, H, W]`` in 0..1.
+
+    Args:
+        sizes: height and width of the pictures of each camera.
+    """
     sys.path.insert(1, str(Path(__file__).parents[1] / "evaluation"))
     sys.path.insert(2, str(Path(__file__).parents[1] / "policies" / "vla"))
-    from environments.fetch_blocks import TASKS, FetchBlocks
+    from environments.fetch_blocks import FetchBlocks
     from experts import act
 
     world, side = FetchBlocks(), max(map(max, sizes))
-    for number, task in enumerate(TASKS):
-        world.reset(number, task)
-        yield None
+    for seed in count():
+        world.reset(seed)
+        first = True
         while not world.done:
             seen = [world.view(camera, side) for camera in ("front", "wrist")]
-            yield [_middle(one, *size) for one, size in zip(seen, sizes, strict=True)]
+            yield first, [_middle(one, *size) for one, size in zip(seen, sizes, strict=True)]
+            first = False
             for _ in range(STEPS):
                 if not world.done:
-                    world.step(act(world, task))
+                    world.step(act(world, world.task))
 
 
-def _middle(picture: npt.NDArray[np.uint8], height: int, width: int) -> Array:
-    """What is in the middle of a square picture, in 0..1."""
-    top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
-    cut = np.moveaxis(picture[top : top + height, left : left + width], -1, 0)
+def _middle(square: npt.NDArray[np.uint8], height: int, width: int) -> Array:
+    """What is in the middle of a picture, in 0..1."""
+    top, left = (len(square) - height) // 2, (len(square) - width) // 2
+    cut = np.moveaxis(square[top : top + height, left : left + width], -1, 0)
     return np.divide(cut, 255, dtype=np.float32)
 
 
-def measured(folder: Path, thresholds: Sequence[float], count: int, patterned: bool) -> dict[str, Calls]:
-    """Calls of each way by its name, after the first of each episode, which computes all.
+def measured(folder: Path, thresholds: Sequence[float], calls: int, patterned: bool) -> dict[str, Calls]:
+    """Calls of each way by its name, but for the first of each episode, which computes all.
 
     Args:
         folder: with the artifact.
         thresholds: of ``TokenReuse``.
-        count: calls of each way.
+        calls: of each way.
         patterned: whether the second camera sees another picture in every call.
     """
     artifact = load_artifact(folder / "compiled")
     bits, (obs, noise) = lowered(artifact), call(artifact.manifest.spec)
     cameras = [key for key, one in artifact.manifest.spec.observations.items() if one.image]
-    settings = {"all tokens": None, **{f"threshold {one:g}": TokenReuse(one, 10**6) for one in thresholds}}
+    settings = {WHOLE: None, **{f"threshold {one:g}": TokenReuse(one, 10**6) for one in thresholds}}
     plans = {name: list(plans_of(artifact, bits, COMPUTED, one).values())[-1] for name, one in settings.items()}
     opened = {name: open_policy(artifact, seed=0, plan=plan) for name, plan in plans.items()}
     rng = np.random.default_rng(1)
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
-    found = {name: Calls() for name in [*plans, "other noise"]}
-    begun = False
-    for shown in views([obs[key].shape[-2:] for key in cameras]):
-        if shown is None:
+    found = {name: Calls() for name in [*plans, OTHER]}
+    for first, shown in views([obs[key].shape[-2:] for key in cameras]):
+        seen = dict(zip(cameras, shown, strict=True))
+        if patterned:
+            seen |= backgrounds({cameras[1]: obs[cameras[1]]}, rng)
+        for key, one in seen.items():
+            obs[key] = np.stack([one] * obs[key].shape[1])[None]
+        if first:
             for policy in opened.values():
                 policy.reset()
-            begun = True
+        made = {name: _timed(policy, obs, noise, plans[name]) for name, policy in opened.items()}
+        if first:
             continue
-        if patterned:
-            shown[1] = picture(max(shown[1].shape), rng)[:, : shown[1].shape[1], : shown[1].shape[2]]
-        for key, one in zip(cameras, shown, strict=True):
-            obs[key] = np.stack([one] * obs[key].shape[1])[None]
-        expected: Array | None = None
-        for name, policy in opened.items():
-            actions, seconds = _timed(policy, obs, noise, plans[name])
-            expected = actions if expected is None else expected
-            if not begun:
-                found[name].seconds.append(seconds)
-                found[name].shares.append([float(one.computed.mean()) for one in policy.seen()])
-                found[name].off.append(float(np.abs(actions - expected).mean()))
-        if not begun:
-            again, _ = _timed(opened["all tokens"], obs, other, plans["all tokens"])
-            assert expected is not None
-            found["other noise"].off.append(float(np.abs(again - expected).mean()))
-        begun = False
-        if len(found["all tokens"].seconds) == count:
+        made[OTHER] = _timed(opened[WHOLE], obs, other, plans[WHOLE])
+        for name, (actions, seconds) in made.items():
+            found[name].off.append(float(np.abs(actions - made[WHOLE][0]).mean()))
+            found[name].seconds.append(seconds)
+            if name in settings:
+                found[name].shares.append([float(one.computed.mean()) for one in opened[name].seen()])
+        if len(found[WHOLE].seconds) == calls:
             break
     return found
 
@@ -142,15 +144,13 @@ def _timed(policy: CompiledPolicy, obs: Mapping[str, Array], noise: Noise, plan:
 def main(folder: Path, thresholds: str, calls: int, patterned: bool) -> None:
     """Time calls of the policy in FOLDER."""
     found = measured(folder, [float(one) for one in thresholds.split(",")], calls, patterned)
-    whole = statistics.median(found["all tokens"].seconds)
+    whole = statistics.median(found[WHOLE].seconds)
     for name, one in found.items():
-        told = f"{statistics.mean(one.off):8.3f}  actions off those with all tokens"
-        if one.seconds:
-            seconds = statistics.median(one.seconds)
-            shares = ", ".join(f"{statistics.mean(own):.0%}" for own in zip(*one.shares, strict=True))
-            told += f"; {seconds:.2f} s, {seconds / whole:.2f} of all tokens"
-            told += f"; computed, by camera: {shares}" if shares else ""
-        print(f"{told}: {name}")
+        seconds = statistics.median(one.seconds)
+        shares = ", ".join(f"{statistics.mean(own):.0%}" for own in zip(*one.shares, strict=True))
+        computed = f"; computed, by camera: {shares}" if shares else ""
+        off = f"{statistics.mean(one.off):8.3f}  actions off those with all tokens"
+        print(f"{off}; {seconds:.2f} s, {seconds / whole:.2f} of theirs{computed}: {name}")
 
 
 if __name__ == "__main__":

@@ -71,20 +71,19 @@ def test_of_a_camera_that_moves_all_is_computed_and_of_a_still_one_what_changed(
 ) -> None:
     (tmp_path / "compiled").symlink_to(cameras.compiled_tokens(once) / "artifact")
 
-    def views(sizes: list[tuple[int, int]]) -> Iterator[list[Array] | None]:
-        yield None
+    def views(sizes: list[tuple[int, int]]) -> Iterator[tuple[bool, list[Array]]]:
         for seen in (0.0, 0.4, 0.8):
             front, gripper = (np.full((3, *size), seen, np.float32) for size in sizes)
             front[:, 1:] = 0.5  # all but its first row of pixels stands still
-            yield [front, gripper]
+            yield seen == 0, [front, gripper]
 
     monkeypatch.setattr(in_motion, "views", views)
-    found = in_motion.measured(tmp_path, [0.01], count=2, patterned=False)
-    assert list(found) == ["all tokens", "threshold 0.01", "other noise"]
-    assert found["all tokens"].shares == [[], []] and found["all tokens"].off == [0, 0]
+    found = in_motion.measured(tmp_path, [0.01], calls=2, patterned=False)
+    assert list(found) == [in_motion.WHOLE, "threshold 0.01", in_motion.OTHER]
+    assert found[in_motion.WHOLE].shares == [[], []] and found[in_motion.WHOLE].off == [0, 0]
     assert all(0 < still <= 0.5 and moves == 1 for still, moves in found["threshold 0.01"].shares)
-    assert max(found["threshold 0.01"].off) < min(found["other noise"].off)
-    patterned = in_motion.measured(tmp_path, [0.01], count=2, patterned=True)
+    assert max(found["threshold 0.01"].off) < min(found[in_motion.OTHER].off)
+    patterned = in_motion.measured(tmp_path, [0.01], calls=2, patterned=True)
     assert all(moves == 1 for _, moves in patterned["threshold 0.01"].shares)
 
 
