@@ -48,6 +48,8 @@ WAYS = {
     "merged": "importance; the others from a similar one that is computed",
     "effect": "the effect in this very call, after the fact",
 }
+EIGHTHS = (1, 2, 4)
+"""Of a frame's tokens are computed."""
 FIRST = "difference"
 """The way that others are held against."""
 
@@ -75,7 +77,7 @@ class Ordering:
     """What was found.
 
     Attributes:
-        rows: of all ways for an eighth of the tokens, then for a quarter, then for half.
+        rows: of all ways, for each number of tokens.
         tokens: of a frame.
         stretches: of ``CALLS`` calls that orders were learned on, and that were judged.
         flops: of the head for a frame, as a share of the prologue's.
@@ -94,6 +96,7 @@ def ordering(
     *,
     observation: Sources | None = None,
     ways: Sequence[str] = tuple(WAYS),
+    eighths: Sequence[int] = EIGHTHS,
     learned: int = 160,
     judged: int = 64,
     seed: int = 0,
@@ -106,6 +109,7 @@ def ordering(
         camera: the observation whose tokens are chosen.
         observation: see ``ttscompile.calibrate``.
         ways: some of ``WAYS``, beside today's.
+        eighths: for how many of these of its tokens a frame is computed.
         learned: stretches of calls that are learned from, at most.
         judged: those of other episodes, at most.
         seed: of the division of the episodes, the noise and the head.
@@ -147,7 +151,7 @@ def ordering(
         torch.cat([one[2] for one in told]),
         seed,
     )
-    judging, sizes = Chains(policy, number, others, seed), [-(-policy.tower.tokens // part) for part in (8, 4, 2)]
+    judging, sizes = Chains(policy, number, others, seed), [-(-policy.tower.tokens * one // 8) for one in eighths]
     unit, rows = judging.other_noise(seed), []
     asked = [(size, way) for size in sizes for way in dict.fromkeys([FIRST, *ways])]
     errors = dict[tuple[int, str], Errors]()
@@ -175,6 +179,7 @@ def _row(way: str, size: int, errors: Errors, today: Errors, episodes: npt.NDArr
 @trajectories_options()
 @click.option("--camera", required=True, help="The observation whose tokens are chosen.")
 @click.option("--ways", default=",".join(WAYS), help="Of choosing tokens; some of these.")
+@click.option("--eighths", default=",".join(map(str, EIGHTHS)), help="Of a frame's tokens that are computed.")
 @click.option("--learned", default=160, help="Stretches of calls to learn from, at most.")
 @click.option("--judged", default=64, help="Those of other episodes, to judge on, at most.")
 @click.option("--seed", default=0, help="Of the division of the episodes, the noise and the head.")
@@ -185,6 +190,7 @@ def main(
     sources: Sources,
     camera: str,
     ways: str,
+    eighths: str,
     learned: int,
     judged: int,
     seed: int,
@@ -194,7 +200,10 @@ def main(
     asked = ways.split(",")
     if unknown := set(asked) - set(WAYS):
         raise click.BadParameter(f"expected some of {', '.join(WAYS)}; found {', '.join(sorted(unknown))}.")
-    sizes: dict[str, Any] = {"learned": learned, "judged": judged, "seed": seed}
+    counts = [int(one) for one in eighths.split(",") if one in "1234567"]
+    if len(counts) != len(eighths.split(",")):
+        raise click.BadParameter(f"expected numbers from 1 to 7; found {eighths!r}.", param_hint="--eighths")
+    sizes: dict[str, Any] = {"eighths": counts, "learned": learned, "judged": judged, "seed": seed}
     with Bar(shown=True) as bar:
         found = ordering(directory, trajectories, camera, observation=sources, ways=asked, **sizes, progress=bar.tell)
     if as_json:

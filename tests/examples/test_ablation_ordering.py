@@ -154,15 +154,29 @@ def test_what_it_prints(found: Ordering, folder: Path, recording: Path, monkeypa
         return found
 
     monkeypatch.setattr(ordering, "ordering", measured)
-    asked = [str(folder), "-t", str(recording), "--camera", CAMERA, "--ways", "head,merged", "--judged", "3"]
+    asked = [
+        str(folder),
+        "-t",
+        str(recording),
+        "--camera",
+        CAMERA,
+        "--ways",
+        "head,merged",
+        "--judged",
+        "3",
+        "--eighths",
+        "1,6",
+    ]
     result = CliRunner().invoke(ordering.main, asked, catch_exceptions=False)
     assert result.exit_code == 0 and told["ways"] == ["head", "merged"]
-    assert (told["camera"], told["judged"]) == (CAMERA, 3)
+    assert (told["camera"], told["judged"], told["eighths"]) == (CAMERA, 3, [1, 6])
     printed = " ".join(result.stdout.split())
     assert "5 of 37" in printed and "the last 2 of 3 consecutive calls" in printed and CALLS == 3
     assert '"rows"' in CliRunner().invoke(ordering.main, [*asked, "--json"], catch_exceptions=False).stdout
     refused = CliRunner().invoke(ordering.main, [*asked, "--ways", "luck"])
     assert refused.exit_code == 2 and "found luck" in refused.output
+    refused = CliRunner().invoke(ordering.main, [*asked, "--eighths", "2,8"])
+    assert refused.exit_code == 2 and "numbers from 1 to 7; found '2,8'" in refused.output
 
 
 def test_what_cannot_be_measured_is_refused(once: Once, folder: Path, recording: Path, tmp_path: Path) -> None:
