@@ -9,7 +9,17 @@ import torch
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
-from ttscompile.ir.pieces import INDEX, PIXELS, frame_name, pixels_name, renewed_name, tokens_name
+from ttscompile.ir.pieces import (
+    INDEX,
+    NOT_KEPT,
+    PIXELS,
+    PLACES,
+    ROWS,
+    frame_name,
+    pixels_name,
+    renewed_name,
+    tokens_name,
+)
 from ttscompile.ir.program import Program
 from ttscompile.ir.tokens import ATTENTION, TokenStream, find_tokens
 
@@ -32,16 +42,18 @@ class ReuseTokens(Pass[Program, Program]):
     After, beside it; in ``tokens_00`` there is one row, and B is the number of tokens::
 
         pixels_00 : %row -> %pixels                       # what patches are cut from
-        tokens_00 : %pixels, %index : [B], %k.kept : [17, 1, 128] -> %feature, %k.kept.new : [17, 1, 128]
+        tokens_00 : %pixels, %index : [B], %places, %rows : [2*B], %k.kept : [17, 1, 128]
+                    -> %feature, %k.kept.new : [17, 1, 128]
             %tokens.changed : [1, B, 128] = aten.index_select.default(%tokens, 1, %index)
             %k.changed      : [1, B, 128] = aten.linear.default(%normed.changed, ...)
-            %k.kept.new     = %k.kept with %k.changed in the rows %index
+            %k.kept.new     = %k.kept with the rows %rows of %k.changed at %places
             %k              = %k.kept.new
 
     A value has a row for each token as long as nothing but attention brings tokens together. What attention reads of
-    all tokens, and what follows after the last layer, is kept from frame to frame, and written anew for the tokens in
-    ``index``. Nothing else reads what was kept, so a runtime may have it written where it is. With all tokens it is the
-    tower. Which token is of which patch is found on numbers.
+    all tokens, and what follows after the last layer, is kept from frame to frame. Tokens in ``index`` are computed,
+    and their rows are written to ``places``: their own, and as many more. Nothing else reads what was kept, so a
+    runtime may have it written where it is. With all tokens it is the tower. Which token is of which patch is found on
+    numbers.
     """
 
     def call(self, program: Program) -> PassResult[Program]:
@@ -56,7 +68,7 @@ class ReuseTokens(Pass[Program, Program]):
                 continue
             graph = for_tokens(tower, stream)
             found |= {pixels_name(i): _pixels_graph(tower, stream), tokens_name(i): graph}
-            kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in (PIXELS, INDEX))
+            kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in NOT_KEPT)
             notes.append(f"{frame_name(i)}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
         if not found:
             return PassResult(program, tuple(notes))
@@ -71,12 +83,13 @@ class ReuseTokens(Pass[Program, Program]):
             (name,) = tower.inputs
             row = torch.from_numpy(rng.standard_normal(tower.inputs[name].at(1), dtype=np.float32))
             graph = pieces.tokens[tokens_name(i)]
-            kept = {n: torch.full(t.at(1), torch.nan) for n, t in graph.inputs.items() if n not in (PIXELS, INDEX)}
+            kept = {n: torch.full(t.at(1), torch.nan) for n, t in graph.inputs.items() if n not in NOT_KEPT}
             tokens = torch.arange(next(iter(kept.values())).shape[0])
             with torch.no_grad():
                 whole = evaluator(tower, program.weights)({name: row})
                 (pixels,) = evaluator(pieces.tokens[pixels_name(i)], program.weights)({name: row})
-                parts = evaluator(graph, program.weights)({PIXELS: pixels, INDEX: tokens, **kept})
+                twice = {PLACES: tokens.repeat(2), ROWS: tokens.repeat(2)}
+                parts = evaluator(graph, program.weights)({PIXELS: pixels, INDEX: tokens, **twice, **kept})
             for output, one, other in zip(tower.outputs, whole, parts, strict=False):
                 if not torch.allclose(one, other, rtol=0, atol=_CLOSE * float(one.abs().max()), equal_nan=True):
                     raise self.fail(f"%{output} of all tokens is not what the tower gives.")
@@ -124,7 +137,8 @@ class _Changed:
         types, stream, axes = self.tower.types(), self.stream, self.stream.axes
         own = backward_slice(self.tower, self.tower.outputs, {stream.pixels: types[stream.pixels]})
         self.makers, self.types = own.producers(), types
-        index, pixels = {INDEX: TensorType((Batch(),), "int64")}, types[stream.pixels].resized(_rowless)
+        numbers = {name: TensorType((Batch(size),), "int64") for name, size in ((INDEX, 1), (PLACES, 2), (ROWS, 2))}
+        pixels = types[stream.pixels].resized(_rowless)
         self.nodes.append(Node(stream.pixels, "aten.clone.default", (Ref(PIXELS),), (), (pixels,)))
         for node in own.nodes:
             if node.name in axes and node.name != stream.entry:
@@ -138,7 +152,7 @@ class _Changed:
                 self._gather(node.name, axes[node.name])
         for name in own.outputs:
             self._whole(name)
-        given = {PIXELS: pixels, **index, **self.inputs}
+        given = {PIXELS: pixels, **numbers, **self.inputs}
         return Graph(given, own.constants, tuple(self.nodes), (*own.outputs, *self.outputs))
 
     def _part(self, type_: TensorType, axis: int) -> TensorType:
@@ -197,11 +211,11 @@ class _Changed:
         front = (axis, *(a for a in range(len(type_.shape)) if a != axis))
         back = tuple(front.index(a) for a in range(len(front)))
         rest = tuple(type_.shape[a] for a in front[1:])
-        all_rows, new_rows = replace(type_, shape=(self.stream.tokens, *rest)), replace(type_, shape=(Batch(), *rest))
+        all_rows, new_rows, placed = (replace(type_, shape=(n, *rest)) for n in (self.stream.tokens, Batch(), Batch(2)))
         kept, renewed = f"{name}.kept", renewed_name(f"{name}.kept")
         self.inputs[kept] = all_rows
         self.outputs.append(renewed)
-        args = (Ref(kept), 0, Ref(INDEX), Ref(f"{name}.rows"))
+        take, put = (Ref(f"{name}.rows"), 0, Ref(ROWS)), (Ref(kept), 0, Ref(PLACES), Ref(f"{name}.placed"))
         # Past axes of size 1 nothing moves, and nothing is to be copied.
         moves = any(size != 1 for size in type_.shape[:axis])
 
@@ -211,6 +225,7 @@ class _Changed:
 
         self.nodes += [
             moved(f"{name}.rows", f"{name}.changed", front, new_rows),
-            Node(renewed, "aten.index_copy.default", args, (), (all_rows,)),
+            Node(f"{name}.placed", "aten.index_select.default", take, (), (placed,)),
+            Node(renewed, "aten.index_copy.default", put, (), (all_rows,)),
             moved(name, renewed, back, type_),
         ]

@@ -16,7 +16,7 @@ from ttscompile.artifact.strict_json import REMEDY
 from ttscompile.artifact.towers import TokensRecord
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import ArtifactError
-from ttscompile.ir.pieces import INDEX, PIXELS, frame_pieces, pixels_name, tokens_name
+from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, frame_pieces, pixels_name, tokens_name
 
 Array: TypeAlias = npt.NDArray[Any]
 Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
@@ -77,17 +77,19 @@ class TokenTower:
     """A frame piece that computes some of its tokens.
 
     Args:
-        pixels: name of the piece that makes of a row what patches are cut from.
-        part: name of the piece for some tokens.
+        names: of the piece that makes of a row what patches are cut from, and of the piece for some tokens.
         record: of the tokens.
         reuse: when a token is computed.
+        forward: whether the piece writes rows of computed tokens to others, too. One of an older artifact does not.
         run: the first of these.
         renew: the second.
     """
 
-    def __init__(self, pixels: str, part: str, record: TokensRecord, reuse: TokenReuse, run: Run, renew: Renew) -> None:
-        self._pixels, self._part, self._run, self._renew = pixels, part, run, renew
-        self._record, self._reuse = record, reuse
+    def __init__(
+        self, names: tuple[str, str], record: TokensRecord, reuse: TokenReuse, forward: bool, run: Run, renew: Renew
+    ) -> None:
+        (self._pixels, self._part), self._run, self._renew = names, run, renew
+        self._record, self._reuse, self._forward = record, reuse, forward
         self._lanes: dict[Lane, _Kept] = {}
 
     @property
@@ -127,7 +129,10 @@ class TokenTower:
         else:
             kept.age, kept.number = kept.age + 1, kept.number + 1
         if index.size:
-            kept.values = self._renew(self._part, {PIXELS: pixels, INDEX: index}, kept.arrays)
+            feed = {PIXELS: pixels, INDEX: index}
+            if self._forward:
+                feed |= _written(index, *self._similar(kept.pixels, pixels[0], index))
+            kept.values = self._renew(self._part, feed, kept.arrays)
         if len(index) == self.tokens:
             kept.pixels, kept.age = pixels[0], 0
         elif index.size:
@@ -149,6 +154,32 @@ class TokenTower:
         size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
         most = np.argpartition(-off, size - fixed - 1)[: size - fixed] if size < tokens else np.arange(tokens - fixed)
         return np.concatenate([np.arange(fixed), fixed + np.sort(most)])
+
+    def _similar(self, old: Array, new: Array, index: Array) -> tuple[Array, Array]:
+        """Tokens that are better off with the rows of a computed one, and which one, as a place in ``index``.
+
+        They are not computed, and their patches are nearer to another one that is than to what they were: at most as
+        many as are computed, those that gain most.
+        """
+        fixed, computed = self._record.fixed, index[self._record.fixed :] - self._record.fixed
+        off = self._differences(new, old)
+        off[computed] = 0
+        (others,) = off.nonzero()
+        if not others.size:
+            return others, others
+        one, known = self._of(new, others), self._of(new, computed)
+        # Half of the square of a difference, but for what is the same for all that a patch is held against.
+        nearest = ((known * known).sum(1) / 2 - one @ known.T).argmin(1)
+        gain = np.square(one - self._of(old, others)).mean(1) - np.square(one - known[nearest]).mean(1)
+        best = np.argsort(-gain)[: len(index)]
+        best = best[gain[best] > 0]
+        return fixed + others[best], fixed + nearest[best]
+
+    def _of(self, pixels: Array, patches: Array) -> Array:
+        """Some patches of ``[C, H, W]``, a row each."""
+        cut = self._patches(pixels)
+        y, x = np.divmod(patches, cut.shape[2])
+        return cut[:, y, x].swapaxes(0, 1).reshape(len(patches), -1)
 
     def _require_patches(self, pixels: Array) -> None:
         """Raise unless each token but the fixed ones has a patch: else the wrong ones would be computed."""
@@ -178,12 +209,22 @@ class TokenTower:
         return cut.reshape(len(cut), rows, high, columns, wide).swapaxes(2, 3)
 
 
+def _written(index: Array, places: Array, rows: Array) -> dict[str, Array]:
+    """Where rows go: those of computed tokens to their own places, and to ``places``.
+
+    Two for each, so that shapes stay few: what is left over is written to its own place again.
+    """
+    own, left = np.arange(len(index)), len(index) - len(places)
+    return {PLACES: np.concatenate([index, places, index[:left]]), ROWS: np.concatenate([own, rows, own[:left]])}
+
+
 def token_towers(manifest: Manifest, reuse: TokenReuse | None, run: Run, renew: Renew) -> dict[str, TokenTower]:
     """By frame piece, those that reuse tokens; none where ``reuse`` is None."""
     if reuse is None:
         return {}
-    return {
-        name: TokenTower(pixels_name(i), tokens_name(i), manifest.tokens[name], reuse, run, renew)
-        for i, name in enumerate(frame_pieces(manifest.pieces))
-        if name in manifest.tokens
-    }
+    towers = dict[str, TokenTower]()
+    for i, name in enumerate(frame_pieces(manifest.pieces)):
+        if name in manifest.tokens:
+            names, part = (pixels_name(i), tokens_name(i)), manifest.pieces[tokens_name(i)]
+            towers[name] = TokenTower(names, manifest.tokens[name], reuse, PLACES in part.inputs, run, renew)
+    return towers

@@ -1,6 +1,7 @@
 """What reusing tokens means, literally: every value of the tower is computed whole, and then most of it is thrown away.
 
-In a value that has a row for each token, the rows of tokens that are not computed are those that it had when they were.
+In a value that has a row for each token, the rows of tokens that are not computed are those that it had when they were,
+or those that a computed token has now.
 """
 
 from __future__ import annotations
@@ -32,12 +33,22 @@ class LiteralTokens:
         self.kept: dict[str, torch.Tensor] = {}
 
     def __call__(
-        self, row: npt.NDArray[np.float32], computed: Sequence[int] | npt.NDArray[np.int64]
+        self,
+        row: npt.NDArray[np.float32],
+        computed: Sequence[int] | npt.NDArray[np.int64],
+        similar: Mapping[int, int] | None = None,
     ) -> list[npt.NDArray[np.float32]]:
-        """What the tower gives for a row ``[1, ...]``, of which these tokens are computed."""
+        """What the tower gives for a row ``[1, ...]``, of which these tokens are computed.
+
+        Args:
+            similar: by token that is not computed, one that is, whose rows it gets; of the others it keeps them.
+        """
         values = {**self.weights, **{name: torch.from_numpy(row) for name in self.tower.inputs}}
         chosen = torch.zeros(self.stream.tokens, dtype=torch.bool)
         chosen[torch.as_tensor(computed)] = True
+        taken = torch.arange(self.stream.tokens)
+        for token, other in (similar or {}).items():
+            chosen[token], taken[token] = True, other
         types, several = self.tower.types(), dict[str, Sequence[torch.Tensor]]()
         for node in self.tower.nodes:
             if node.op == GETITEM:
@@ -54,6 +65,6 @@ class LiteralTokens:
             axis = self.stream.axes.get(node.name)
             if axis is not None and node.name in self.kept:
                 mask = chosen.reshape(-1, *[1] * (value.ndim - axis - 1))
-                value = torch.where(mask, value, self.kept[node.name])
+                value = torch.where(mask, value.index_select(axis, taken), self.kept[node.name])
             values[node.name] = self.kept[node.name] = value
         return [values[name].numpy() for name in self.tower.outputs]

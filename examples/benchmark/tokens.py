@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +33,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.capture.export import capture
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.ir.graph import backward_slice
-from ttscompile.ir.pieces import INDEX, PIXELS, renewed_name
+from ttscompile.ir.pieces import INDEX, NOT_KEPT, PIXELS, PLACES, ROWS, renewed_name
 from ttscompile.ir.tokens import find_tokens
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
 from ttscompile.lower.program import lower_graph
@@ -126,7 +127,7 @@ def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
     rng = np.random.default_rng(0)
     feed = {name: rng.standard_normal(type_.at(1), dtype=np.float32) for name, type_ in part.inputs.items()}
     image = {"image": feed[PIXELS]}
-    kept = {renewed_name(name): array for name, array in feed.items() if name not in (PIXELS, INDEX)}
+    kept = {renewed_name(name): array for name, array in feed.items() if name not in NOT_KEPT}
     given = {name: np.zeros(part.types()[name].at(1), np.float32) for name in tower.outputs} | kept
     rows = []
     for precision in precisions:
@@ -138,7 +139,11 @@ def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
         times: dict[int, list[float]] = {
             count: [] for count in (0, stream.tokens, *(-(-stream.tokens // part) for part in (2, 4, 8)))
         }
-        bound = {count: Bound(some, {**feed, INDEX: np.arange(count)}, given) for count in times if count}
+        numbers = {
+            count: {INDEX: np.arange(count), **dict.fromkeys((PLACES, ROWS), np.tile(np.arange(count), 2))}
+            for count in times
+        }
+        bound = {count: Bound(some, {**feed, **numbers[count]}, given) for count in times if count}
         for _ in range(rounds + 1):  # the first does not count
             for count, own in times.items():
                 start = time.process_time()
@@ -147,6 +152,12 @@ def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
         figures = (f"{statistics.median(own[1:]):.0f}" for own in times.values())
         rows.append(f"| {title}, {precision} | {' | '.join(figures)} |")
     return rows
+
+
+def _numbers(count: int) -> dict[str, Any]:
+    """So many tokens, whose rows go to their own places; each is written twice, as where others get as many."""
+    own = np.arange(count)
+    return {INDEX: own, PLACES: np.tile(own, 2), ROWS: np.tile(own, 2)}
 
 
 def main() -> None:

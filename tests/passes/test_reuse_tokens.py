@@ -1,5 +1,6 @@
 """A tower that is a vision transformer has a form for some of its tokens."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -17,7 +18,7 @@ from ttscompile.driver import transform
 from ttscompile.errors import PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Node, Ref, backward_slice
-from ttscompile.ir.pieces import INDEX, PIXELS
+from ttscompile.ir.pieces import INDEX, NOT_KEPT, PIXELS, PLACES, ROWS
 from ttscompile.ir.program import Program
 from ttscompile.ir.tokens import find_tokens
 from ttscompile.ir.verify import verify
@@ -41,15 +42,24 @@ def test_some_tokens_give_what_they_literally_give(kind: str, tokens: int, fixed
     assert (literal.stream.tokens, literal.stream.fixed) == (tokens, fixed)
     weights = {name: torch.from_numpy(np.array(value)) for name, value in program.weights.items()}
     pixels, part = program.pieces.tokens["pixels_00"], program.pieces.tokens["tokens_00"]
-    kept = {name: torch.full(t.at(1), torch.nan) for name, t in part.inputs.items() if name not in (PIXELS, INDEX)}
+    kept = {name: torch.full(t.at(1), torch.nan) for name, t in part.inputs.items() if name not in NOT_KEPT}
     rng, (name,) = np.random.default_rng(0), program.pieces.towers[0].inputs
-    for computed in (range(tokens), [0, 3, 4], [35, 7, 2, 20, 11], range(tokens), [5]):
+    calls: list[tuple[Sequence[int], dict[int, int]]] = [
+        (range(tokens), {}),
+        ([0, 3, 4], {}),
+        ([35, 7, 2, 20, 11], {1: 7, 30: 7, 5: 35}),
+        (range(tokens), {}),
+        ([5], {6: 5}),
+    ]
+    for computed, similar in calls:
         row = rng.random((1, 3, cameras.SIDE, cameras.SIDE), dtype=np.float32)
         (cut,) = evaluate(pixels, weights, {name: torch.from_numpy(row)})
-        index = torch.tensor(list(computed))
-        value, *renewed = evaluate(part, weights, {PIXELS: cut, INDEX: index, **kept})
+        index, left = torch.tensor(list(computed)), len(computed) - len(similar)
+        places = torch.tensor([*computed, *similar, *computed[:left]])
+        rows = torch.tensor([list(computed).index(similar.get(place, place)) for place in places.tolist()])
+        value, *renewed = evaluate(part, weights, {PIXELS: cut, INDEX: index, PLACES: places, ROWS: rows, **kept})
         kept = dict(zip(kept, renewed, strict=True))
-        np.testing.assert_allclose(value, literal(row, list(computed))[0], rtol=0, atol=1e-5)
+        np.testing.assert_allclose(value, literal(row, list(computed), similar)[0], rtol=0, atol=1e-5)
     whole = evaluate(program.pieces.towers[0], weights, {name: torch.from_numpy(row)})[0]
     assert (whole - value).abs().max() > 1e-3, "tokens that were not computed keep what they gave"
 

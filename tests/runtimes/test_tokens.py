@@ -17,6 +17,7 @@ from tests.families import cameras
 from tests.families.cameras import act, counted, frame, moved, picture
 from tests.literal_tokens import LiteralTokens
 from tests.once import Once
+from ttscompile.artifact.codec import decode, encode
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.requires import check_size
@@ -24,7 +25,7 @@ from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.plan import DENSE, Plan, TokenReuse
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
-from ttscompile.ir.pieces import FRAMES, INDEX
+from ttscompile.ir.pieces import FRAMES, INDEX, PIXELS, PLACES, ROWS
 from ttscompile.runtimes.frames import FramePieces
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
@@ -74,10 +75,13 @@ def computed_literally(artifact: Artifact, changes: tuple[int, ...]) -> list[int
     literal = LiteralTokens(artifact.graph("frame_00"), artifact.weights)
     tower, rng, image = tower_of(artifact, refresh=6), np.random.default_rng(0), picture(0)
     (name,) = artifact.graph("frame_00").inputs
-    seen, asked, renew = [], list[Array](), tower._renew
+    seen, asked, similar, renew = [], list[Array](), dict[int, int](), tower._renew
 
     def heard(piece: str, feed: Any, kept: Any) -> Any:
         asked.append(feed[INDEX])
+        sources = dict(zip(feed[PLACES].tolist(), feed[INDEX][feed[ROWS]].tolist(), strict=True))
+        similar.clear()
+        similar.update({place: source for place, source in sources.items() if place not in feed[INDEX]})
         return renew(piece, feed, kept)
 
     tower._renew = heard
@@ -86,7 +90,7 @@ def computed_literally(artifact: Artifact, changes: tuple[int, ...]) -> list[int
             image = moved(image, patch, rng.uniform(0.1, 1.0))
         (value, *_), count = tower.compute(b"", {name: image[None]})
         if count:
-            np.testing.assert_allclose(value, literal(image[None], asked[-1])[0], rtol=0, atol=1e-5)
+            np.testing.assert_allclose(value, literal(image[None], asked[-1], similar)[0], rtol=0, atol=1e-5)
             assert len(asked[-1]) == count
             assert literal.stream.fixed == 0 or asked[-1][0] == 0, "the class token is always computed"
         seen.append(count)
@@ -320,3 +324,50 @@ def test_cameras_share_no_lane_however_many_streams_there_are(streams: int) -> N
     assert len(set(lanes)) == len(lanes) == 3 * streams
     fewer = frames._lanes_of("frame_00", dict.fromkeys(cameras_, shown[:1]))
     assert set(lanes).isdisjoint(fewer), "of another batch, which is prepared before its first call"
+
+
+def test_a_token_that_is_not_computed_gets_what_a_similar_one_has(artifact: Artifact) -> None:
+    """Four patches become something else. Of three that change less, two become the same as one of them."""
+    tower, (name,) = tower_of(artifact, threshold=1.2), artifact.graph("frame_00").inputs
+    literal, renew, fed = LiteralTokens(artifact.graph("frame_00"), artifact.weights), tower._renew, dict[str, Array]()
+
+    def heard(piece: str, feed: Any, kept: Any) -> Any:
+        fed.update(feed)
+        return renew(piece, feed, kept)
+
+    tower._renew = heard
+    before = np.zeros((3, cameras.SIDE, cameras.SIDE), np.float32)
+    after = before.copy()
+    for patch, level in ((0, 0.9), (3, 0.7), (7, 0.8), (20, 1.0), (14, 0.5), (15, 0.45), (16, 0.1)):
+        y, x = divmod(patch, 6)
+        after[:, 4 * y : 4 * y + 4, 4 * x : 4 * x + 4] = level
+    tower.compute(b"", {name: before[None]})
+    literal(before[None], range(TOKENS))
+    (value, *_), count = tower.compute(b"", {name: after[None]})
+    assert (count, fed[INDEX].tolist()) == (5, [0, 1, 4, 8, 21])
+    similar = {15: 4, 16: 4}
+    written = dict(zip(fed[PLACES].tolist(), fed[INDEX][fed[ROWS]].tolist(), strict=True))
+    assert written == {token: token for token in fed[INDEX].tolist()} | similar
+    np.testing.assert_allclose(value, literal(after[None], fed[INDEX], similar)[0], rtol=0, atol=1e-5)
+
+
+def test_an_artifact_from_before_keeps_what_it_does_not_compute(artifact: Artifact) -> None:
+    """Its piece for some tokens reads no places, and writes each row to its own."""
+    pieces, fed = dict(artifact.manifest.pieces), list[set[str]]()
+    part = pieces["tokens_00"]
+    pieces["tokens_00"] = replace(part, inputs=tuple(name for name in part.inputs if name not in (PLACES, ROWS)))
+    before = replace(artifact.manifest, pieces=pieces)
+    assert decode(encode(before)).pieces == pieces
+    image = picture(0)
+
+    def run(piece: str, feed: Any) -> tuple[Array, ...]:
+        return tuple(feed.values())
+
+    def renew(piece: str, feed: Any, kept: Any) -> tuple[Array, ...]:
+        fed.append(set(feed))
+        return (image,)
+
+    for manifest in (before, artifact.manifest):
+        (tower,) = token_towers(manifest, REUSE, run, renew).values()
+        tower.compute(b"", {"row": image[None]})
+    assert fed == [{PIXELS, INDEX}, {PIXELS, INDEX, PLACES, ROWS}]

@@ -67,7 +67,7 @@ def tokens_records(program: Program) -> dict[str, TokensRecord]:
     for i in range(len(pieces.towers)):
         if (graph := pieces.tokens.get(names.tokens_name(i))) is None:
             continue
-        kept = {n: kind for n, kind in graph.inputs.items() if n not in (names.PIXELS, names.INDEX)}
+        kept = {n: kind for n, kind in graph.inputs.items() if n not in names.NOT_KEPT}
         patches = next(node for node in graph.nodes if node.op.startswith("aten.conv"))
         _, weight = list(patches.refs())[:2]
         high, wide = graph.constants[weight].at(1)[2:]

@@ -84,9 +84,11 @@ def frame_pieces(pieces: Iterable[str]) -> tuple[str, ...]:
 
 _PIXELS, _TOKENS = "pixels_", "tokens_"
 
-PIXELS, INDEX = "tokens.pixels", "tokens.index"
-"""What a piece for some tokens reads beside what is kept: what patches are cut from, and the numbers of the tokens. No
-captured value has a dot in its name."""
+PIXELS, INDEX, PLACES, ROWS = "tokens.pixels", "tokens.index", "tokens.places", "tokens.rows"
+NOT_KEPT = (PIXELS, INDEX, PLACES, ROWS)
+"""What a piece for some tokens reads beside what is kept: what patches are cut from, the numbers of the tokens that are
+computed, and where rows go: token ``places[i]`` gets the row of the ``rows[i]``-th of these. No captured value has a
+dot in its name."""
 
 
 def renewed_name(kept: str) -> str:

@@ -11,7 +11,7 @@ from ..judge import Score, further, judge
 from ..proposer import Proposal, Proposals, Proposer
 from ..trials import LEARNED, Trials
 
-THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
+THRESHOLDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Differences that are tried, ascending. Encoders read pixels with a deviation of about one."""
 REFRESHES = (32, 16, 12, 8, 4)
 """Of so many new frames one is whole; never of more than follow each other where plans are judged."""
