@@ -40,11 +40,11 @@ RESAMPLED = 2000
 """Samples of the bootstrap over episodes."""
 WAYS = {
     "chance": "chance",
-    "difference": "how much the patch differs, as today",
+    "difference": "how much the patch differs",
     "importance": "the same times the patch's importance",
     "head": "a learned head",
     "found": "importance; the others from where their patch was",
-    "similar": "as today; the others from a similar one that is computed",
+    "similar": "how much the patch differs; the others from a similar one that is computed, as plans do",
     "merged": "importance; the others from a similar one that is computed",
     "effect": "the effect in this very call, after the fact",
 }
@@ -62,7 +62,7 @@ class Row:
         way: what tokens are ordered by.
         size: how many tokens are computed of a frame.
         error: mean, in units of what other noise does; and the median over calls.
-        less: share of today's error that is saved, and its 95 % interval over episodes.
+        less: share of the error of ``FIRST`` that is saved, and its 95 % interval over episodes.
     """
 
     way: str
@@ -108,7 +108,7 @@ def ordering(
         trajectories: recorded episodes, see ``ttscompile.trajectories``.
         camera: the observation whose tokens are chosen.
         observation: see ``ttscompile.calibrate``.
-        ways: some of ``WAYS``, beside today's.
+        ways: some of ``WAYS``, beside ``FIRST``.
         eighths: for how many of these of its tokens a frame is computed.
         learned: stretches of calls that are learned from, at most.
         judged: those of other episodes, at most.
@@ -164,13 +164,13 @@ def ordering(
     return Ordering(tuple(rows), policy.tower.tokens, (len(own), len(others)), share)
 
 
-def _row(way: str, size: int, errors: Errors, today: Errors, episodes: npt.NDArray[np.int64], seed: int) -> Row:
+def _row(way: str, size: int, errors: Errors, first: Errors, episodes: npt.NDArray[np.int64], seed: int) -> Row:
     """Of errors ``[N, CALLS - 1]``, and the episode of each N."""
-    sums = np.stack([np.bincount(episodes, one.sum(1)) for one in (errors, today)])
+    sums = np.stack([np.bincount(episodes, one.sum(1)) for one in (errors, first)])
     drawn = np.random.default_rng((seed, 16)).integers(0, sums.shape[1], (RESAMPLED, sums.shape[1]))
     own, theirs = sums[:, drawn].sum(2)
     low, high = np.quantile(1 - own / theirs, (0.025, 0.975))
-    less = float(1 - errors.sum() / today.sum()), float(low), float(high)
+    less = float(1 - errors.sum() / first.sum()), float(low), float(high)
     return Row(way, size, float(errors.mean()), float(np.median(errors)), less)
 
 
@@ -215,7 +215,7 @@ def main(
 def show(found: Ordering) -> None:
     """What was found as a table, and what the words in it mean."""
     output = results_console()
-    made = table("which tokens are computed", "tokens", "error", "median", "less than today", "95 % interval")
+    made = table("which tokens are computed", "tokens", "error", "median", "less than the first", "95 % interval")
     for number, one in enumerate(found.rows):
         if number and one.size != found.rows[number - 1].size:
             made.add_section()

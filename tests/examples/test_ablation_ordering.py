@@ -139,10 +139,10 @@ def test_what_is_found(found: Ordering) -> None:
     assert len(found.rows) == 3 * len(WAYS)
     for size in (5, 10, 19):
         by_way = {row.way: row for row in found.rows if row.size == size}
-        today = by_way["difference"]
-        assert today.less == (0, 0, 0)
-        assert by_way["importance"].less[0] == pytest.approx(1 - by_way["importance"].error / today.error)
-        assert by_way["chance"].error > today.error
+        first = by_way["difference"]
+        assert first.less == (0, 0, 0)
+        assert by_way["importance"].less[0] == pytest.approx(1 - by_way["importance"].error / first.error)
+        assert by_way["chance"].error > first.error
         assert all(row.less[1] <= row.less[0] <= row.less[2] for row in by_way.values())
 
 
