@@ -104,8 +104,16 @@ def test_an_action_that_never_changed_is_worth_a_note(tmp_path: Path) -> None:
 
 
 def test_state_without_a_normaliser_is_a_warning(tmp_path: Path) -> None:
-    said = found(save_policy(tmp_path, modes=("IDENTITY", "IDENTITY", "MIN_MAX")))
-    assert said[f"normaliser of {STATE}"].level is Level.WARNING
+    directory = save_policy(tmp_path, modes=("IDENTITY", "IDENTITY", "MIN_MAX"))
+    one = found(directory)[f"normaliser of {STATE}"]
+    assert one.level is Level.WARNING and one.found.startswith("there are statistics, and IDENTITY is configured")
+
+    def without(tensors: Tensors) -> None:
+        for name in [name for name in tensors if name.startswith(STATE)]:
+            del tensors[name]
+
+    one = found(statistics(directory, without))[f"normaliser of {STATE}"]
+    assert one.level is Level.WARNING and one.found.startswith("there are no statistics of observation.state")
 
 
 def test_cameras_of_the_data_that_the_policy_does_not_read(sound: Path) -> None:

@@ -38,6 +38,7 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
     found = read_groot_processors(*how) if entries["type"] == "groot" else read_processors(*how, str(entries["type"]))
     step: dict[str, Any] = {"config": {}} | next(own, {})
     doubts, action = [], {} if found.action is None else {ACTION: found.action}
+    measured = _measured(directory, step)
     for key, (kind, _) in features.items():
         mode, name = step["config"].get("norm_map", {}).get(kind, "IDENTITY"), found.renamed.get(key, key)
         one = (action if key == ACTION else found.normalizers).get(key)
@@ -45,6 +46,10 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
             continue
         if one is not None:
             doubts.append(judged(name, one.first, one.second, one.mode == "MEAN_STD", one.clipped))
+        elif mode == "IDENTITY" and key in measured:
+            told = "there are statistics, and IDENTITY is configured, so it is not normalised"
+            remedy = f"Was it trained so? If not, correct norm_map in {PREPROCESSOR}."
+            doubts.append(Finding(PART, f"normaliser of {name}", told, Level.WARNING, remedy))
         elif mode != "IDENTITY" or kind in ("STATE", "ACTION"):
             told = f"there are no statistics of {key}, so it is not normalised ({mode} is configured)"
             level = Level.WARNING if mode == "IDENTITY" else Level.PROBLEM
@@ -57,14 +62,18 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
         doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
     model = next((entries[key] for key in _MODELS if key in entries), "none")
     name = str(found.tokenizer.get("tokenizer_name", model))[:200]
-    return [*doubts, *_cameras(directory, features, step), *_tokenizer(directory, name, found, spec, encoders)]
+    return [*doubts, *_cameras(features, step, measured), *_tokenizer(directory, name, found, spec, encoders)]
 
 
-def _cameras(directory: Path, features: Features, step: Mapping[str, Any]) -> list[Finding]:
+def _measured(directory: Path, step: Mapping[str, Any]) -> set[str]:
+    """Of what in the data there are statistics."""
+    file = step.get("state_file")
+    return {name.rpartition(".")[0] for name in read_tensors(directory / file)} if file else set()
+
+
+def _cameras(features: Features, step: Mapping[str, Any], measured: set[str]) -> list[Finding]:
     """Names and sizes in the data that are not the policy's: lerobot passes over a picture that it does not know."""
     doubts, known = [], [key for key, (kind, _) in features.items() if kind == "VISUAL"]
-    file = step.get("state_file")
-    measured = {name.rpartition(".")[0] for name in read_tensors(directory / file)} if file else set()
     foreign = sorted(key for key in measured if key.startswith("observation.images.") and key not in known)
     if foreign:
         told = (
