@@ -1,7 +1,7 @@
 """A policy beside OpenVINO (github.com/openvinotoolkit/openvino), the same weights and the same call, taking turns.
 
     pip install openvino nncf
-    python examples/benchmark/large.py --smolvla --output DIR        # or --pi0, or --groot
+    python examples/benchmark/large.py --smolvla --output DIR        # or --evo1, --pi0, or --groot
     python examples/benchmark/openvino_beside.py DIR [--threads 1]
 
 ``DIR`` is what ``large.py`` leaves. OpenVINO converts the original network as two models: what the original evaluates
