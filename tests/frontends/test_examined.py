@@ -116,6 +116,12 @@ def test_state_without_a_normaliser_is_a_warning(tmp_path: Path) -> None:
     assert one.level is Level.WARNING and one.found.startswith("there are no statistics of observation.state")
 
 
+def test_pictures_without_a_normaliser_are_usual(tmp_path: Path) -> None:
+    """Whether or not there are statistics of them: SmolVLA sees so."""
+    said = found(save_policy(tmp_path, ("front",), modes=("IDENTITY", "MIN_MAX", "MIN_MAX")))
+    assert f"normaliser of {FRONT}" not in said and f"normaliser of {STATE}" in said
+
+
 def test_cameras_of_the_data_that_the_policy_does_not_read(sound: Path) -> None:
     def rename(tensors: Tensors) -> None:
         for name in [name for name in tensors if name.startswith(FRONT)]:

@@ -46,11 +46,13 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
             continue
         if one is not None:
             doubts.append(judged(name, one.first, one.second, one.mode == "MEAN_STD", one.clipped))
+        elif mode == "IDENTITY" and kind not in ("STATE", "ACTION"):
+            continue  # as SmolVLA and its like see pictures
         elif mode == "IDENTITY" and key in measured:
             told = "there are statistics, and IDENTITY is configured, so it is not normalised"
             remedy = f"Was it trained so? If not, correct norm_map in {PREPROCESSOR}."
             doubts.append(Finding(PART, f"normaliser of {name}", told, Level.WARNING, remedy))
-        elif mode != "IDENTITY" or kind in ("STATE", "ACTION"):
+        else:
             told = f"there are no statistics of {key}, so it is not normalised ({mode} is configured)"
             level = Level.WARNING if mode == "IDENTITY" else Level.PROBLEM
             remedy = f"Was it trained so? lerobot says nothing. {REPEAT}"
