@@ -122,7 +122,7 @@ class TokenTower:
         (pixels,) = self._run(self._pixels, row)
         if kept is None:
             self._require_patches(pixels[0])
-        index = self._changed(kept, pixels[0])
+        index, off = self._changed(kept, pixels[0])
         if kept is None:
             nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
             kept = _Kept(pixels[0], nothing, (), index)
@@ -131,7 +131,7 @@ class TokenTower:
         if index.size:
             feed = {PIXELS: pixels, INDEX: index}
             if self._forward:
-                feed |= _written(index, *self._similar(kept.pixels, pixels[0], index))
+                feed |= _written(index, *self._similar(kept.pixels, pixels[0], index, off))
             kept.values = self._renew(self._part, feed, kept.arrays)
         if len(index) == self.tokens:
             kept.pixels, kept.age = pixels[0], 0
@@ -142,29 +142,31 @@ class TokenTower:
         kept.index, self._lanes[lane] = index, kept
         return kept.values, len(index)
 
-    def _changed(self, kept: _Kept | None, pixels: Array) -> Array:
-        """Numbers of the tokens to compute, int64; none where no patch changed."""
+    def _changed(self, kept: _Kept | None, pixels: Array) -> tuple[Array, Array]:
+        """Numbers of the tokens to compute, int64; none where no patch changed. And by how much each patch differs.
+
+        Of a frame that is computed whole anyway nobody asks how much differs, and nothing is said.
+        """
         fixed, tokens = self._record.fixed, self.tokens
         if kept is None or kept.age + 1 >= self._reuse.refresh:
-            return np.arange(tokens)
+            return np.arange(tokens), np.zeros(0, np.float32)
         off = self._differences(pixels, kept.pixels)
         changed = np.count_nonzero(off > self._reuse.threshold)
         if not changed:
-            return np.arange(0)
+            return np.arange(0), off
         size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
         most = np.argpartition(-off, size - fixed - 1)[: size - fixed] if size < tokens else np.arange(tokens - fixed)
-        return np.concatenate([np.arange(fixed), fixed + np.sort(most)])
+        return np.concatenate([np.arange(fixed), fixed + np.sort(most)]), off
 
-    def _similar(self, old: Array, new: Array, index: Array) -> tuple[Array, Array]:
-        """Tokens that are better off with the rows of a computed one, and which one, as a place in ``index``.
+    def _similar(self, old: Array, new: Array, index: Array, off: Array) -> tuple[Array, Array]:
+        """Tokens that take the rows of a computed one, and which one each takes, as a place in ``index``.
 
-        They are not computed, and their patches are nearer to another one that is than to what they were: at most as
-        many as are computed, those that gain most.
+        Such a token is not computed, and its patch is nearer to that one's than to the pixels that it was last computed
+        for. They are at most as many as are computed: those that gain most.
         """
         fixed, computed = self._record.fixed, index[self._record.fixed :] - self._record.fixed
-        off = self._differences(new, old)
-        off[computed] = 0
         (others,) = off.nonzero()
+        others = np.setdiff1d(others, computed, assume_unique=True)
         if not others.size:
             return others, others
         one, known = self._of(new, others), self._of(new, computed)

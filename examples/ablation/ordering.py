@@ -200,7 +200,7 @@ def main(
     asked = ways.split(",")
     if unknown := set(asked) - set(WAYS):
         raise click.BadParameter(f"expected some of {', '.join(WAYS)}; found {', '.join(sorted(unknown))}.")
-    counts = [int(one) for one in eighths.split(",") if one in "1234567"]
+    counts = [int(one) for one in eighths.split(",") if one in tuple("1234567")]
     if len(counts) != len(eighths.split(",")):
         raise click.BadParameter(f"expected numbers from 1 to 7; found {eighths!r}.", param_hint="--eighths")
     sizes: dict[str, Any] = {"eighths": counts, "learned": learned, "judged": judged, "seed": seed}

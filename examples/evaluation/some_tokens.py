@@ -46,7 +46,7 @@ class Counted:
         """Take their place."""
         setattribute(TokenTower, "compute", lambda tower, lane, row: self.compute(tower, lane, row))
         if self._kept:
-            setattribute(TokenTower, "_similar", lambda tower, old, new, index: (index[:0], index[:0]))
+            setattribute(TokenTower, "_similar", lambda tower, old, new, index, off: (index[:0], index[:0]))
 
     def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
         """See ``TokenTower``."""

@@ -175,8 +175,9 @@ def test_what_it_prints(found: Ordering, folder: Path, recording: Path, monkeypa
     assert '"rows"' in CliRunner().invoke(ordering.main, [*asked, "--json"], catch_exceptions=False).stdout
     refused = CliRunner().invoke(ordering.main, [*asked, "--ways", "luck"])
     assert refused.exit_code == 2 and "found luck" in refused.output
-    refused = CliRunner().invoke(ordering.main, [*asked, "--eighths", "2,8"])
-    assert refused.exit_code == 2 and "numbers from 1 to 7; found '2,8'" in refused.output
+    for wrong in ("2,8", "12", "1,"):
+        refused = CliRunner().invoke(ordering.main, [*asked, "--eighths", wrong])
+        assert refused.exit_code == 2 and f"numbers from 1 to 7; found '{wrong}'" in refused.output
 
 
 def test_what_cannot_be_measured_is_refused(once: Once, folder: Path, recording: Path, tmp_path: Path) -> None:

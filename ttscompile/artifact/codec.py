@@ -237,8 +237,8 @@ def _check_tokens(manifest: Manifest, fields: Mapping[str, Value]) -> None:
         )
         rows = [kind.at(1)[:1] for kind in record.kept.values()]
         fits = pixels.inputs == frame.inputs and pixels.outputs == (names.PIXELS,) and 0 <= record.fixed < record.tokens
-        # An artifact may be from before rows went to other tokens, too.
-        beside = names.NOT_KEPT if names.PLACES in part.inputs else names.NOT_KEPT[:2]
+        # In an older artifact each row goes to its own token, so the piece is not told where.
+        beside = names.NOT_KEPT if names.PLACES in part.inputs else (names.PIXELS, names.INDEX)
         fits = fits and sorted(part.inputs) == sorted((*beside, *record.kept))
         renewed = tuple(map(names.renewed_name, record.kept))
         if not fits or part.outputs[len(frame.outputs) :] != renewed or set(rows) != {(record.tokens,)}:
