@@ -154,10 +154,11 @@ def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
     return rows
 
 
-def _numbers(count: int) -> dict[str, Any]:
-    """So many tokens, whose rows go to their own places; each is written twice, as where others get as many."""
+def _numbers(count: int, tokens: int) -> dict[str, Any]:
+    """So many tokens, whose rows go to their own places: of some twice, as where others get as many."""
     own = np.arange(count)
-    return {INDEX: own, PLACES: np.tile(own, 2), ROWS: np.tile(own, 2)}
+    places = np.tile(own, 1 if count == tokens else 2)
+    return {INDEX: own, PLACES: places, ROWS: places}
 
 
 def main() -> None:
