@@ -215,7 +215,7 @@ def _written(index: Array, places: Array, rows: Array) -> dict[str, Array]:
     """Where rows go: those of computed tokens to their own places, and to ``places``.
 
     Two for each, so that shapes stay few: what is left over is written to its own place again. One for each where no
-    other token takes any, as of a whole frame, which takes 6 % longer with two; ``2*B`` is a name to onnxruntime.
+    other token takes any, since a whole frame takes longer with two; ``2*B`` is a name to onnxruntime.
     """
     own, left = np.arange(len(index)), len(index) - len(places) if len(places) else 0
     return {PLACES: np.concatenate([index, places, index[:left]]), ROWS: np.concatenate([own, rows, own[:left]])}
