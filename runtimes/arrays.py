@@ -57,7 +57,7 @@ def read_observation(
         found = "{:.400} (missing: {:.400}, unexpected: {:.400})".format(*map(str, names))
         remedy = "Give exactly the keys that the policy was compiled for."
         if "task" in unexpected and any(specs[key].dtype == "int64" for key in missing):
-            loaded = "load with tokenizer=PATH (serve: --tokenizer)"
+            loaded = "the artifact has no tokenizer: load with tokenizer=PATH (serve: --tokenizer)"
             remedy = f"For a text in place of its tokens, {loaded}, or compile it in: convert --task."
         raise ObservationError(f"expected the observation keys {sorted(specs)}; found {found}. {remedy}")
     example = next((value for value in given.values() if is_tensor(value)), None)

@@ -1,9 +1,11 @@
 """The text of a task in place of its tokens, for a robot that has the policy's tokenizer. Imports no torch."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
+from ttscompile.artifact.load import Artifact
 from ttscompile.core.spec import PolicySpec
 from ttscompile.core.tokenizer import TASK, Tokenizer, padded
 from ttscompile.errors import ObservationError
@@ -13,21 +15,19 @@ class Instruct:
     """Puts the tokens of a task into an observation.
 
     Args:
-        spec: of the policy.
-        path: of the policy's tokenizer; see ``Tokenizer``.
-
-    Raises:
-        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
+        spec: of a policy that is told its task in words.
+        read: gives its tokenizer; called when the first text comes.
     """
 
-    def __init__(self, spec: PolicySpec, path: str | os.PathLike[str]) -> None:
-        if spec.instruction is None:
-            remedy = "Leave the tokenizer out."
-            raise ObservationError(f"{path}: this policy takes no text that alone would give its tokens. {remedy}")
-        self._told, self._keys = spec.instruction, tuple(spec.observations)
-        self._length = spec.observations[spec.instruction.tokens].shape[0]
-        self._tokenizer = Tokenizer(path, ObservationError)
+    def __init__(self, spec: PolicySpec, read: Callable[[], Tokenizer]) -> None:
+        assert spec.instruction is not None
+        self._told, self._keys, self._read = spec.instruction, tuple(spec.observations), read
+        self._length = spec.observations[self._told.tokens].shape[0]
         self._made: dict[str, list[int]] = {}
+
+    @cached_property
+    def _tokenizer(self) -> Tokenizer:
+        return self._read()
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
         """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is."""
@@ -58,3 +58,31 @@ class Instruct:
             known = self._tokenizer.of_task(text, self._told, self._length)
             self._made = {text: known}
         return known
+
+
+def instruct_of(artifact: Artifact, tokenizer: str | os.PathLike[str] | None = None) -> Instruct | None:
+    """What puts tokens into a policy's observations; None where the policy has no tokenizer, or is told no task.
+
+    Args:
+        tokenizer: see ``Tokenizer``; read at once. None for the artifact's own, which is read when the first text
+            comes: whoever gives tokens needs neither it nor the package that reads it.
+
+    Raises:
+        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
+    """
+    spec, own = artifact.manifest.spec, artifact.tokenizer
+    if tokenizer is not None and spec.instruction is None:
+        remedy = "Leave the tokenizer out."
+        raise ObservationError(f"{tokenizer}: this policy takes no text that alone would give its tokens. {remedy}")
+    if spec.instruction is None or (tokenizer is None and own is None):
+        return None
+    if tokenizer is not None:
+        given = Tokenizer(tokenizer, ObservationError)
+        return Instruct(spec, lambda: given)
+
+    def read() -> Tokenizer:
+        assert own is not None
+        with artifact.reading(own.name):
+            return Tokenizer(own, ObservationError)
+
+    return Instruct(spec, read)

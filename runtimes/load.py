@@ -11,7 +11,7 @@ from ttscompile.errors import ArtifactChangedError, ArtifactError
 from ttscompile.hub import fetch_artifact
 
 from .arrays import check_seed
-from .instruct import Instruct
+from .instruct import instruct_of
 from .open import open_runtime
 from .policy import CompiledPolicy, plan_of
 
@@ -44,7 +44,7 @@ def load(
             among them, or a ``ttscompile.Plan``; None for the artifact's default.
         device: where torch computes: ``cpu``, ``cuda``, ``cuda:1``, ``mps``. None for the CPU.
         tokenizer: ``tokenizer.json`` of the policy's language model, or its folder: observations may then have the text
-            ``task`` in place of tokens. Needs the package tokenizers. None: the caller gives tokens.
+            ``task`` in place of tokens, with the package tokenizers. None for the artifact's own, if it has one.
 
     Raises:
         IllegalPlanError: the artifact has no plan of this name, or lacks what the plan names.
@@ -99,5 +99,4 @@ def open_policy(
     """The policy of an artifact that is loaded; see ``load`` and ``CompiledPolicy``."""
     wanted = plan_of(artifact, plan)  # refused before the sessions are opened
     opened = open_runtime(artifact, runtime, threads, device, wanted)
-    instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
-    return CompiledPolicy(artifact, opened, seed, wanted, origin, instruct)
+    return CompiledPolicy(artifact, opened, seed, wanted, origin, instruct_of(artifact, tokenizer))

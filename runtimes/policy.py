@@ -207,7 +207,8 @@ class CompiledPolicy:
     def with_tokens(self, frame: Mapping[str, Any]) -> Mapping[str, Any]:
         """One frame by key, ``[...]``, with tokens in the place of its text ``task``.
 
-        As it is where the policy was loaded without a tokenizer. Any thread may ask, whoever else calls the policy.
+        As it is where the policy has no tokenizer. Any thread may ask, whoever else calls the policy; the first text
+        takes longer, since the artifact's own tokenizer is read then.
 
         Raises:
             ObservationError: the task is no text, or has more tokens than the policy reads.

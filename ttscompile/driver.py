@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -20,7 +20,7 @@ from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, ORIGINAL, PolicySpec
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
-from .frontends import files_beside, load_checkpoint_policy
+from .frontends import files_beside, load_checkpoint_policy, tokenizer_of
 from .frontends.encoded import own_copy, parts
 from .frontends.examined import examine
 from .frontends.families import LoadOptions
@@ -129,12 +129,15 @@ def convert(
         if one.remedy:
             warnings.warn(one.told, stacklevel=2)
     spec = replace(spec, source={**spec.source, **origin})
-    beside = files_beside(checkpoint, spec)
+    tokenizer, words = tokenizer_of(checkpoint, spec, encoders)
+    beside = files_beside(checkpoint, spec, tokenizer is not None)
     if beside == {}:
         explain("files_beside", ("none: no step of its program makes the tokens that this policy reads",))
-    loop = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL)
+    if spec.instruction is not None:
+        explain("tokenizer_of", (words,))
+    loop, added = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL), _Added(beside or {}, tokenizer)
     return _compile(
-        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, beside or {}, loop
+        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, added, loop
     )
 
 
@@ -175,8 +178,16 @@ def compile_denoiser(
     """
     module = own_copy(module)  # the program, which is returned, shares memory with it
     return _compile(
-        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, {}, ORIGINAL
+        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, _Added(), ORIGINAL
     )
+
+
+@dataclass(frozen=True)
+class _Added:
+    """What goes into the directory with the program: see ``write_artifact``."""
+
+    beside: Mapping[str, bytes] = field(default_factory=dict)
+    tokenizer: bytes | None = None
 
 
 def _compile(
@@ -188,10 +199,10 @@ def _compile(
     keep_fp32: Collection[str],
     single_file: str | os.PathLike[str] | None,
     explain: Explain,
-    beside: Mapping[str, bytes],
+    added: _Added,
     loop: str,
 ) -> Program:
-    """See ``compile_denoiser``; ``beside`` goes into the directory, for other programs. The single file is of ``loop``.
+    """See ``compile_denoiser``. The single file is of ``loop``.
 
     Nobody else may change the module: the program shares memory with it.
     """
@@ -225,7 +236,7 @@ def _compile(
         told = f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams"
         further = (f"{name}: {len(golden.loops[name].steps)} of {table.steps}" for name, table in spec.loops.items())
         explain("record_original", (told, *further))
-        manifest = write_artifact(program, models, directory, lowered, golden, beside, loop)
+        manifest = write_artifact(program, models, directory, lowered, golden, added.beside, loop, added.tokenizer)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         try:

@@ -24,6 +24,7 @@ from ttscompile import Noise, Plan, PolicySpec
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.core.plan import TokenReuse
 from ttscompile.ir.flops import graph_flops
+from ttscompile.measure.machine import cpuinfo
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.random_calls import random_calls
@@ -31,6 +32,9 @@ from ttscompile.runtimes.report import CallReport
 
 COMPARED = 3
 """Random observations that precisions are compared on: a dense call of a large policy takes seconds."""
+
+FLOORS = {"fp32": "fp32", "int8": "int8", "int4": "int8"}
+"""The product that a precision's floor is taken from: four bits are summed as eight, and bf16 is PyTorch's alone."""
 
 
 class Arithmetic:
@@ -82,7 +86,10 @@ class Times:
             seconds, flops = calls.seconds[left_out:], calls.flops[left_out:]
             total = statistics.median(map(sum, seconds))
             parts = ", ".join(f"{statistics.median(part):.2f}" for part in zip(*seconds, strict=True))
-            product = self._products["fp32" if calls.precision == "fp32" else "int8"]  # four bits are summed as eight
+            if calls.precision not in FLOORS:
+                print(f"{total:8.2f} s  {name}, {calls.precision}: {parts}", flush=True)
+                continue
+            product = self._products[FLOORS[calls.precision]]
             least = [product.seconds(statistics.mean(part)) for part in zip(*flops, strict=True)]
             floor = f"floor {sum(least):.3f}: {', '.join(f'{part:.3f}' for part in least)}"
             print(f"{total:8.2f} s  {name}: {parts}; {floor}; {total / sum(least):.2f} times it", flush=True)
@@ -99,9 +106,9 @@ def compare(
 ) -> None:
     """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in fewer bits.
 
-    Seconds are the processor's: all calls are on one thread, and the machine may be busy. Then it is told how far dense
-    actions in fewer bits are from those in fp32, with equal noise on some random observations, and how far other noise
-    moves these.
+    Where the processor multiplies in bf16, eager is timed under autocast, too. Seconds are the processor's: all calls
+    are on one thread, and the machine may be busy. Then it is told how far dense actions in fewer bits are from
+    those in fp32, with equal noise on some random observations, and how far other noise moves these.
 
     Args:
         folder: with the artifact.
@@ -119,9 +126,13 @@ def compare(
     policy = open_policy(artifact, plan=artifact.plan(f"dense@{precisions[0]}"))
     obs, noise = call(spec)
     times = Times(Arithmetic(artifact))
+    halves = not {"amx_bf16", "avx512_bf16"}.isdisjoint(cpuinfo().get("flags", "").split())
     for _ in range(rounds + 1):  # the first does not count
         times.next_round()
         expected, split = eager()
+        if exact and halves:
+            with torch.autocast("cpu", torch.bfloat16):
+                rounded, seconds = eager()
         for precision in precisions:
             for name, plan in plans_of(artifact, precision, computed).items():
                 policy.forget_frames()  # every call sees the same observation
@@ -130,10 +141,14 @@ def compare(
                     error = float(np.abs(found - expected).max())
                     assert policy.last_report is not None
                     times.add(f"eager: {parts}", "fp32", split, policy.last_report)
+                    if exact and halves:
+                        times.add(f"eager, autocast: {parts}", "bf16", seconds, policy.last_report)
     times.tell(1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     told = f"the dense call, {precisions[0]}, from eager; {peak:.2f} GiB at most, all of them loaded"
     print(f"{error:8.1e}  {told}")
+    if exact and halves:
+        print(f"{np.abs(rounded - expected).mean():8.2g}  eager in bf16 by autocast, from eager in fp32 on average")
     if exact:
         tell_precision(artifact, policy)
 

@@ -139,11 +139,7 @@ def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
         times: dict[int, list[float]] = {
             count: [] for count in (0, stream.tokens, *(-(-stream.tokens // part) for part in (2, 4, 8)))
         }
-        numbers = {
-            count: {INDEX: np.arange(count), **dict.fromkeys((PLACES, ROWS), np.tile(np.arange(count), 2))}
-            for count in times
-        }
-        bound = {count: Bound(some, {**feed, **numbers[count]}, given) for count in times if count}
+        bound = {count: Bound(some, {**feed, **_numbers(count, stream.tokens)}, given) for count in times if count}
         for _ in range(rounds + 1):  # the first does not count
             for count, own in times.items():
                 start = time.process_time()

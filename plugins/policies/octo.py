@@ -7,6 +7,7 @@ neither JAX nor orbax is needed. Source: ``OctoModel.sample_actions`` of octo-mo
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -328,14 +329,20 @@ def _task(directory: Path, settings: Settings, words: Words, options: LoadOption
     entry = settings.values.get("text_processor")
     own = _of_class(entry, settings, "text_processor", "HFTokenizer")[1]
     own.require(encode_with_model=False)
-    name = own.text("tokenizer_name", "t5-base", _MOST_LETTERS)
-    places = [
-        place for each in encoder_folders(options.encoders, directory) for place in (each / Path(name).name, each)
-    ]
-    folder = next((place for place in places if find_tokenizer(place) is not None), None)
+    name, file = own.text("tokenizer_name", "t5-base", _MOST_LETTERS), tokenizer_file(directory, options.encoders)
+    folder = None if file is None else file.parent
     tokens = task_tokens(options.task or "", name, folder, words.length, words.vocabulary)
     rows, mask = padded([tokens], words.length)
     return torch.from_numpy(rows), torch.from_numpy(mask)
+
+
+def tokenizer_file(directory: Path, encoders: str | os.PathLike[str] | None) -> Path | None:
+    """The tokenizer of its T5, if it is on this machine, in a folder of its name or where a T5 or the policy is."""
+    settings = Settings(read_json(directory / CONFIG), f"{directory / CONFIG}: ", _REMEDY)
+    own = _of_class(settings.values.get("text_processor"), settings, "text_processor", "HFTokenizer")[1]
+    name = Path(own.text("tokenizer_name", "t5-base", _MOST_LETTERS)).name
+    places = [place for each in encoder_folders(encoders, directory) for place in (each / name, each)]
+    return next((path for place in places if (path := find_tokenizer(place)) is not None), None)
 
 
 def _normalizer(directory: Path, settings: Settings, actions: int) -> tuple[str, Affine | None]:

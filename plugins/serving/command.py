@@ -28,7 +28,7 @@ from ttscompile.cli.sections import Section, SectionedCommand
 from ttscompile.cli.types import ADDRESS, ANY_TEXT, FILE, PATH, RATE, TEXT
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
-from ttscompile.runtimes.instruct import Instruct
+from ttscompile.runtimes.instruct import instruct_of
 from ttscompile.runtimes.load import open_policy
 
 from .admission import AUDIT, ServerLimits
@@ -200,8 +200,8 @@ SECTIONS = (
 @click.option(
     "--tokenizer",
     type=PATH,
-    help="Let clients send instructions as text: the task of an observation, or the prompt of openpi's. It is read with"
-    " this tokenizer.json, or that of this folder.",
+    help="Read the instructions that clients send as text, the task of an observation or the prompt of openpi's, with"
+    " this tokenizer.json, or that of this folder, in place of the artifact's own.",
 )
 @shared.runtime_options
 @click.option(
@@ -279,7 +279,7 @@ def _serve_fleet(
 ) -> None:
     console, artifact = progress(), load_artifact(directory)
     Plans.of(artifact, plan)  # before copies are started, which takes a while
-    instruct = None if tokenizer is None else Instruct(artifact.manifest.spec, tokenizer)
+    instruct = instruct_of(artifact, tokenizer)
     output, identity = sys.stdout, artifact.manifest.identity
     limits = ServerLimits.of(artifact.manifest.spec.observations, FLEET_CLIENTS)
     with (

@@ -94,7 +94,7 @@ class AsyncExecutor:
 
         Args:
             obs: by key, without the axes of batch and time: ``{"obs": float32 [Do]}``. Copied. The text ``task`` may be
-                among them if the policy was loaded with ``tokenizer=``; its tokens are made when it changes.
+                among them if the policy has a tokenizer, which the first text reads; tokens are made when it changes.
             t: when it was taken, on the executor's clock; None for now. Frames may come late and out of order.
 
         Raises:

@@ -30,6 +30,9 @@ def test_a_card_says_what_the_policy_needs_and_nothing_of_your_machine(toy_artif
     )
     assert "it runs with numpy and onnxruntime alone" in text and "real time" not in text
     assert "tokenizer" not in text and "give `load` its folder, `tokenizer=DIR`" in of_words
+    stores = replace(made.manifest.stores, tokenizer="tokenizer.json")
+    with_it = card(replace(made, manifest=replace(made.manifest, spec=told, stores=stores)), "org/name", [], [], None)
+    assert "the text `task`, which takes the package `tokenizers`." in with_it and "tokenizer=DIR" not in with_it
 
 
 @pytest.mark.slow

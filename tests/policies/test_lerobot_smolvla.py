@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.contestants import original_policy
 from ttscompile.core.spec import Noise
-from ttscompile.errors import CheckpointError, ObservationError
-from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.errors import ArtifactError, CheckpointError, ObservationError
+from ttscompile.frontends import load_checkpoint_policy, tokenizer_of
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import parts
 from ttscompile.frontends.families import LoadOptions
@@ -107,9 +108,9 @@ def test_select_action_over_twenty_ticks(compiled: Path, golden: Mapping[str, Ar
 def test_the_text_of_a_task_in_place_of_its_tokens(
     compiled: Path, directory: Path, golden: Mapping[str, Array]
 ) -> None:
-    """With a tokenizer on the robot; of two episodes the instructions differ."""
-    policy = ttscompile.load(compiled, tokenizer=directory.parent / "smolvlm-tiny")
-    for call in (0, 1):
+    """With the artifact's tokenizer, and with one on the robot; of two episodes the instructions differ."""
+    policies = ttscompile.load(compiled), ttscompile.load(compiled, tokenizer=directory.parent / "smolvlm-tiny")
+    for call, policy in enumerate(policies):
         given = arrays(golden, call)
         batch = {key: value for key, value in observed(given).items() if key not in (TOKENS, MASK)}
         for task in (str(given["task"]), [str(given["task"])]):
@@ -125,7 +126,18 @@ def test_the_text_of_a_task_in_place_of_its_tokens(
     with pytest.raises(ObservationError, match="the task is 3; expected a text"):
         policy.predict_action_chunk(batch | {"task": 3})
     with pytest.raises(ObservationError, match="no such file; expected the tokenizer.json"):
-        ttscompile.load(compiled, tokenizer=compiled)
+        ttscompile.load(compiled, tokenizer=directory)
+
+
+def test_the_artifact_has_its_tokenizer(compiled: Path, directory: Path, tmp_path: Path) -> None:
+    """It is one of the files that are checked, and LeRobot's own step makes no tokens before it."""
+    own = directory.parent / "smolvlm-tiny" / "tokenizer.json"
+    assert (compiled / "tokenizer.json").read_bytes() == own.read_bytes()
+    assert "tokenizer" not in (compiled / "policy_preprocessor.json").read_text()
+    shutil.copytree(compiled, tmp_path / "compiled")
+    (tmp_path / "compiled" / "tokenizer.json").write_bytes(own.read_bytes().replace(b" ", b"\t", 1))
+    with pytest.raises(ArtifactError, match="tokenizer.json: expected sha256"):
+        ttscompile.load(tmp_path / "compiled")
 
 
 def test_verify_names_a_broken_layer(compiled: Path, tmp_path: Path) -> None:
@@ -224,13 +236,33 @@ def test_a_tokenizer_that_is_missing_or_of_another_model(directory: Path, tmp_pa
     entries["model"]["vocab"]["zebra"] = 4000
     entries["added_tokens"].append(dict(entries["added_tokens"][0], id=4000, content="zebra"))
     (model / "tokenizer.json").write_text(json.dumps(entries))
+    _, spec = load_checkpoint_policy(policy)
     assert_not_read(policy, "token 4000; the language model has 400", options=LoadOptions(task="zebra"))
+    assert tokenizer_of(policy, spec, None) == (
+        None,
+        f"none: {model}/tokenizer.json has 4001 tokens, of which the policy knows 400",
+    )
     (model / "tokenizer.json").write_text("{")
     assert_not_read(policy, "no tokenizer that can be read", options=LoadOptions(task="go"))
+    assert "none: " in (told := tokenizer_of(policy, spec, None)[1]) and "no tokenizer that can be read" in told
     (model / "tokenizer.json").unlink()
     assert_not_read(
         policy, "is not on this machine: .* has none, and nothing is ever downloaded", options=LoadOptions(task="go")
     )
+    assert tokenizer_of(policy, spec, None)[0] is None
+    # What stands beside the policy, and not under the name of its model, may be anybody's.
+    shutil.copyfile(directory.parent / "smolvlm-tiny" / "tokenizer.json", tmp_path / "tokenizer.json")
+    assert tokenizer_of(policy, spec, None)[0] is None
+    assert tokenizer_of(policy, spec, tmp_path)[0] == (tmp_path / "tokenizer.json").read_bytes()
+
+
+def test_without_the_package_that_reads_it_the_artifact_has_no_tokenizer(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, spec = load_checkpoint_policy(directory)
+    monkeypatch.setitem(sys.modules, "tokenizers", None)
+    content, told = tokenizer_of(directory, spec, None)
+    assert content is None and "Install 'ttscompile[tokens]'" in told
 
 
 def test_a_processor_or_a_language_model_that_is_missing(directory: Path, tmp_path: Path) -> None:

@@ -60,9 +60,9 @@ def test_the_rebuilt_network_gives_lerobots_actions(
 def test_what_is_compiled_gives_them_too(
     whole: Whole, compiled: Path, golden: Mapping[str, Array], runtime: str
 ) -> None:
-    """The text of the task is an observation, whose tokens the policy makes."""
+    """The text of the task is an observation, whose tokens the policy makes with the tokenizer in the artifact."""
     kind, (count, numbers) = whole.kinds[0], whole.executed
-    policy = ttscompile.load(compiled, runtime=runtime, tokenizer=whole.tokenizer(kind))
+    policy = ttscompile.load(compiled, runtime=runtime)
     assert set(policy.info.observation) == {STATE, *whole.cameras, TOKENS, MASK}
     for call in whole.calls:
         given = {key: value[None] for key, value in whole.observation(kind, call).items()}
@@ -92,7 +92,7 @@ def test_every_rung_of_verify_holds(compiled: Path) -> None:
 def test_in_eight_bits_its_actions_are_near(whole: Whole, tmp_path: Path, golden: Mapping[str, Array]) -> None:
     kind = whole.kinds[0]
     ttscompile.convert(whole.save(kind, tmp_path / "saved", 0), tmp_path / "compiled", precision="int8")
-    policy = ttscompile.load(tmp_path / "compiled", tokenizer=whole.tokenizer(kind))
+    policy = ttscompile.load(tmp_path / "compiled")
     assert (policy.info.default_plan, policy.info.precision) == ("full", "int8")
     given = {key: value[None] for key, value in whole.observation(kind, 0).items()}
     found = policy.predict_action_chunk(given | {"task": whole.tasks[0]}, noise=Noise(whole.noise(kind)))
@@ -109,9 +109,13 @@ def test_doctor_knows_statistics_and_tokenizer(whole: Whole, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("whole", [pytest.param(one, id=one.name) for one in WHOLE if one.files], indirect=True)
 def test_lerobots_commands_take_it_with_its_task_alone(whole: Whole, tmp_path: Path) -> None:
-    """None of lerobot's steps writes what is around the instruction."""
+    """None of lerobot's steps writes what is around the instruction; an artifact with its tokenizer does it itself."""
     directory = whole.save(whole.kinds[0], tmp_path, 0)
-    assert not files_beside(directory, load_checkpoint_policy(directory)[1])
+    spec = load_checkpoint_policy(directory)[1]
+    assert not files_beside(directory, spec)
+    steps = json.loads(files_beside(directory, spec, text=True)["policy_preprocessor.json"])["steps"]
+    names = ["rename_observations_processor", "to_batch_processor", "device_processor"]
+    assert [step["registry_name"] for step in steps] == names
     beside = files_beside(directory, load_checkpoint_policy(directory, options=LoadOptions(task="go"))[1])
     assert set(json.loads(beside["config.json"])["input_features"]) == {STATE, *whole.cameras}
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,20 +15,26 @@ import pytest
 from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.core.spec import Instruction, ObservationSpec
-from ttscompile.errors import ObservationError
+from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.errors import ArtifactChangedError, ObservationError
 from ttscompile.runtimes.executor import AsyncExecutor
-from ttscompile.runtimes.instruct import Instruct
+from ttscompile.runtimes.instruct import Instruct, instruct_of
 
 WORDS = {"?": 0, "push": 1, "left": 2, "right": 3}
 STATE = np.zeros((1, 5), np.float32)
 
 
 @pytest.fixture
-def instruct(tmp_path: Path) -> Instruct:
+def spec() -> Any:
     language = {"tokens": ObservationSpec((3,), dtype="int64"), "mask": ObservationSpec((3,), dtype="bool")}
     told = Instruction("tokens", "mask", new_line=False)
-    spec: Any = SimpleNamespace(instruction=told, observations={"state": ObservationSpec((1, 5)), **language})
-    return Instruct(spec, write_tokenizer(tmp_path / "language", WORDS))
+    return SimpleNamespace(instruction=told, observations={"state": ObservationSpec((1, 5)), **language})
+
+
+@pytest.fixture
+def instruct(spec: Any, tmp_path: Path) -> Instruct:
+    folder = write_tokenizer(tmp_path / "language", WORDS)
+    return Instruct(spec, lambda: Tokenizer(folder, ObservationError))
 
 
 def test_every_stream_has_the_tokens_of_its_text(instruct: Instruct) -> None:
@@ -38,6 +46,38 @@ def test_every_stream_has_the_tokens_of_its_text(instruct: Instruct) -> None:
         np.testing.assert_array_equal(made["mask"], made["tokens"] > 0)
     with pytest.raises(ObservationError, match="the task is 3; expected a text, or one for each stream"):
         instruct({"state": states, "task": 3})
+
+
+def test_an_artifacts_own_tokenizer_is_read_when_a_text_comes(spec: Any, tmp_path: Path) -> None:
+    """Whoever gives tokens needs none; and one that was replaced since it was checked is not read."""
+    folder, reads, refused = write_tokenizer(tmp_path / "own", WORDS), list[str](), ArtifactChangedError("replaced")
+
+    @contextmanager
+    def reading(name: str) -> Iterator[None]:
+        reads.append(name)
+        if len(reads) == 1:
+            raise refused
+        yield
+
+    manifest = SimpleNamespace(spec=spec)
+    own: Any = SimpleNamespace(manifest=manifest, tokenizer=folder / "tokenizer.json", reading=reading)
+    instruct = instruct_of(own)
+    assert instruct is not None
+    assert instruct({"state": STATE}) == {"state": STATE} and not reads
+    with pytest.raises(ArtifactChangedError, match="replaced"):
+        instruct({"state": STATE, "task": "left"})
+    assert instruct({"state": STATE, "task": "left"})["tokens"].tolist() == [[2, 0, 0]]
+    assert instruct({"state": STATE, "task": "right"})["tokens"].tolist() == [[3, 0, 0]] and len(reads) == 2
+    given = instruct_of(own, write_tokenizer(tmp_path / "other", {"?": 0, "left": 1}))
+    assert given is not None and given({"task": "left"})["tokens"].tolist() == [[1, 0, 0]] and len(reads) == 2
+
+
+def test_a_policy_that_is_told_no_task_has_none(spec: Any, tmp_path: Path) -> None:
+    silent: Any = SimpleNamespace(manifest=SimpleNamespace(spec=SimpleNamespace(instruction=None)), tokenizer=None)
+    assert instruct_of(silent) is None
+    assert instruct_of(SimpleNamespace(manifest=SimpleNamespace(spec=spec), tokenizer=None)) is None  # type: ignore[arg-type]
+    with pytest.raises(ObservationError, match="this policy takes no text that alone would give its tokens"):
+        instruct_of(silent, tmp_path)
 
 
 def test_a_frame_has_no_axis_of_streams(instruct: Instruct) -> None:

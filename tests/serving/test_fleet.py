@@ -21,7 +21,7 @@ from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
 from ttscompile.runtimes.executor.window import Array
-from ttscompile.runtimes.instruct import Instruct
+from ttscompile.runtimes.instruct import instruct_of
 from ttscompile.serving.fleet import Answered, FleetServer, Plans
 from ttscompile.serving.lock import Lock, hashed
 
@@ -118,7 +118,7 @@ def test_robots_send_their_instruction_as_text_where_the_fleet_has_a_tokenizer(
     def served(**options: Any) -> Any:
         return listening(lambda: FleetServer(read, copies, limits=replace(LIMITS, message_bytes=8192), **options))
 
-    with served(instruct=Instruct(spec_told, tokenizer)) as url, connected(url) as call:
+    with served(instruct=instruct_of(read, tokenizer)) as url, connected(url) as call:
         assert call("predict", obs={**GOOD, "task": "push left"})["action"]
         assert copies.given[-1]["tokens"].tolist() == [1, 2, 0]
         assert copies.given[-1]["mask"].tolist() == [True, True, False]

@@ -62,13 +62,14 @@ def data_set(path: Path, version: int) -> Path:
 
 
 def require_told(path: Path, tokenizer: Path) -> None:
-    """Both episodes have the tokens of their texts, at every call."""
-    first, second = load_trajectories([path], OBSERVED, 3, {"task": (str(tokenizer),)}, TOLD)
-    assert first.calls == second.calls == 2
-    np.testing.assert_array_equal(first.observations[TOKENS], [[1, 2, 4]] * 2)
-    np.testing.assert_array_equal(first.observations[MASK], [[True] * 3] * 2)
-    np.testing.assert_array_equal(second.observations[TOKENS], [[1, 3, 3]] * 2)  # what is longer is cut
-    np.testing.assert_array_equal(second.observations["state"][0], arrays()["state"][ENDS[0] :][:1])
+    """Both episodes have the tokens of their texts, at every call: by the user's tokenizer, and by the policy's own."""
+    for asked, own in (({"task": (str(tokenizer),)}, None), (None, tokenizer)):
+        first, second = load_trajectories([path], OBSERVED, 3, asked, TOLD, own)
+        assert first.calls == second.calls == 2
+        np.testing.assert_array_equal(first.observations[TOKENS], [[1, 2, 4]] * 2)
+        np.testing.assert_array_equal(first.observations[MASK], [[True] * 3] * 2)
+        np.testing.assert_array_equal(second.observations[TOKENS], [[1, 3, 3]] * 2)  # what is longer is cut
+        np.testing.assert_array_equal(second.observations["state"][0], arrays()["state"][ENDS[0] :][:1])
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -82,6 +83,24 @@ def test_texts_of_an_npz_become_tokens(tmp_path: Path, tokenizer: Path) -> None:
     path = tmp_path / "it.npz"
     np.savez(path, state=arrays()["state"], task=np.array(texts), episode_ends=np.array(ENDS), meta=meta)
     require_told(path, tokenizer)
+
+
+def test_recorded_tokens_come_before_the_policys_own_tokenizer(tmp_path: Path, tokenizer: Path) -> None:
+    """Whoever names a tokenizer has the texts read all the same; without texts nothing stands for absent tokens."""
+    rows, path, meta = ENDS[-1], tmp_path / "it.npz", np.array('{"frames": true}')
+    tokens: dict[str, Any] = {TOKENS: np.full((rows, 3), 2), MASK: np.ones((rows, 3), bool)}
+    kept: dict[str, Any] = {"state": arrays()["state"], "episode_ends": np.array(ENDS), "meta": meta}
+    np.savez(path, task=np.array(["push"] * rows), **tokens, **kept)
+    with pytest.warns(UserWarning, match="arrays .'task'. are no keys of the observation"):
+        recorded = load_trajectories([path], OBSERVED, 3, None, TOLD, tokenizer)
+    asked = {"task": (str(tokenizer),)}
+    with pytest.warns(UserWarning, match=f"arrays .'{MASK}', '{TOKENS}'. are no keys of the observation"):
+        made = load_trajectories([path], OBSERVED, 3, asked, TOLD)
+    assert recorded[0].observations[TOKENS].tolist() == [[2] * 3] * 2
+    assert made[0].observations[TOKENS].tolist() == [[1, 4, 0]] * 2
+    np.savez(path, **kept)
+    with pytest.raises(TrajectoryError, match=f"no array '{TOKENS}'"):
+        load_trajectories([path], OBSERVED, 3, None, TOLD, tokenizer)
 
 
 def test_short_texts_are_padded(tmp_path: Path, tokenizer: Path) -> None:

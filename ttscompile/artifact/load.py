@@ -97,6 +97,12 @@ class Artifact:
             )
 
     @property
+    def tokenizer(self) -> Path | None:
+        """What makes an instruction's text the policy's tokens, to be read within ``reading``; None without."""
+        name = self.manifest.stores.tokenizer
+        return None if name is None else self.files / name
+
+    @property
     def files(self) -> Path:
         """The folder to read from, within ``reading``: still the one that was checked when another is at ``path``."""
         return self._folder.files
@@ -289,7 +295,8 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
         )
     check_size(manifest, directory)
     check_models(directory, manifest.models, manifest.acting)
-    others = sorted(stamps.keys() - manifest.models - {manifest.stores.program, MANIFEST})
+    stores = manifest.stores
+    others = sorted(stamps.keys() - manifest.models - {stores.program, stores.tokenizer, MANIFEST})
     tensors.require_few((directory / name for name in others), directory)
     stored = tensors.read(directory / manifest.stores.weights)
     apart = None if manifest.precision is None else manifest.precision.fp32

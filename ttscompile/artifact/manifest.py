@@ -189,6 +189,7 @@ class Stores:
         plans: schedules and corrections.
         golden: what the original network answered (``artifact.golden``).
         golden_plans: what the reference runtime made of the plans when they were calibrated.
+        tokenizer: what makes an instruction's text the policy's tokens.
     """
 
     program: FileName
@@ -197,6 +198,7 @@ class Stores:
     plans: FileName | None
     golden: FileName | None = None
     golden_plans: FileName | None = None
+    tokenizer: FileName | None = field(default=None, metadata=OMITTED)
 
 
 @dataclass(frozen=True)

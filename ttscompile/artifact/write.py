@@ -32,7 +32,7 @@ from .strict_json import dump_compact
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-PROGRAM = "program.json"
+PROGRAM, TOKENIZER = "program.json", "tokenizer.json"
 WEIGHTS, WEIGHTS_FP32 = "weights.safetensors", "weights_fp32.safetensors"
 GOLDEN = "golden.safetensors"
 
@@ -44,7 +44,7 @@ BESIDE = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json"
 """Files for LeRobot that may stand in an artifact. Nothing here reads them, the manifest does not list them, and no
 identity covers them."""
 
-_BESIDE = "|".join(map(re.escape, BESIDE))
+_BESIDE = "|".join(map(re.escape, (TOKENIZER, *BESIDE)))
 _OURS = re.compile(rf"manifest\.json|program\.json|{_BESIDE}|[A-Za-z0-9_-]+\.(onnx|safetensors)|{_STALE.pattern}")
 
 
@@ -56,6 +56,7 @@ def write_artifact(
     golden: Golden | None = None,
     beside: Mapping[str, bytes] | None = None,
     loop: str = ORIGINAL,
+    tokenizer: bytes | None = None,
 ) -> Manifest:
     """Write a compiled program.
 
@@ -72,6 +73,7 @@ def write_artifact(
         golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
         beside: files for other programs, by name, one of ``BESIDE``.
         loop: of plan ``full``.
+        tokenizer: content of ``tokenizer.json``, of a policy that is told its task in words; None without.
 
     Raises:
         ArtifactError: ``directory`` is something else than an artifact, or cannot be written; or program and models do
@@ -84,7 +86,7 @@ def write_artifact(
         target.parent.mkdir(parents=True, exist_ok=True)
         files.recover(target)
         with locked(target) if target.is_dir() else nullcontext(), files.new_folder(target) as partial:
-            manifest = _fill(partial, program, models, lowered, golden, loop)
+            manifest = _fill(partial, program, models, lowered, golden, loop, tokenizer)
             for name, content in (beside or {}).items():
                 assert name in BESIDE
                 files.write_synced(partial / name, content)
@@ -234,13 +236,13 @@ def _fill(
     lowered: LoweredPieces | None,
     golden: Golden | None,
     loop: str,
+    tokenizer: bytes | None,
 ) -> Manifest:
     verify_pieces(program)
     graphs = program.pieces.graphs()
     read = sorted({name for graph in graphs.values() for name in graph.constants})
     values: dict[str, npt.NDArray[Any]] = {name: program.weights[name] for name in read}
-    contexts = records.context_records(program)
-    requires = records.requirements(models)
+    contexts, requires = records.context_records(program), records.requirements(models)
     # The names of loops need not be names of files.
     numbered = {of_loop(ADVANCE, of): f"{ADVANCE}_{i:02d}" for i, of in enumerate(program.spec.loops, start=1)}
     onnx_files = {name: f"{numbered.get(name, name)}.onnx" for name in models}
@@ -279,6 +281,8 @@ def _fill(
         plans[FULL] = PlanRecord("all", loop=loop, precision=held)
     if golden is not None:
         files.write_synced(folder / GOLDEN, tensors.serialize(golden.arrays()))
+    if tokenizer is not None:
+        files.write_synced(folder / TOKENIZER, tokenizer)
     graphs |= {of_loop(PRUNER, loop): graph for loop, graph in program.pieces.loop_pruners.items()}
     document = {
         "graphs": {name: graph_to_json(graph) for name, graph in graphs.items()},
@@ -302,7 +306,12 @@ def _fill(
             default_plan=FULL if plans else DENSE,
             calibration=None,
             stores=Stores(
-                PROGRAM, WEIGHTS, pruner_files.pop(PRUNER, None), None, golden=None if golden is None else GOLDEN
+                PROGRAM,
+                WEIGHTS,
+                pruner_files.pop(PRUNER, None),
+                None,
+                golden=None if golden is None else GOLDEN,
+                tokenizer=None if tokenizer is None else TOKENIZER,
             ),
             requires=requires,
             files={path.name: files.describe(path) for path in sorted(folder.iterdir())},

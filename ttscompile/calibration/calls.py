@@ -4,6 +4,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,7 @@ from ..core.spec import PolicySpec
 from ..errors import CalibrationError
 from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
-from ..trajectories.episodes import Episode, load_trajectories
+from ..trajectories.episodes import Episode, episodes_of
 from ..trajectories.fits import check_ranges
 
 IntArray = npt.NDArray[np.int64]
@@ -50,15 +51,17 @@ def split_episodes(count: int, fraction: float, seed: int) -> Split:
 
 
 def load_episodes(
-    spec: PolicySpec, trajectories: Sequence[str | os.PathLike[str]], observation: Mapping[str, Sequence[str]] | None
+    spec: PolicySpec,
+    trajectories: Sequence[str | os.PathLike[str]],
+    observation: Mapping[str, Sequence[str]] | None,
+    tokenizer: Path | None = None,
 ) -> list[Episode]:
     """The recorded episodes, as the policy observes them; see ``load_trajectories``.
 
     Raises:
         TrajectoryError: the recordings do not fit the policy.
     """
-    steps = spec.chunk.stop - spec.chunk.start
-    episodes = load_trajectories(trajectories, spec.observations, steps, observation, spec.instruction)
+    episodes = episodes_of(spec, trajectories, observation, tokenizer)
     if len(episodes) < 2:
         raise CalibrationError(
             "the trajectories hold one episode; expected at least two: a plan is judged on episodes that it was not"

@@ -91,7 +91,7 @@ def compare(
             raise CalibrationError(f"two artifacts are called {name!r}: points could not be told apart. Rename one.")
         compared[name] = load_artifact(other)
         _require_same_policy(artifact, compared[name], name)
-    episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
+    episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
     on = None if device is None else torch.device(device)
     state = StateFile(None, {})
     trials = Trials.of(artifact, episodes, state, seed=seed, observations=calls, device=on, runtime=runtime)

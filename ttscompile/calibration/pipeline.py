@@ -228,7 +228,7 @@ def calibrate(
         for _, proposer in made:
             if (reason := proposer.applies(artifact)) is not None:
                 raise CalibrationError(reason)
-        episodes = load_episodes(artifact.manifest.spec, trajectories, observation)
+        episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
         corrects = correct or any(row.corrects for row in rows if row.name != SCHEDULE)
         corrects |= chosen.fits_correction and SCHEDULE in learn
         limits = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))

@@ -24,7 +24,7 @@ from ttscompile.report.page import require_packages
 from ttscompile.report.usage import run_episode
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.trajectories import Episode, load_trajectories
+from ttscompile.trajectories import Episode, episodes_of
 
 SCHEDULE = "schedule"
 """Name that calibration gives to its best plan that does not depend on the observation."""
@@ -77,8 +77,7 @@ def inspect(
     console, artifact = progress(), load_artifact(directory)
     spec, episode = artifact.manifest.spec, None
     if trajectories:
-        executed = spec.chunk.stop - spec.chunk.start
-        episode = load_trajectories(trajectories, spec.observations, executed, sources, spec.instruction)[0]
+        episode = episodes_of(spec, trajectories, sources, artifact.tokenizer)[0]
     passed, section = True, NOT_RUN
     if page is not None:
         with only_results_on_stdout(), console.status("loading") as status:

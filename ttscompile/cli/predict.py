@@ -53,8 +53,12 @@ def _numbers(_: click.Context, __: click.Parameter, value: str | None) -> Any:
     " observation.images.front. May be repeated.",
 )
 @click.option("--state", type=TEXT, callback=_numbers, metavar="NUMBER,..", help="Give the state these numbers.")
-@click.option("--task", type=TEXT, help="Give this instruction to a policy that reads one; needs --tokenizer.")
-@click.option("--tokenizer", type=PATH, help="Read the task with this tokenizer.json, or that of this folder.")
+@click.option("--task", type=TEXT, help="Give this instruction to a policy that reads one.")
+@click.option(
+    "--tokenizer",
+    type=PATH,
+    help="Read the task with this tokenizer.json, or that of this folder, in place of the artifact's own.",
+)
 @click.option(
     "--observation", "archive", type=FILE, help="Take arrays by key from this .npz: whatever the policy reads."
 )
@@ -82,9 +86,9 @@ def predict(
     artifact = load_artifact(directory)
     spec = artifact.manifest.spec
     obs, repeated = observed(spec.observations, pictures, state, archive)
-    if task is not None and (spec.instruction is None or tokenizer is None):
+    if task is not None and (spec.instruction is None or (tokenizer or artifact.tokenizer) is None):
         compiled = f"the policy reads no text; compiled in is {spec.source.get('task', 'none')!r:.100}"
-        told = compiled if spec.instruction is None else "--tokenizer PATH is needed, too"
+        told = compiled if spec.instruction is None else "the artifact has no tokenizer; name one by --tokenizer PATH"
         raise ObservationError(f"{directory}: --task {task!r:.100}: {told}. Or give tokens in --observation FILE.npz.")
     with progress().status("loading"):
         policy = open_policy(artifact, seed=seed, plan=plan, tokenizer=tokenizer)

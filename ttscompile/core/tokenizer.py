@@ -15,7 +15,9 @@ from .rules import OMITTED
 TASK = "task"
 """The key of an instruction's text, as LeRobot has it."""
 
-FILE, _VOCABULARY, _MERGES = "tokenizer.json", "vocab.json", "merges.txt"
+FILE = "tokenizer.json"
+
+_VOCABULARY, _MERGES = "vocab.json", "merges.txt"
 _MOST_BYTES = 64 * 2**20
 """Of a file; PaliGemma's has 18 MB."""
 
@@ -105,8 +107,13 @@ class Tokenizer:
 
     @property
     def size(self) -> int:
-        """How many tokens there are, added ones counted."""
-        return int(self._tokenizer.get_vocab_size())
+        """One more than its largest token, added ones counted: what a model has to know."""
+        return max(self._tokenizer.get_vocab().values(), default=-1) + 1
+
+    @property
+    def json(self) -> bytes:
+        """What ``tokenizer.json`` says of it: the file that was read, or of CLIP's two files what they make."""
+        return self._path.read_bytes() if self._path.name != _VOCABULARY else self._tokenizer.to_str().encode()
 
     def with_words(self, words: Sequence[str]) -> list[int]:
         """The token of each of these words; those that are none yet become one, as transformers adds them."""

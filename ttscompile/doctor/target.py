@@ -111,14 +111,16 @@ def target_findings(
         from ..artifact.load import load_artifact
         from ..trajectories.fits import examine_recordings
 
+        tokenizer = None
         if isinstance(target, str) or is_checkpoint(target):
             found, spec = _checkpoint(target)
         else:
             found = artifact_findings(target)
             if not recordings or any(one.what == "load" for one in found):
                 return found
-            spec = load_artifact(target).manifest.spec
-        return [*found, *(examine_recordings(recordings, spec, sources or {}) if recordings else [])]
+            artifact = load_artifact(target)
+            spec, tokenizer = artifact.manifest.spec, artifact.tokenizer
+        return [*found, *(examine_recordings(recordings, spec, sources or {}, tokenizer) if recordings else [])]
     except ModuleNotFoundError as error:
         told = f"not tried: {(error.name or '').partition('.')[0]} is not installed"
         return [Finding(CHECKPOINT, "load", told, Level.PROBLEM, "Run: pip install 'ttscompile[compile]'.")]

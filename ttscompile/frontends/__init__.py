@@ -10,8 +10,11 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..core.paths import require_free_or_path
 from ..core.spec import PolicySpec
+from ..core.tokenizer import Tokenizer
 from ..errors import CheckpointError
 from .families import AS_SAVED, LoadOptions, find_family, function_of
 
@@ -41,10 +44,39 @@ def load_checkpoint_policy(
     return find_family(Path(path), format).load(Path(path), options)
 
 
-def files_beside(path: str | os.PathLike[str], spec: PolicySpec) -> dict[str, bytes] | None:
+def tokenizer_of(
+    path: str | os.PathLike[str], spec: PolicySpec, encoders: str | os.PathLike[str] | None
+) -> tuple[bytes | None, str]:
+    """The ``tokenizer.json`` that makes an instruction a policy's tokens; and which that is, or why there is none.
+
+    One that belongs to another language model is none: it knows more tokens than the policy does.
+
+    Args:
+        encoders: see ``LoadOptions``.
+    """
+    if spec.instruction is None:
+        return None, "none: no text alone gives what this policy observes"
+    find, bounds = function_of(spec, "tokenizer_file"), spec.observations[spec.instruction.tokens].bounds
+    try:
+        file = None if find is None else find(Path(path), encoders)
+        if file is None or bounds is None:
+            return None, "none: its tokenizer is not on this machine, and whoever gives the policy text has to have it"
+        found = Tokenizer(file, CheckpointError)
+    except CheckpointError as error:
+        return None, f"none: {error}"
+    known = round(float(np.max(bounds[1]))) + 1
+    if found.size > known:
+        return None, f"none: {file} has {found.size} tokens, of which the policy knows {known}"
+    return found.json, f"{file}: {found.size} tokens"
+
+
+def files_beside(path: str | os.PathLike[str], spec: PolicySpec, text: bool) -> dict[str, bytes] | None:
     """Files by which the program that trained a policy takes the compiled one in its place.
 
     None where it never can; empty where it cannot take this one.
+
+    Args:
+        text: whether the compiled one makes tokens of its task itself.
     """
     own = function_of(spec, "files_beside")
-    return None if own is None else own(Path(path), spec)
+    return None if own is None else own(Path(path), spec, text)

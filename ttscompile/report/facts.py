@@ -57,6 +57,7 @@ def policy(artifact: Artifact) -> Section:
     before = ", from the chunk of the call before"
     rows = [
         *((f"observation {key!r}", _observation(one)) for key, one in spec.observations.items()),
+        *([] if spec.instruction is None else [("instruction", told_in_words(manifest))]),
         ("action", action),
         *((f"loop {name!r}", told_sampler(table)) for name, table in spec.all_loops.items()),
         *((f"loop {n!r}", f"the last {one.steps} steps of {one.loop!r}{before}") for n, one in manifest.starts.items()),
@@ -74,6 +75,13 @@ def policy(artifact: Artifact) -> Section:
 def _observation(one: ObservationSpec) -> str:
     inside = "as it is" if one.normalizer is None else "normalised inside"
     return f"{one.dtype}{list(one.shape)} a stream, {inside}" + ", from pictures of any size" * (one.fit is not None)
+
+
+def told_in_words(manifest: Manifest) -> str:
+    """Whether a policy that reads an instruction takes it as text."""
+    if manifest.stores.tokenizer is None:
+        return "its tokens, or the text 'task' where the policy is loaded with tokenizer=DIR"
+    return f"the text 'task' in place of its tokens, which {manifest.stores.tokenizer} makes"
 
 
 def told_sampler(table: SamplerTable) -> str:

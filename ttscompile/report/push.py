@@ -28,9 +28,10 @@ from .timing import Measurement, latency, measure_plans
 BASE, BASE_LICENCE = "base", "base_licence"
 """Entries of ``PolicySpec.source`` that ``convert`` writes of a checkpoint from the hub."""
 _MOST_BYTES = 64 << 20
-_TOKENIZER = (
-    "It is told its task in words. Text takes the base's tokenizer, which is not in this repository, and the package"
-    " `tokenizers`: give `load` its folder, `tokenizer=DIR`. Without it, give the tokens and their mask yourself."
+_WORDS = "It is told its task in words: an observation has the text `task`, which takes the package `tokenizers`{}."
+_ELSEWHERE = (
+    ", and the base's tokenizer, which is not in this repository: give `load` its folder, `tokenizer=DIR`. Without it,"
+    " give the tokens and their mask yourself"
 )
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~])")
 
@@ -122,7 +123,7 @@ def card(
         told_dense = "It was not calibrated: every call is dense, and does what the base does."
         calibrated = replace(calibrated, text=(told_dense,))
     if manifest.spec.instruction is not None:
-        lines += ["", _TOKENIZER]
+        lines += ["", _WORDS.format(_ELSEWHERE if manifest.stores.tokenizer is None else "")]
     for section in (
         _what(artifact, base, licence),
         replace(calibrated, tables=calibrated.tables[:-1]),  # without the record

@@ -3,6 +3,6 @@
 Whatever is wrong with a recording is a ``TrajectoryError`` of any function of this room.
 """
 
-from .episodes import Episode, load_trajectories, read_npz
+from .episodes import Episode, episodes_of, load_trajectories, read_npz
 
-__all__ = ["Episode", "load_trajectories", "read_npz"]
+__all__ = ["Episode", "episodes_of", "load_trajectories", "read_npz"]

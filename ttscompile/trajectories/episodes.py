@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ..core.coercion import integer
 from ..core.paths import on_hub, require_path
-from ..core.spec import Instruction, ObservationSpec
+from ..core.spec import Instruction, ObservationSpec, PolicySpec
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values, fitted
@@ -62,6 +62,7 @@ def load_trajectories(
     action_steps: int,
     sources: Mapping[str, Sequence[str]] | None = None,
     instruction: Instruction | None = None,
+    tokenizer: Path | None = None,
 ) -> list[Episode]:
     """Read episodes from files.
 
@@ -72,6 +73,7 @@ def load_trajectories(
             are called otherwise; ``NAME:N`` are the first N numbers of one. With ``task``, the path of a tokenizer, the
             recorded instructions are made the policy's tokens.
         instruction: how the policy is told its task in words.
+        tokenizer: makes recorded instructions tokens where ``sources`` names none and no tokens were recorded.
 
     Returns:
         The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning; so
@@ -89,7 +91,7 @@ def load_trajectories(
         raise TrajectoryError("no trajectory files were given. Name at least one .npz with recorded episodes.")
     different: dict[bytes, Episode] = {}  # one that is there twice could be learned from and held out at once
     again = []
-    how = observations, action_steps, sources or {}, instruction
+    how = observations, action_steps, sources or {}, instruction, tokenizer
     read = [(path, _read(path, *how)) for path in paths]
     for path, found in read:
         if on_hub(path):
@@ -106,6 +108,17 @@ def load_trajectories(
     return list(different.values())
 
 
+def episodes_of(
+    spec: PolicySpec,
+    paths: Sequence[str | os.PathLike[str]],
+    sources: Mapping[str, Sequence[str]] | None = None,
+    tokenizer: Path | None = None,
+) -> list[Episode]:
+    """Recorded episodes as a policy observes them, with a call for each chunk that it executes."""
+    executed = spec.chunk.stop - spec.chunk.start
+    return load_trajectories(paths, spec.observations, executed, sources, spec.instruction, tokenizer)
+
+
 def local_path(path: str | os.PathLike[str]) -> Path:
     """Where a recording is on this machine; of a data set on the hub the first episodes are downloaded."""
     return fetch_recording(os.fspath(path)) if on_hub(path) else Path(path)
@@ -117,17 +130,19 @@ def _read(
     action_steps: int,
     given: Mapping[str, Sequence[str]],
     instruction: Instruction | None,
+    tokenizer: Path | None,
 ) -> list[Episode]:
     path, limits = local_path(given_path), {"most": MOST_EPISODES} if on_hub(given_path) else {}
     sources = {key: parts for key, parts in given.items() if key != TASK}
-    words = instruction if TASK in given else None
-    if TASK in given and words is None:
+    asked = TASK in given
+    if asked and instruction is None:
         told = f"{given[TASK][0]}: this policy takes no text that alone would give its tokens. Leave the tokenizer out"
         raise TrajectoryError(f"{told}, and record tokens if it observes any.")
-    text = {words.tokens, words.mask} if words else set()
-    seen = {key: spec for key, spec in observations.items() if key not in text}
-    used = {part.partition(":")[0] for key in seen for part in sources.get(key, (key,))} | ({TASK} & set(given))
-    other, held, frames = _opened(path, limits, sorted(used))
+    tokenizer = Path(given[TASK][0]) if asked else tokenizer
+    other, held, frames = _opened(path, limits, sorted({*_arrays(observations, sources), TASK}))
+    words = instruction if asked or (tokenizer and _in_text_alone(held, instruction, sources)) else None
+    seen = {key: spec for key, spec in observations.items() if words is None or key not in (words.tokens, words.mask)}
+    used = _arrays(seen, sources) | ({TASK} if words else set())
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
@@ -138,8 +153,8 @@ def _read(
         held, action_steps = frames_of_calls(held, action_steps), 1
         ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
-    if words:
-        arrays |= instruction_rows(path, held, words, observations, os.fspath(given[TASK][0]))
+    if words and tokenizer:
+        arrays |= instruction_rows(path, held, words, observations, tokenizer)
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}
@@ -160,6 +175,16 @@ def _read(
             part = {key: _windows(array, observations[key].frames, action_steps) for key, array in part.items()}
         episodes.append(Episode(f"{path.name}[{number}]", part))
     return episodes
+
+
+def _arrays(keys: Iterable[str], sources: Mapping[str, Sequence[str]]) -> set[str]:
+    """Names of the arrays of a recording that these keys of the observation are made of."""
+    return {part.partition(":")[0] for key in keys for part in sources.get(key, (key,))}
+
+
+def _in_text_alone(held: Frames, told: Instruction | None, sources: Mapping[str, Sequence[str]]) -> bool:
+    """Whether a recording says the task in words, and has no tokens of them, nor what they are to be made of."""
+    return told is not None and TASK in held.names and {told.tokens, told.mask}.isdisjoint({*held.names, *sources})
 
 
 def recorded_names(path: Path) -> tuple[list[str], bool]:

@@ -15,7 +15,7 @@ from ..core.spec import Affine, PolicySpec
 from ..core.tokenizer import TASK
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .episodes import Episode, load_trajectories, local_path, recorded_names
+from .episodes import Episode, episodes_of, local_path, recorded_names
 from .frames import few, one_error
 from .lerobot_dataset import MAX_INFO
 
@@ -122,11 +122,15 @@ _BLIND_SECONDS = 3.0
 
 
 def examine_recordings(
-    paths: Sequence[str | os.PathLike[str]], spec: PolicySpec, sources: Mapping[str, Sequence[str]]
+    paths: Sequence[str | os.PathLike[str]],
+    spec: PolicySpec,
+    sources: Mapping[str, Sequence[str]],
+    tokenizer: Path | None = None,
 ) -> list[Finding]:
     """Look at recordings, which are given as to ``load_trajectories``, as the policy would observe them."""
     found, renamed = list[Finding](), dict(sources)
-    if said := [key for key in spec.observations if key.startswith(_LANGUAGE) and not {key, TASK} & set(sources)]:
+    language = [key for key in spec.observations if key.startswith(_LANGUAGE)]
+    if tokenizer is None and (said := [key for key in language if not {key, TASK} & set(sources)]):
         observed = {key: one for key, one in spec.observations.items() if key not in said}
         spec = replace(spec, observations=observed, instruction=None)
         told = f"{', '.join(said)}: not looked at; recordings seldom have them, and convert --task compiles a text in"
@@ -135,9 +139,8 @@ def examine_recordings(
         warnings.simplefilter("always")
         try:
             for path in map(local_path, paths):
-                found += [*_names(path, spec, renamed), *_rate(path, spec)]
-            steps = spec.chunk.stop - spec.chunk.start
-            episodes = load_trajectories(paths, spec.observations, steps, renamed, spec.instruction)
+                found += [*_names(path, spec, renamed, tokenizer), *_rate(path, spec)]
+            episodes = episodes_of(spec, paths, renamed, tokenizer)
         except TrajectoryError as error:
             return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
     found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in warned]
@@ -145,11 +148,12 @@ def examine_recordings(
     return [*found, *map(judged, placed(episodes, spec))]
 
 
-def _names(path: Path, spec: PolicySpec, renamed: dict[str, Sequence[str]]) -> list[Finding]:
+def _names(path: Path, spec: PolicySpec, renamed: dict[str, Sequence[str]], tokenizer: Path | None) -> list[Finding]:
     """Keys that a recording lacks; a name that may stand for one is added to ``renamed``, and said."""
     names, frames = recorded_names(path)
     used = {part.partition(":")[0] for key in spec.observations for part in renamed.get(key, (key,))}
-    text = {spec.instruction.tokens, spec.instruction.mask} if TASK in renamed and spec.instruction else set[str]()
+    worded = TASK in renamed or (tokenizer is not None and TASK in names)
+    text = {spec.instruction.tokens, spec.instruction.mask} if worded and spec.instruction else set[str]()
     missing = [key for key in spec.observations if key not in renamed and key not in names and key not in text]
     free = [name for name in names if name not in used]
     if not missing:

@@ -204,7 +204,7 @@ def one_error(what: str, hint: str = "") -> Iterator[None]:
 
 
 def instruction_rows(
-    path: Path, held: Frames, told: Instruction, observations: Mapping[str, ObservationSpec], tokenizer: str
+    path: Path, held: Frames, told: Instruction, observations: Mapping[str, ObservationSpec], tokenizer: Path
 ) -> dict[str, Array]:
     """Tokens and mask of every row, from its text.
 

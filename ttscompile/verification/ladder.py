@@ -19,7 +19,7 @@ from ..core.plan import DENSE
 from ..errors import ArtifactChangedError, ArtifactError, RuntimeUnavailableError, TtscompileError
 from ..runtimes.open import MOST_THREADS, open_runtime
 from ..runtimes.policy import CompiledPolicy
-from ..trajectories.episodes import load_trajectories
+from ..trajectories.episodes import episodes_of
 from .calls import DENSE_CALL, PLANS, RUNTIMES, TOKENS, check_dense, check_plans, check_runtimes, check_tokens
 from .network import BLOCK, EVALUATION, PREPROCESSING, Probe, check_blocks, check_evaluation, check_preprocessing
 from .precision import PLANS_PRECISION, PRECISION, check_plans_precision, check_precision
@@ -69,9 +69,7 @@ def verify(
         return Verification(str(path), None, None, (rung,), time.monotonic() - begun)
     manifest, episodes = artifact.manifest, []
     if trajectories:
-        spec = manifest.spec
-        steps = spec.chunk.stop - spec.chunk.start
-        episodes = choose(load_trajectories(trajectories, spec.observations, steps, sources, spec.instruction), calls)
+        episodes = choose(episodes_of(manifest.spec, trajectories, sources, artifact.tokenizer), calls)
     rungs, errors = _climb(artifact, episodes, threads, progress)
     seconds = time.monotonic() - begun
     return Verification(str(path), manifest.identity, manifest.model_identity, (rung, *rungs), seconds, errors)

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 _LANGUAGE = "observation.language."
 _FILES = [
-    *("manifest.json", "program.json", "*.onnx", "*.safetensors"),
+    *("manifest.json", "program.json", "tokenizer.json", "*.onnx", "*.safetensors"),
     *("config.json", "policy_preprocessor.json", "policy_postprocessor.json"),
 ]
 """Of a repository: an artifact's files, and those that LeRobot reads beside them. ``load`` checks them."""
@@ -123,8 +123,8 @@ class TtscompilePolicy(PreTrainedPolicy):
         """The next action ``[B, Da]``, in the units of the robot.
 
         Args:
-            batch: one frame of every stream by key, in the units of the robot; keys that are not the policy's are left
-                alone.
+            batch: one frame of every stream by key, in the units of the robot, and the ``task`` of each where the
+                artifact makes its tokens; keys that are not the policy's are left alone.
             noise: ``[B, T, D]`` that a chunk starts from, if this call computes one; None draws it.
         """
         if self._shadow is not None:

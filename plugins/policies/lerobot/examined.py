@@ -7,10 +7,9 @@ from typing import Any
 
 from ttscompile.core.finding import Finding, Level
 from ttscompile.core.spec import PolicySpec
-from ttscompile.core.tokenizer import Tokenizer, find_tokenizer
+from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.examined import PART, REPEAT, judged
-from ttscompile.frontends.instruction import encoder_folders
 from ttscompile.frontends.saved_weights import read_tensors
 from ttscompile.frontends.settings import read_json
 
@@ -18,8 +17,7 @@ from .config import ACTION, CONFIG
 from .groot_steps import read_groot_processors
 from .policy import TOKENS
 from .processors import NORMALIZE, PREPROCESSOR, Features, Processors, read_processors
-
-_MODELS = ("vlm_model_name", "qwen_model_name", "vlm_base", "pretrained_name_or_path")
+from .tokenizer import tokenizer_file, tokenizer_name
 
 
 def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
@@ -62,9 +60,7 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
         told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
         remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
         doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
-    model = next((entries[key] for key in _MODELS if key in entries), "none")
-    name = str(found.tokenizer.get("tokenizer_name", model))[:200]
-    return [*doubts, *_cameras(features, step, measured), *_tokenizer(directory, name, found, spec, encoders)]
+    return [*doubts, *_cameras(features, step, measured), *_tokenizer(directory, found, spec, encoders)]
 
 
 def _measured(directory: Path, step: Mapping[str, Any]) -> set[str]:
@@ -95,15 +91,13 @@ def _cameras(features: Features, step: Mapping[str, Any], measured: set[str]) ->
 
 
 def _tokenizer(
-    directory: Path, name: str, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
+    directory: Path, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
 ) -> list[Finding]:
     """Of a policy that reads an instruction: whether the tokenizer is of its language model."""
     one = spec.observations.get(TOKENS)
     if one is None or one.bounds is None:
         return []
-    near = encoder_folders(encoders, directory)
-    places = [place for each in near for place in (each / name, each / Path(name).name, each)]
-    file = next((path for place in places if (path := find_tokenizer(place)) is not None), None)
+    file, name = tokenizer_file(directory, encoders), tokenizer_name(directory) or "none"
     level, told, remedy = Level.NOTE, f"{name:.100}, which is not on this machine, and so was not tried", ""
     if (length := found.tokenizer.get("max_length", one.shape[0])) != one.shape[0]:
         level, told = Level.WARNING, f"makes {length!s:.20} tokens of an instruction; {one.shape[0]} are read"

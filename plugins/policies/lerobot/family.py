@@ -17,8 +17,9 @@ from ttscompile.frontends.settings import read_json
 from .config import CONFIG
 from .examined import examine
 from .files import files_beside
+from .tokenizer import tokenizer_file
 
-__all__ = ["TYPES", "examine", "files_beside", "load"]
+__all__ = ["TYPES", "examine", "files_beside", "load", "tokenizer_file"]
 
 TYPES = {name: name for name in "act diffusion eo1 evo1 groot multi_task_dit smolvla vla_jepa wall_x xvla".split()}
 TYPES |= {"pi0": "pi", "pi05": "pi"}

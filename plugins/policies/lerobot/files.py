@@ -2,7 +2,7 @@
 
 With these files beside it, an artifact is a policy of the type ``ttscompile``, which the package
 ``lerobot_policy_ttscompile`` registers. It takes what the robot measures, so its processors normalise nothing: they
-make batches, and tokens of the instruction where that is an input.
+make batches, and tokens of the instruction where that is an input and the artifact has no tokenizer of its own.
 """
 
 import json
@@ -27,16 +27,19 @@ _TEXT = {
 """Steps that work on the instruction, by the name that lerobot knows without the modules of their policies."""
 
 
-def files_beside(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
+def files_beside(directory: Path, spec: PolicySpec, text: bool = False) -> dict[str, bytes]:
     """The files of a compiled policy by name; the same policy gives the same bytes.
 
     None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
     normalises with, and without that step tokens would be wrong. None of one that has words before the instruction
-    (eo1, evo1, groot, vla_jepa, wall_x), which no step writes, unless that is compiled in.
+    (eo1, evo1, groot, vla_jepa, wall_x), which no step writes, where the artifact does not make its tokens itself.
+
+    Args:
+        text: whether it does: lerobot then gives it the task as text.
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]
-    worded = spec.instruction is not None and (spec.instruction.before or spec.instruction.around)
+    worded = spec.instruction is not None and (spec.instruction.before or spec.instruction.around) and not text
     if worded or entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps):
         return {}
     renamed = {
@@ -56,7 +59,7 @@ def files_beside(directory: Path, spec: PolicySpec) -> dict[str, bytes]:
         "output_features": {ACTION: entries["output_features"][ACTION]},
         "device": "cpu",
     }
-    tokens = [one.shape[-1] for key, one in spec.observations.items() if key.startswith(LANGUAGE)]
+    tokens = [one.shape[-1] for key, one in spec.observations.items() if key.startswith(LANGUAGE) and not text]
     before = [_step("rename_observations_processor", rename_map={}), _step("to_batch_processor")]
     before += [_text_step(step, tokens[0]) for step in steps if tokens and step.get("registry_name") in _TEXT]
     device = _step("device_processor", device="cpu", float_dtype=None)

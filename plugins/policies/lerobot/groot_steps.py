@@ -22,7 +22,7 @@ from ttscompile.frontends.settings import Settings
 from . import processors as lerobot
 from .config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 
-(_PACK, _UNPACK, _DECODE), _ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
+(_PACK, _UNPACK, _DECODE), ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _EPSILON = 64, 1e-8
@@ -88,11 +88,11 @@ class Seen(nn.Module):
 
 def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootProcessors:
     """The pipelines of a policy with these features."""
-    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, (_PACK, _ENCODE, *_OLD))
+    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, (_PACK, ENCODE, *_OLD))
     after = lerobot.read_steps(directory, lerobot.POSTPROCESSOR, (_UNPACK, _DECODE, *_OLD))
     if old := next((step["registry_name"] for step in (*before, *after) if step["registry_name"] in _OLD), None):
         raise CheckpointError(f"{directory}: the step {old} is {OLD}.")
-    pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
+    pack, encode = (_one(directory, before, name) for name in (_PACK, ENCODE))
     decode = _one(directory, after, _UNPACK, _DECODE)
     packing = _settings(directory, pack)
     packing.require(state_horizon=1, language_key=TASK, clip_outliers=True)
