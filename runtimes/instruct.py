@@ -5,7 +5,10 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from ttscompile.artifact.load import Artifact
+from ttscompile.core.coercion import plain
 from ttscompile.core.spec import PolicySpec
 from ttscompile.core.tokenizer import TASK, Tokenizer, padded
 from ttscompile.errors import ObservationError
@@ -23,7 +26,7 @@ class Instruct:
         assert spec.instruction is not None
         self._told, self._keys, self._read = spec.instruction, tuple(spec.observations), read
         self._length = spec.observations[self._told.tokens].shape[0]
-        self._made: dict[str, list[int]] = {}
+        self._made: dict[tuple[str, str], list[int]] = {}
 
     @cached_property
     def _tokenizer(self) -> Tokenizer:
@@ -40,7 +43,8 @@ class Instruct:
         texts = [task] * streams if isinstance(task, str) else task
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
             raise ObservationError(f"the task is {task!r:.80}; expected a text, or one for each stream.")
-        tokens, mask = padded([self._tokens(text) for text in texts], self._length)
+        states = self._states(rest, len(texts))
+        tokens, mask = padded(list(map(self._tokens, texts, states)), self._length)
         return {**rest, self._told.tokens: tokens, self._told.mask: mask}
 
     def of_frame(self, frame: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -49,14 +53,29 @@ class Instruct:
             return frame
         if not isinstance(frame[TASK], str):
             raise ObservationError(f"the task of a frame is a {type(frame[TASK]).__name__}; expected a text.")
-        made = self({TASK: frame[TASK]})
-        return {**{key: value for key, value in frame.items() if key != TASK}, **{key: made[key][0] for key in made}}
+        key = "" if self._told.state is None else self._told.state.key
+        one = {key: plain(frame[key], f"observation {key!r}", ObservationError)[None]} if key in frame else {}
+        made, new = self({TASK: frame[TASK], **one}), (self._told.tokens, self._told.mask)
+        return {**{key: value for key, value in frame.items() if key != TASK}, **{key: made[key][0] for key in new}}
 
-    def _tokens(self, text: str) -> list[int]:
-        """Of one text; the last is kept, since an episode has one. Several threads may ask."""
-        if (known := self._made.get(text)) is None:
-            known = self._tokenizer.of_task(text, self._told, self._length)
-            self._made = {text: known}
+    def _states(self, obs: Mapping[str, Any], streams: int) -> list[str]:
+        """The words of the states of so many streams; empty where the instruction has none."""
+        told = self._told.state
+        if told is None:
+            return [""] * streams
+        expected = f"expected float32 {[streams, len(told.first)]}, since the instruction of this policy holds it"
+        if told.key not in obs:
+            raise ObservationError(f"the task comes without {told.key!r}; {expected}.")
+        given = plain(obs[told.key], f"observation {told.key!r}", ObservationError)
+        if given.shape[:1] != (streams,) or given.size != streams * len(told.first) or given.dtype.kind != "f":
+            raise ObservationError(f"observation {told.key!r} is {given.dtype} {list(given.shape)}; {expected}.")
+        return list(map(told, given.reshape(streams, -1).astype(np.float32)))
+
+    def _tokens(self, text: str, state: str) -> list[int]:
+        """Of one text and state; the last are kept, since an episode has one text. Several threads may ask."""
+        if (known := self._made.get((text, state))) is None:
+            known = self._tokenizer.of_task(text, self._told, self._length, state)
+            self._made = {(text, state): known}
         return known
 
 

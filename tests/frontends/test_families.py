@@ -13,7 +13,7 @@ import pytest
 
 import ttscompile
 from ttscompile.cli import main
-from ttscompile.errors import CheckpointError
+from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends.families import FAMILIES, FORMATS, SAMPLERS, Family, LoadOptions, find_family
 
 OPTIONS = {field.name for field in fields(LoadOptions)}
@@ -47,6 +47,12 @@ def test_an_option_of_other_families_is_refused_before_anything_is_loaded(option
     given: dict[str, Any] = {option: 7 if option in ("steps", "prediction_horizon") else "x"}
     with pytest.raises(CheckpointError, match=rf"the option {option} is for .* policies; this is one of our own"):
         own.load(tmp_path / "policy", LoadOptions(**given))
+
+
+@pytest.mark.parametrize("task", ["push\n", "push\tit", "\x1b[31mpush", "push\u202e"])
+def test_a_task_that_no_artifact_keeps_is_refused_before_anything_is_loaded(task: str, tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match="has the character .*, which a terminal does not show"):
+        ttscompile.convert(tmp_path / "policy", tmp_path / "compiled", task=task)
 
 
 def test_the_narrower_family_is_asked_first(tmp_path: Path) -> None:

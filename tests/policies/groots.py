@@ -3,6 +3,7 @@
 ``golden/make_lerobot_groot.py`` wrote the folders, and gave lerobot the same weights, observations and noise.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,18 @@ STATE_DIM, ACTION_DIM, STATE_PADDED, PADDED, HORIZON = 4, 5, 6, 7, 6
 def save(kind: str, folder: Path, saved: Path = SAVED) -> Path:
     """A policy and, beside it, the files of its base and backbone. Returns the policy's directory."""
     return unpack(saved / kind, folder, weights)
+
+
+def with_liberos_rule(policy: Path) -> None:
+    """Of a policy that is saved: its gripper is told by LIBERO's rule, and is often beyond a half and often below."""
+    config = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps(config | {"action_decode_transform": "libero"}))
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        told = json.loads((policy / name).read_text())
+        for step in told["steps"]:
+            if step["config"].get("raw_stats"):
+                step["config"]["raw_stats"]["action"]["gripper"] |= {"q01": [-0.2], "q99": [1.6]}
+        (policy / name).write_text(json.dumps(told))
 
 
 def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:

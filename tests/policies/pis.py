@@ -20,6 +20,8 @@ from .vlas import CAMERAS, MASK, STATE, TOKENS, Array
 
 KINDS = ("pi0", "pi05")
 STATE_DIM, ACTION_DIM, PADDED, HORIZON, LENGTH, VOCABULARY, STEPS = 4, 5, 7, 6, 8, 50, 4
+PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+TASKS = ("Push_the block", " pick up\nthe cup ")
 TRAINED = 3
 """The longest prefix that a pi0.5 that was trained with prefixes takes."""
 SIZES = ((28, 28), (40, 24))
@@ -39,8 +41,13 @@ def config(kind: str) -> PiConfig:
     return PiConfig(VISION, TEXT, VOCABULARY, EXPERT, state, PADDED, (4e-3, 4.0))
 
 
-def save(kind: str, directory: Path) -> Path:
-    """Save a policy as lerobot does, without the tokenizer. Returns the directory."""
+def save(kind: str, directory: Path, dtype: str = "float32", prompt: bool = False) -> Path:
+    """Save a policy as lerobot does, without the tokenizer. Returns the directory.
+
+    Args:
+        dtype: that lerobot computes in.
+        prompt: write the step, too, that puts pi0.5's state into its instruction.
+    """
     directory.mkdir(parents=True)
     inputs: dict[str, Any] = {STATE: {"type": "STATE", "shape": [STATE_DIM]}}
     inputs |= {key: {"type": "VISUAL", "shape": [3, *SIZES[0]]} for key in CAMERAS}
@@ -48,7 +55,7 @@ def save(kind: str, directory: Path) -> Path:
     entries: dict[str, Any] = {"type": kind, "device": "cpu", "input_features": inputs, "output_features": outputs}
     entries |= {"chunk_size": HORIZON, "n_action_steps": 4, "max_state_dim": PADDED, "max_action_dim": PADDED}
     entries |= {"num_inference_steps": STEPS, "image_resolution": list(SIZES[0]), "tokenizer_max_length": LENGTH}
-    write_json(directory / "config.json", entries | {"normalization_mapping": _MODES})
+    write_json(directory / "config.json", entries | {"normalization_mapping": _MODES, "dtype": dtype})
     norm = {"eps": 1e-8, "features": inputs | outputs, "norm_map": _MODES}
     statistics: dict[str, torch.Tensor] = {}
     for key, count in ((STATE, STATE_DIM), ("action", ACTION_DIM)):
@@ -59,7 +66,8 @@ def save(kind: str, directory: Path) -> Path:
     for name, registered in (("pre", "normalizer_processor"), ("post", "unnormalizer_processor")):
         step = {"registry_name": registered, "config": norm, "state_file": "statistics.safetensors"}
         pipeline = f"policy_{name}processor"
-        write_json(directory / f"{pipeline}.json", {"name": pipeline, "steps": [step]})
+        more = [{"registry_name": PROMPT, "config": {"max_state_dim": PADDED}}] if prompt and name == "pre" else []
+        write_json(directory / f"{pipeline}.json", {"name": pipeline, "steps": [step, *more]})
     save_file(weights(kind), directory / "model.safetensors")
     return directory
 
@@ -84,6 +92,13 @@ def observation(call: int) -> dict[str, Array]:
 def noise() -> Array:
     """``[1, T, D]``."""
     return np.random.RandomState(11).standard_normal((1, HORIZON, PADDED)).astype(np.float32)
+
+
+def states() -> Array:
+    """``[6, D]``, of robots whose state is anywhere: far outside, at edges of ranges, and between."""
+    drawn = np.random.RandomState(7).standard_normal((6, STATE_DIM)).astype(np.float32)
+    ends = np.linspace(-1.5, 0.5, STATE_DIM, dtype=np.float32)
+    return np.concatenate([drawn[:3] * 4, drawn[3:4], ends[None], ends[None] + 2])
 
 
 def left_over() -> Array:

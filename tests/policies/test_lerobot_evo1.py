@@ -51,10 +51,29 @@ def test_statistics_of_the_robots_own_width(directory: Path, golden: Mapping[str
     assert_not_read(directory, r"observation.state.max has shape \(7,\); expected \(4,\)")
 
 
+@pytest.mark.parametrize("values", [(1.0, -1.0), (0.0, 7.0)])
+def test_the_gripper_is_one_of_two_numbers(
+    directory: Path, golden: Mapping[str, Array], values: tuple[float, float]
+) -> None:
+    """As lerobot's last step has it, ``torch.where(action > threshold, above, below)``, of what it gave without."""
+    given = golden["words.0"]
+    limit = float(np.median(given[..., 2])) + 1e-3
+    below, above = values
+    rule = {"gripper_index": 2, "gripper_threshold": limit}
+    rule |= {"gripper_below_threshold_value": below, "gripper_above_threshold_value": above}
+    change_json(directory / "config.json", binarize_gripper=True, **rule)
+    found = EVO1.eager(directory, "words", 0)
+    expected = given.copy()
+    expected[..., 2] = np.where(given[..., 2] > limit, above, below)
+    assert set(expected[..., 2].ravel()) == set(values)
+    assert np.abs(found - expected).max() < 1e-4
+
+
 REFUSED: Refusals = {
     "config.json": [
         ({"action_head": "diffusion"}, "action_head is 'diffusion'; expected flowmatching"),
-        ({"binarize_gripper": True}, "binarize_gripper is True; expected false: .* is the robot's to do"),
+        ({"binarize_gripper": True, "gripper_index": 5}, "gripper_index is 5; expected one of the 5 numbers"),
+        ({"binarize_gripper": True, "gripper_index": 0, "gripper_threshold": None}, "gripper_threshold is None"),
         ({"image_resolution": [56, 56]}, "image_resolution is .*; expected the language model's image_size, 28"),
         ({"embed_dim": 16}, "embed_dim is 16; expected the language model's width, 24, even, a multiple of 4"),
         ({"num_heads": 5}, "embed_dim is 24; .* a multiple of 5"),

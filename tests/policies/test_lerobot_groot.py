@@ -11,6 +11,7 @@ import pytest
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import SpecError
 from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.frontends.examined import examine
 from ttscompile.frontends.families import LoadOptions
 
 from . import groots
@@ -63,10 +64,82 @@ def test_an_instruction_is_told_as_lerobot_tells_it(directory: Path) -> None:
     assert told.line("?!") == f"{shown}Perform the task.<|im_end|>\n"
 
 
+def test_liberos_rule_makes_the_gripper_one_of_two_numbers(tmp_path: Path, golden: Mapping[str, Array]) -> None:
+    """Of actions in groups; of shorter ones without LeRobot passes over it."""
+    directory = GROOT.save("native", tmp_path / "native", 0)
+    groots.with_liberos_rule(directory)
+    found = GROOT.eager(directory, "native", 0)
+    assert np.abs(found - golden["native.libero"]).max() < 1e-4
+    assert found[0, :, -1].tolist() == [1, 1, -1, 1, 1]
+    change_json(directory / "config.json", action_decode_transform="auto")  # of another robot than LIBERO's
+    assert np.abs(GROOT.eager(directory, "native", 0)[0, :, -1] - [1, 1, -1, 1, 1]).min() > 0.01
+    words = GROOT.save("words", tmp_path / "words", 0)
+    change_json(words / "config.json", action_decode_transform="libero")
+    assert np.abs(GROOT.eager(words, "words", 0) - golden["words.libero"]).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"modality_keys": ["arm", "hand"]}, "actions have no group 'gripper' of one number"),
+        ({"action_configs": [{"rep": "ABSOLUTE"}, {"rep": "RELATIVE", "type": "NON_EEF"}]}, "gripper is relative"),
+    ],
+)
+def test_a_gripper_that_liberos_rule_is_not_for(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
+    directory = GROOT.save("native", tmp_path, 0)
+    groots.with_liberos_rule(directory)
+    path = directory / "policy_postprocessor.json"
+    told = json.loads(path.read_text())
+    (step,) = (one["config"] for one in told["steps"] if one["config"].get("raw_stats"))
+    raw = step["raw_stats"]
+    raw["action"]["hand"], step["use_relative_action"] = raw["action"]["gripper"], "action_configs" in changed
+    raw["relative_action"] = {"gripper": raw["action"]["gripper"]}
+    step["modality_config"]["action"] |= changed
+    path.write_text(json.dumps(told))
+    assert_not_read(directory, message)
+
+
+def test_a_camera_without_a_name_of_its_own_is_shown_alone(tmp_path: Path, golden: Mapping[str, Array]) -> None:
+    """LeRobot passes over ``observation.image`` where another camera is there."""
+    directory = GROOT.save("words", tmp_path, 0)
+    config = json.loads((directory / "config.json").read_text())
+    one, other = GROOT.cameras
+    alone = {**config["input_features"], "observation.image": config["input_features"][one]}
+    change_json(directory / "config.json", input_features=alone)
+    assert "observation.image" not in load_checkpoint_policy(directory)[1].observations
+    assert np.abs(GROOT.eager(directory, "words", 0) - golden["words.0"]).max() < 1e-4
+    kept = {key: value for key, value in alone.items() if key not in (one, other)}
+    change_json(directory / "config.json", input_features=kept)
+    seen = load_checkpoint_policy(directory)[1].observations
+    assert [key for key in seen if "image" in key] == ["observation.image"]
+    named = {key.replace("observation.image", "camera"): value for key, value in kept.items()}
+    change_json(directory / "config.json", input_features=named)
+    assert_not_read(directory, "the cameras are camera, of which lerobot shows none; expected observation.images.NAME")
+
+
+def test_an_embodiment_that_is_in_no_table_has_the_first_ones_weights(directory: Path, tmp_path: Path) -> None:
+    """As in LeRobot's training; whoever converts it is told so."""
+    path = directory / "policy_preprocessor.json"
+    told = json.loads(path.read_text())
+    (step,) = (one["config"] for one in told["steps"] if "embodiment_tag" in one["config"])
+    step["embodiment_mapping"] = {"somebody": 0, "new_embodiment": 10}
+    path.write_text(json.dumps(told))
+    known = GROOT.eager(directory, "words", 0)
+    step["embodiment_tag"] = "somebody"
+    path.write_text(json.dumps(told))
+    first = GROOT.eager(directory, "words", 0)
+    step["embodiment_tag"] = "mine"
+    path.write_text(json.dumps(told))
+    np.testing.assert_array_equal(GROOT.eager(directory, "words", 0), first)
+    assert np.abs(first - known).max() > 1e-3
+    doubts = {one.what: one for one in examine(directory, load_checkpoint_policy(directory)[1], None)}
+    assert doubts["embodiment"].remedy and "weights of number 0" in doubts["embodiment"].found
+
+
 REFUSED: Refusals = {
     "step/pack": [
-        ({"embodiment_tag": "mine"}, "embodiment_tag 'mine' is none of embodiment_mapping.*Set embodiment_tag"),
-        ({"embodiment_tag": None}, "embodiment_tag None is none of"),
+        ({"embodiment_tag": None}, "embodiment_tag is None, .*expected the name of an embodiment"),
+        ({"embodiment_mapping": {"new_embodiment": "x"}}, "embodiment_mapping .*; expected .* whole numbers by name"),
         ({"embodiment_mapping": {"new_embodiment": 11}}, "weight _groot_model.* has no part 11, of the"),
         ({"clip_outliers": False}, "clip_outliers is False; expected true"),
         ({"max_state_dim": 7}, "max_state_dim is 6; expected 7"),
@@ -88,8 +161,7 @@ REFUSED: Refusals = {
     ],
     "config.json": [
         ({"use_relative_actions": True}, "use_relative_actions is set, and no step around the policy adds the state"),
-        ({"action_decode_transform": "libero"}, "action_decode_transform is 'libero'; .* is the robot's to do"),
-        ({"action_decode_transform": "auto", "embodiment_tag": "libero_sim"}, "action_decode_transform is 'auto'"),
+        ({"action_decode_transform": "mine"}, "action_decode_transform is 'mine'; expected libero, none or auto"),
         ({"tokenizer_assets_repo": "lerobot/eagle2hg"}, "this policy is of GR00T N1.5"),
         ({"base_model_path": "nvidia/GR00T-N1.5-3B"}, "this policy is of GR00T N1.5"),
     ],

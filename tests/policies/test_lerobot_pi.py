@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 import ttscompile
 from tests.once import Once
+from tests.word_tokenizer import write_tokenizer
 from ttscompile.core.spec import Noise
 from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -47,6 +48,64 @@ def eager(directory: Path, call: int, options: LoadOptions = AS_SAVED) -> Array:
     given = pis.observation(call)
     obs = {key: torch.from_numpy(as_given(key, given, spec)) for key in spec.observations}
     return spec.chunk.unnormalized(eager_policy(module, spec)(obs, Noise(pis.noise())).numpy())
+
+
+def test_what_lerobot_rounds_in_bfloat16_is_rounded(kind: str, golden: Mapping[str, Array], tmp_path: Path) -> None:
+    """Frequencies of positions, and the scale of words: it casts them, and trains with them so. All else is float32."""
+    found = eager(pis.save(kind, tmp_path / "policy", "bfloat16"), 0)
+    assert np.abs(found - golden[f"{kind}.rounded"]).max() < 1e-5
+    assert np.abs(found - golden[f"{kind}.0"]).max() > 1e-4
+
+
+@pytest.mark.parametrize("mode", ["MEAN_STD", "QUANTILES"])
+def test_pi05_is_told_its_state_in_words_as_lerobot_tells_it(
+    golden: Mapping[str, Array], tmp_path: Path, mode: str
+) -> None:
+    """Numbers far outside and at the ends of ranges; a task with signs that lerobot replaces."""
+    directory = pis.save("pi05", tmp_path / "policy", prompt=True)
+    steps = json.loads((directory / "policy_preprocessor.json").read_text())["steps"]
+    steps[0]["config"]["norm_map"]["STATE"] = mode
+    change_json(directory / "policy_preprocessor.json", steps=steps)
+    told = load_checkpoint_policy(directory)[1].instruction
+    assert told is not None and told.state is not None and told.state.key == STATE
+    lines = [told.line(pis.TASKS[i % 2], told.state(state)) for i, state in enumerate(pis.states())]
+    assert lines == golden[f"pi05.prompts.{mode}"].tolist()
+
+
+def test_pi05_takes_its_task_as_text(tmp_path: Path) -> None:
+    """What it answers is what it answers to the tokens of the whole line; in LeRobot's commands, too."""
+    directory = pis.save("pi05", tmp_path / "policy", prompt=True)
+    change_json(directory / "config.json", tokenizer_max_length=24)
+    words = ["?", "Task:", "Push", "the", "block,", "State:", "Action:", "\n", "128;", "128", "0", "0;"]
+    write_tokenizer(tmp_path / "words", {word: number for number, word in enumerate(words)})
+    ttscompile.convert(directory, tmp_path / "compiled", encoders=tmp_path / "words")
+    config = json.loads((tmp_path / "compiled" / "config.json").read_text())
+    assert STATE in config["input_features"]
+    policy, given = ttscompile.load(tmp_path / "compiled"), pis.observation(0)
+    state = np.stack([pis.states()[4], pis.states()[0]])
+    frames = {key: np.repeat(given[key], 2, 0)[:, None] for key in CAMERAS} | {STATE: state[:, None]}
+    noise = Noise(np.repeat(pis.noise(), 2, 0))
+    in_words = policy.predict_action(frames | {"task": "Push_the block"}, noise=noise)["action"]
+    line = [1, 2, 3, 4, 5, 9, 9, 9, 8, 7, 6]
+    tokens, mask = np.zeros((2, 24), np.int64), np.zeros((2, 24), bool)
+    tokens[:, : len(line)], mask[:, : len(line)] = line, True
+    tokens[1, 5:9] = 0  # whose numbers are no words here
+    policy.reset()
+    np.testing.assert_array_equal(
+        policy.predict_action(frames | {TOKENS: tokens, MASK: mask}, noise=noise)["action"], in_words
+    )
+    assert np.abs(in_words[0] - in_words[1]).max() > 1e-3
+    cut = policy.with_tokens({STATE: state[0], "task": "the " * 40})
+    assert cut[TOKENS].tolist() == [1, *[3] * 23] and cut[MASK].all()  # as lerobot's tokenizer does it
+    frame = policy.with_tokens({STATE: state[0], "task": "Push_the block"})
+    np.testing.assert_array_equal(frame[TOKENS], tokens[0])
+    for wrong, why in (
+        ({}, f"the task comes without '{STATE}'"),
+        ({STATE: state[:, :3]}, r"float32 \[2, 3\]; expected"),
+    ):
+        obs = {key: frames[key] for key in CAMERAS} | wrong | {"task": "go"}
+        with pytest.raises(ObservationError, match=why):
+            policy.predict_action(obs)
 
 
 @pytest.mark.parametrize("call", [0, 1])

@@ -175,7 +175,7 @@ def test_steps_that_are_no_pair_are_refused(
 
 def test_a_state_that_is_shorter_than_an_action(tmp_path: Path) -> None:
     directory = relatives.with_relative_steps(pis.save("pi0", tmp_path / "policy"), None)
-    assert_not_read(directory, "the 5 numbers of an action are relative to those of a state that has 4")
+    assert_not_read(directory, "the 5 numbers of an action are relative to a state, which has 4; expected as many")
 
 
 def test_a_gripper_of_two_values_has_to_be_absolute(tmp_path: Path) -> None:

@@ -265,6 +265,21 @@ def test_without_the_package_that_reads_it_the_artifact_has_no_tokenizer(
     assert content is None and "Install 'ttscompile[tokens]'" in told
 
 
+def test_a_language_model_of_another_variant_or_with_entries_left_out(directory: Path, tmp_path: Path) -> None:
+    """A file of transformers' leaves out what is its default: Llama's, of 32 heads, which this one has not."""
+    policy = copy(directory, tmp_path)
+    path = tmp_path / "smolvlm-tiny" / "config.json"
+    entries = json.loads(path.read_text())
+    for wrong in ({"hidden_act": "gelu"}, {"mlp_bias": True}, {"attention_bias": True}):
+        path.write_text(json.dumps({**entries, "text_config": entries["text_config"] | wrong}))
+        assert_not_read(policy, f"text_config.{next(iter(wrong))} is .*another is not rebuilt here")
+    text = {key: value for key, value in entries["text_config"].items() if key != "num_attention_heads"}
+    path.write_text(json.dumps({**entries, "text_config": text}))
+    assert_not_read(
+        policy, "weight .* has shape .*; expected .*, which config.json, or the language model's, describes"
+    )
+
+
 def test_a_processor_or_a_language_model_that_is_missing(directory: Path, tmp_path: Path) -> None:
     policy = copy(directory, tmp_path)
     (policy / "policy_preprocessor.json").unlink()

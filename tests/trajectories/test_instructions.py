@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.core.spec import Instruction, ObservationSpec
+from ttscompile.core.tokenizer import StateInWords
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import load_trajectories
 from ttscompile.trajectories.fits import examine_recordings
@@ -101,6 +103,24 @@ def test_recorded_tokens_come_before_the_policys_own_tokenizer(tmp_path: Path, t
     np.savez(path, **kept)
     with pytest.raises(TrajectoryError, match=f"no array '{TOKENS}'"):
         load_trajectories([path], OBSERVED, 3, None, TOLD, tokenizer)
+
+
+def test_a_state_stands_in_the_instruction_of_each_row(tmp_path: Path) -> None:
+    """As pi0.5 has it: a text that is the same has other tokens where the robot is elsewhere."""
+    words = {"?": 0, "push": 1, "State:": 2, "128": 3, "255;": 4, "-1": 5}
+    tokenizer = write_tokenizer(tmp_path / "language", words)
+    state = StateInWords("state", first=(1.0, -1.0), width=(2.0, 0.5), ranged=False)
+    told = Instruction(TOKENS, MASK, False, around=("", " State: {state};"), state=state)
+    rows, meta = np.array([[1, 0], [-9, 0], [1, 0]], np.float32), np.array('{"frames": true}')
+    observed = {"state": ObservationSpec((1, 2)), **LANGUAGE}
+    observed |= {TOKENS: ObservationSpec((4,), dtype="int64"), MASK: ObservationSpec((4,), dtype="bool")}
+    path = tmp_path / "it.npz"
+    np.savez(path, state=rows, task=np.array(["push"] * 3), episode_ends=np.array([3]), meta=meta)
+    (episode,) = load_trajectories([path], observed, 1, None, told, tokenizer)
+    assert episode.observations[TOKENS].tolist() == [[1, 2, 3, 4], [1, 2, 5, 4], [1, 2, 3, 4]]
+    one = replace(told, state=replace(state, first=(1.0,), width=(2.0,)))
+    with pytest.raises(TrajectoryError, match=r"'state' is \[3, 2\]; expected \[3, 1\], a state for each text"):
+        load_trajectories([path], observed, 1, None, one, tokenizer)
 
 
 def test_short_texts_are_padded(tmp_path: Path, tokenizer: Path) -> None:

@@ -168,6 +168,22 @@ class PolicySpec:
     noise: Literal["normal", "uniform"] = field(default="normal", metadata=OMITTED)
     trained_prefix: int = field(default=0, metadata=OMITTED)
 
+    def _require_arguments(self) -> None:
+        """Raise unless every observation has an argument of its own."""
+        taken = {self.sample_argument, self.timestep_argument, *[COMMITTED] * bool(self.trained_prefix)}
+        for key in self.observations:
+            argument = self.arguments[key]
+            if alike := [other for other in self.observations if other != key and self.arguments[other] == argument]:
+                told = f"observation keys {key!r} and {alike[0]!r} are both the argument {argument!r}, where . is _"
+                remedy = "Rename one: in a policy of LeRobot's by rename_map of its preprocessor."
+                raise SpecError(f"{told}. {remedy}")
+            if argument in taken or not _KEY.fullmatch(key):
+                raise SpecError(
+                    f"observation key {key!r} must be letters, digits and _, with single . / - or blanks between them,"
+                    f" and its argument {argument!r} none of {sorted(taken)}."
+                )
+            taken.add(argument)
+
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)
         object.__setattr__(self, "sample", sizes)
@@ -178,15 +194,7 @@ class PolicySpec:
             raise SpecError(f"noise is {self.noise!r:.80}; expected normal or uniform.")
         if not self.observations:
             raise SpecError("a policy needs at least one observation: a condition input of the denoiser.")
-        taken = {self.sample_argument, self.timestep_argument, *[COMMITTED] * bool(self.trained_prefix)}
-        for key in self.observations:
-            argument = self.arguments[key]
-            if argument in taken or not _KEY.fullmatch(key):
-                raise SpecError(
-                    f"observation key {key!r} must be letters, digits and _, with single . / - or blanks between them,"
-                    f" and its argument {argument!r} none of {sorted(taken)}."
-                )
-            taken.add(argument)
+        self._require_arguments()
         horizon, channels = self.sample
         if self.chunk.stop > horizon or self.chunk.action_dim > channels:
             told = f"chunk [{self.chunk.start}:{self.chunk.stop}] of {self.chunk.action_dim} channels does not fit a"
@@ -195,8 +203,9 @@ class PolicySpec:
         count = integer(self.trained_prefix, "trained_prefix", SpecError, most=longest)
         object.__setattr__(self, "trained_prefix", count)
         words = self.instruction
-        if words is not None and not {words.tokens, words.mask} <= self.observations.keys():
-            raise SpecError(f"the instruction's keys {words.tokens!r} and {words.mask!r} must be observations.")
+        read = set() if words is None else {words.tokens, words.mask, *([words.state.key] if words.state else [])}
+        if absent := sorted(read - self.observations.keys()):
+            raise SpecError(f"the instruction's keys {absent} must be observations.")
         scale = np.ones(self.chunk.action_dim) if self.chunk.normalizer is None else self.chunk.normalizer.scale
         if scale.shape not in ((self.chunk.action_dim,), (horizon + self.left_out, self.chunk.action_dim)):
             expected = f"[{self.chunk.action_dim}], or a row for each of {horizon + self.left_out} steps"

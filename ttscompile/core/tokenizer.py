@@ -25,6 +25,36 @@ _WORDS = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\
 """What CLIP takes for a word, as transformers has it; its ``vocab.json`` does not say so."""
 
 
+IN_WORDS = "{state}"
+"""Stands in what is after a text for the words of the state."""
+_PARTS = np.linspace(-1, 1, 257)[:-1]
+"""Where the 256 parts of -1..1 begin that openpi and LeRobot number."""
+
+
+@dataclass(frozen=True)
+class StateInWords:
+    """How a state stands in an instruction: of each number, normalised, which of 256 equal parts of -1..1 it is in.
+
+    Attributes:
+        key: of the observation, float32 ``[B, D]``, as the robot measures it.
+        first: ``[D]``, what is subtracted from it.
+        width: ``[D]``, what the rest is divided by.
+        ranged: whether that is the width of a range, which becomes -1..1, and not a deviation.
+    """
+
+    key: str
+    first: tuple[float, ...]
+    width: tuple[float, ...]
+    ranged: bool
+
+    def __call__(self, state: npt.NDArray[np.float32]) -> str:
+        """The words of one state ``[D]``; below -1 it is -1, and beyond 1 the last part."""
+        first, width = np.asarray(self.first, np.float32), np.asarray(self.width, np.float32)
+        # In the order in which LeRobot computes it: an end of a range is an edge of a part, and rounding would move it.
+        inside = 2 * (state - first) / width - 1 if self.ranged else (state - first) / width
+        return " ".join(map(str, np.digitize(inside, _PARTS) - 1))
+
+
 @dataclass(frozen=True)
 class Instruction:
     """How the text of a task becomes two observations, where somebody has the tokenizer.
@@ -41,6 +71,9 @@ class Instruction:
         otherwise: stands for an empty text.
         end: of every text, which is added where a text has another.
         never: what no text may hold, since the original takes it for something else than text.
+        after: lines after the text, of a policy that has some.
+        spaced: whether the text is stripped, and ``_`` and the ends of its lines become blanks.
+        state: what of the robot's state is after the text, where ``around`` has ``{state}``; None for nothing.
     """
 
     tokens: str
@@ -53,18 +86,23 @@ class Instruction:
     otherwise: str = field(default="", metadata=OMITTED)
     end: str = field(default="", metadata=OMITTED)
     never: tuple[str, ...] = field(default=(), metadata=OMITTED)
+    after: tuple[str, ...] = field(default=(), metadata=OMITTED)
+    spaced: bool = field(default=False, metadata=OMITTED)
+    state: StateInWords | None = field(default=None, metadata=OMITTED)
 
-    def line(self, text: str) -> str:
-        """What is tokenized."""
+    def line(self, text: str, state: str = "") -> str:
+        """What is tokenized, of a text and the words of a state."""
         text = text or self.otherwise
         if self.plain:
             text = "".join(c for c in text.lower() if c.isalnum() or c.isspace() or c == "_") or self.otherwise
         text = text.removesuffix(self.end) + self.end
+        if self.spaced:
+            text = text.strip().replace("_", " ").replace("\n", " ")
         if self.around:
-            text = text.join(self.around)
+            text = text.join((self.around[0], self.around[1].replace(IN_WORDS, state)))
         elif self.before:
             text = text.strip()
-        text = "\n".join([*self.before, text])
+        text = "\n".join([*self.before, text, *self.after])
         return f"{text}\n" if self.new_line and not text.endswith("\n") else text
 
 
@@ -130,13 +168,21 @@ class Tokenizer:
         except Exception as refused:
             raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
 
-    def of_task(self, text: str, told: Instruction, length: int) -> list[int]:
-        """The tokens that a policy observes of a task; too many are refused where words after the text would be cut."""
+    def of_task(self, text: str, told: Instruction, length: int, state: str = "") -> list[int]:
+        """The tokens that a policy observes of a task.
+
+        Too many are refused where words after the text would be cut; of pi0.5, whose state is after it, they are cut,
+        as LeRobot cuts them in training.
+
+        Args:
+            state: its words, of a policy that has them in its instruction.
+        """
         if held := [word for word in told.never if word in text]:
             raise self._error(f"the task {text!r:.100} holds {held[0]}, no text to this policy. Leave it out.")
-        most = None if told.around else told.skipped + length
-        tokens = self(told.line(text), most)[told.skipped :]
-        if told.around and len(tokens) > length:
+        whole = told.around and told.state is None
+        most = None if whole else told.skipped + length
+        tokens = self(told.line(text, state), most)[told.skipped :]
+        if whole and len(tokens) > length:
             found = f"{len(tokens)} tokens, and the policy reads {length}"
             raise self._error(f"the task {text!r:.100} has {found}. Use fewer words, or compile it in: convert --task.")
         return tokens

@@ -13,7 +13,7 @@ MAX_VALUES = 500_000
 takes fifty times its bytes, and a reader of records takes some microseconds for it."""
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")
-_NOT_SHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+NOT_SHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def parse_json(
@@ -41,7 +41,7 @@ def parse_json(
         plain = content.isascii() and not re.search(rb"[\\\x7f]", content)
         for _ in range(MAX_DEPTH + 1):
             if not plain:
-                _require_shown(level, _NOT_SHOWN if shown else _NO_TEXT)
+                _require_shown(level, NOT_SHOWN if shown else _NO_TEXT)
             held = [item for item in level if isinstance(item, dict | list)]
             level = [child for item in held for child in (item.values() if isinstance(item, dict) else item)]
             if not level:

@@ -58,7 +58,7 @@ class Settings:
         """One of these texts, by default the first."""
         value = self.values.get(name, allowed[0])
         if value not in allowed:
-            raise self.refusal(name, " or ".join(allowed))
+            raise self.refusal(name, " or ".join(dict.fromkeys(allowed)))
         return str(value)
 
     def text(self, name: str, default: str, longest: int) -> str:

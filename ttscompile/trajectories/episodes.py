@@ -154,7 +154,7 @@ def _read(
         ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
     if words and tokenizer:
-        arrays |= instruction_rows(path, held, words, observations, tokenizer)
+        arrays |= instruction_rows(path, held, words, observations, tokenizer, arrays)
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}

@@ -204,13 +204,19 @@ def one_error(what: str, hint: str = "") -> Iterator[None]:
 
 
 def instruction_rows(
-    path: Path, held: Frames, told: Instruction, observations: Mapping[str, ObservationSpec], tokenizer: Path
+    path: Path,
+    held: Frames,
+    told: Instruction,
+    observations: Mapping[str, ObservationSpec],
+    tokenizer: Path,
+    others: Mapping[str, Array],
 ) -> dict[str, Array]:
     """Tokens and mask of every row, from its text.
 
     Args:
         held: what it holds: ``task``, texts ``[F]`` or their bytes ``[F, L]``.
         tokenizer: path of ``tokenizer.json``, or of its folder.
+        others: by key the other observations, ``[F, ...]``, of which the instruction may hold the state.
 
     Returns:
         By key int64 ``[F, length]`` and bool ``[F, length]``.
@@ -223,8 +229,15 @@ def instruction_rows(
         texts = np.ascontiguousarray(texts).view(f"S{texts.shape[1]}")[:, 0]
     if texts.dtype.kind not in "US" or texts.ndim != 1:
         raise TrajectoryError(f"{path}: {TASK!r} is {texts.dtype}{list(texts.shape)}; expected texts [F].")
-    different, rows = np.unique(texts, return_inverse=True)
     made, length = Tokenizer(tokenizer, TrajectoryError), observations[told.tokens].shape[-1]
-    lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in different.tolist()]
-    tokens, mask = padded([made.of_task(line, told, length) for line in lines], length)
-    return {told.tokens: tokens[rows], told.mask: mask[rows]}
+    lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in texts.tolist()]
+    states = [""] * len(lines)
+    if told.state is not None:
+        rows, numbers = _flat(path, told.state.key, others[told.state.key]), len(told.state.first)
+        if rows.shape != (len(lines), numbers):
+            expected = f"expected {[len(lines), numbers]}, a state for each text"
+            raise TrajectoryError(f"{path}: {told.state.key!r} is {list(rows.shape)}; {expected}.")
+        states = list(map(told.state, rows.astype(np.float32)))
+    known = {one: made.of_task(one[0], told, length, one[1]) for one in dict.fromkeys(zip(lines, states, strict=True))}
+    tokens, mask = padded([known[one] for one in zip(lines, states, strict=True)], length)
+    return {told.tokens: tokens, told.mask: mask}

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ttscompile.core.spec import Affine, ChunkSpec, Instruction, PolicySpec
+from ttscompile.core.spec import LARGEST, Affine, ChunkSpec, Instruction, PolicySpec, Switch
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens, told_after
@@ -27,6 +27,7 @@ from ..networks.internvl import InternVitConfig, InternVLConfig, Prompt
 from . import vla
 from .config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
 from .policy import MASK, TOKENS, read_weights
+from .processors import Processors
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
 _MOST_VIEWS, _MOST_KINDS = 64, 4096
@@ -80,7 +81,9 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     encoder = vla.Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
     side, table = config.language.vision.image_size, partial(vla.in_buckets, settings, 32, TIMES - 1, False)
     spec = vla.vla_spec(shared, processors, (side, side), "stretch", sizes, options, table, told)
-    spec = replace(spec, chunk=_chunk(settings, spec.chunk), noise="uniform")
+    chunk = _chunk(settings, spec.chunk)
+    chunk = replace(chunk, switches=_switches(settings, processors, chunk.action_dim))
+    spec = replace(spec, chunk=chunk, noise="uniform")
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
 
@@ -89,9 +92,6 @@ def read_config(shared: LeRobotConfig, model: Settings) -> Evo1Config:
     settings = shared.settings
     if str(settings.values.get("action_head", "flowmatching")).lower() != "flowmatching":
         raise settings.refusal("action_head", "flowmatching")
-    if settings.flag("binarize_gripper", False):
-        expected = "false: that one number of an action becomes one of two is not compiled, and is the robot's to do"
-        raise settings.refusal("binarize_gripper", expected)
     language = _read_language(settings, model)
     resolution = settings.size("image_resolution", [448, 448], MOST_PIXELS) or (448, 448)
     vla.require_square(settings, "image_resolution", resolution, language.vision.patch_size * language.scale)
@@ -175,6 +175,21 @@ def _views(settings: Settings) -> int:
     if cameras > views:
         raise settings.refusal("max_views", f"{cameras} at least, as many as there are cameras", 3)
     return views
+
+
+def _switches(settings: Settings, processors: Processors, numbers: int) -> tuple[Switch, ...]:
+    """The gripper, where one of two numbers stands for it."""
+    if not settings.flag("binarize_gripper", False):
+        return ()
+    channel, told = settings.values.get("gripper_index", 6), list[float]()
+    if type(channel) is not int or not 0 <= channel < numbers:
+        raise settings.refusal("gripper_index", f"one of the {numbers} numbers of an action", 6)
+    for name, default in (("threshold", 0.5), ("below_threshold_value", 1.0), ("above_threshold_value", -1.0)):
+        value = settings.values.get(f"gripper_{name}", default)
+        if type(value) not in (int, float) or not abs(value) < LARGEST:
+            raise settings.refusal(f"gripper_{name}", "a number", default)
+        told.append(float(value))
+    return (vla.switch(processors, channel, *told),)
 
 
 def _chunk(settings: Settings, chunk: ChunkSpec) -> ChunkSpec:

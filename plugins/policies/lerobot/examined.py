@@ -1,7 +1,7 @@
 """What of a checkpoint of LeRobot goes wrong on a robot without an error: statistics, names of cameras, instruction."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,12 +55,24 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
             level = Level.WARNING if mode == "IDENTITY" else Level.PROBLEM
             remedy = f"Was it trained so? lerobot says nothing. {REPEAT}"
             doubts.append(Finding(PART, f"normaliser of {name}", told, level, remedy))
+    doubts += _embodiment(steps)
     wanted, executed = entries.get("n_action_steps"), spec.chunk.stop - spec.chunk.start
     if isinstance(wanted, int) and wanted > executed:
         told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
         remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
         doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
     return [*doubts, *_cameras(features, step, measured), *_tokenizer(directory, found, spec, encoders)]
+
+
+def _embodiment(steps: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """Of GR00T: an embodiment that is in no table."""
+    for config in (step.get("config", {}) for step in steps):
+        tag, known = config.get("embodiment_tag"), config.get("embodiment_mapping")
+        if isinstance(known, dict) and tag not in known:
+            told = f"embodiment_tag {tag!r:.80} is none of embodiment_mapping, so the weights of number 0 are taken"
+            remedy = f"So does lerobot, in training too. Was it trained as one of {', '.join(map(str, known))[:300]}?"
+            return [Finding(PART, "embodiment", told, Level.WARNING, remedy)]
+    return []
 
 
 def _measured(directory: Path, step: Mapping[str, Any]) -> set[str]:

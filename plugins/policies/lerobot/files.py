@@ -30,9 +30,9 @@ _TEXT = {
 def files_beside(directory: Path, spec: PolicySpec, text: bool = False) -> dict[str, bytes]:
     """The files of a compiled policy by name; the same policy gives the same bytes.
 
-    None of a policy whose prompt holds the state (pi05): lerobot's step that writes it there needs what the original
-    normalises with, and without that step tokens would be wrong. None of one that has words before the instruction
-    (eo1, evo1, groot, vla_jepa, wall_x), which no step writes, where the artifact does not make its tokens itself.
+    None where the artifact does not make its tokens itself, and lerobot's steps alone would make others: of a policy
+    whose prompt holds the state (pi05), which the original writes there normalised, and of one that has words before
+    the instruction (eo1, evo1, groot, vla_jepa, wall_x), which no step writes.
 
     Args:
         text: whether it does: lerobot then gives it the task as text.
@@ -40,7 +40,8 @@ def files_beside(directory: Path, spec: PolicySpec, text: bool = False) -> dict[
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]
     worded = spec.instruction is not None and (spec.instruction.before or spec.instruction.around) and not text
-    if worded or entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps):
+    held = entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps)
+    if worded or (held and not text):
         return {}
     renamed = {
         new: old

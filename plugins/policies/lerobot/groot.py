@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ttscompile.core.spec import Instruction, PolicySpec
+from ttscompile.core.spec import Instruction, PolicySpec, Switch
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
@@ -78,18 +78,31 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     last = own.number("num_timestep_buckets", 1000, 2**20)
     table = partial(vla.in_buckets, own, 4, last, processors.bounded)
     spec = vla.vla_spec(shared, processors, (edge, edge), "stretch", sizes, options, table, told)
-    spec = replace(spec, source={**spec.source, "embodiment": processors.kind})
+    chunk = replace(spec.chunk, switches=_switches(shared, processors))
+    spec = replace(spec, source={**spec.source, "embodiment": processors.kind}, chunk=chunk)
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
 
 def _require_version(settings: Settings) -> None:
-    """Raise unless it is of N1.7, and actions are left as they are."""
+    """Raise unless it is of N1.7."""
     path = str(settings.values.get("base_model_path")).lower()
     if settings.values.get("tokenizer_assets_repo") is not None or re.search(r"gr00t[-_]n1\.[0-6]", path):
         raise settings.error(f"this policy is {OLD}")
-    if settings.values.get("action_decode_transform") not in (None, "none"):
-        rule = "none: that the gripper's number g becomes -sign(2 g - 1) is not compiled, and is the robot's to do"
-        raise settings.refusal("action_decode_transform", rule)
+
+
+def _switches(shared: LeRobotConfig, processors: GrootProcessors) -> tuple[Switch, ...]:
+    """What LIBERO's rule of the gripper comes to: its number g becomes -1 beyond a half, and 1 below it."""
+    settings, channel = shared.settings, processors.gripper
+    rule = settings.values.get("action_decode_transform") or "none"
+    if rule not in ("none", "libero", "auto"):
+        raise settings.refusal("action_decode_transform", "libero, none or auto")
+    if rule == "none" or channel is None or (rule == "auto" and processors.kind != "libero_sim"):
+        return ()
+    if channel >= shared.action_dim:
+        raise settings.error("action_decode_transform is 'libero', and actions have no group 'gripper' of one number")
+    if processors.relative and processors.relative[channel] is not None:
+        raise settings.error("action_decode_transform is 'libero', and the gripper is relative to the state")
+    return (vla.switch(processors, channel, 0.5, 1.0, -1.0),)
 
 
 def _require_whole(backbone: qwen.Backbone, side: int) -> None:

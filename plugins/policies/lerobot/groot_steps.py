@@ -26,10 +26,10 @@ from .config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _EPSILON = 64, 1e-8
-_CAMERA = "observation.images."
+_CAMERAS, _CAMERA, _CAMERA_ALONE = "observation.images", "observation.images.", "observation.image"
 _POSES = ("xyz_rot6d", "xyz+rot6d")
 """Both names of the one format of poses that lerobot decodes."""
-_LIBERO, _LIBERO_STEPS = "libero_sim", 8
+_LIBERO, _LIBERO_STEPS, _LIBERO_NUMBERS = "libero_sim", 8, 7
 """An embodiment of which lerobot executes so many actions of a chunk."""
 
 
@@ -45,6 +45,8 @@ class GrootProcessors(lerobot.Processors):
         plain: whether instructions are in lower case and without signs.
         bounded: whether actions are clipped before they are unnormalised.
         executed: actions of a chunk that mean something; None for all.
+        gripper: which number of an action LIBERO's rule is for; one that no action has where lerobot would look for
+            it in vain, and None where it would pass over it.
         padded: numbers of a state and of an action, padded.
         geometry: of the images.
     """
@@ -56,6 +58,7 @@ class GrootProcessors(lerobot.Processors):
     plain: bool
     bounded: bool
     executed: int | None
+    gripper: int | None
     padded: tuple[int, int]
     geometry: Geometry
 
@@ -97,13 +100,11 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
     packing = _settings(directory, pack)
     packing.require(state_horizon=1, language_key=TASK, clip_outliers=True)
     kind, known = packing.values.get("embodiment_tag"), packing.values.get("embodiment_mapping")
-    number = known.get(kind) if isinstance(known, dict) and isinstance(kind, str) else None
+    # An embodiment that is not there has the weights of number 0, in LeRobot's training, too; ``examined`` says so.
+    number = known.get(kind, 0) if isinstance(known, dict) and isinstance(kind, str) else None
     if not isinstance(kind, str) or type(number) is not int or number < 0:
-        raise packing.error(
-            f"embodiment_tag {kind!r:.80} is none of embodiment_mapping, whose names are"
-            f" {', '.join(known)[:300] if isinstance(known, dict) else 'missing'}; lerobot would take the first one's"
-            " weights. Set embodiment_tag to the robot that the policy was trained for"
-        )
+        expected = "expected the name of an embodiment, and in embodiment_mapping whole numbers by name"
+        raise packing.error(f"embodiment_tag is {kind!r:.80}, embodiment_mapping {known!r:.200}; {expected}")
     read = packing.flag("normalize_min_max", True)
     state = _statistics(directory, lerobot.state_of(directory, pack) if read else {}, STATE, features)
     actions, added = _actions(directory, decode, features), lerobot.relative_entries(directory, before, after, features)
@@ -125,6 +126,7 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         plain=packing.flag("formalize_language", True),
         bounded=actions.bounded,
         executed=executed,
+        gripper=actions.gripper,
         padded=(packing.number("max_state_dim", 132), packing.number("max_action_dim", 132)),
         geometry=_geometry(encoding),
         relative=added or actions.relative,
@@ -145,7 +147,11 @@ def _settings(directory: Path, step: Mapping[str, Any]) -> Settings:
 
 def _cameras(packing: Settings, features: lerobot.Features) -> tuple[str, ...]:
     """In the order of the base's own names, of which lerobot knows one by another; or in alphabetical order."""
-    there = sorted(key for key, (kind, _) in features.items() if kind == "VISUAL")
+    known = sorted(key for key, (kind, _) in features.items() if kind == "VISUAL")
+    # lerobot shows observation.image only where no other camera is there.
+    there = [key for key in known if key.startswith(_CAMERAS)] or [key for key in known if key == _CAMERA_ALONE]
+    if not there:
+        raise packing.error(f"the cameras are {', '.join(known)}, of which lerobot shows none; expected {_CAMERA}NAME")
     own, found = packing.values.get("video_modality_keys") or [], list[str]()
     if not isinstance(own, list) or not all(isinstance(name, str) for name in own):
         raise packing.refusal("video_modality_keys", "names of cameras, or null")
@@ -176,6 +182,7 @@ class _Actions(NamedTuple):
 
     statistics: lerobot.Statistics | None
     bounded: bool
+    gripper: int | None
     executed: int | None = None
     relative: tuple[int | None, ...] = ()
     poses: tuple[Pose, ...] = ()
@@ -190,7 +197,12 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
         statistics = _statistics(directory, tensors, ACTION, features)
         if tensors and statistics is None:
             raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
-        return _Actions(statistics, statistics is not None and settings.flag("clip_normalized_action", False))
+        # LeRobot passes over the gripper of shorter actions.
+        bounded, gripper = (
+            settings.flag("clip_normalized_action", False),
+            count - 1 if count >= _LIBERO_NUMBERS else None,
+        )
+        return _Actions(statistics, statistics is not None and bounded, gripper)
     ends = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
     try:
         own = settings.values["modality_config"]["action"]
@@ -207,11 +219,15 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
         expected = f"groups of an action in modality_config, and numbers {' and '.join(ends)} of each in raw_stats"
         raise settings.error(f"{error!r:.80}; expected {expected}") from error
     steps = min(steps or rows[0], *rows) if rows else steps
+    sizes = [len(each) for each in columns]
+    single = "gripper" in names and sizes[at := names.index("gripper")] == 1
+    gripper = sum(sizes[:at]) if single else count
     shaped, entries, poses = {ACTION: ("ACTION", (*rows, count))}, list[int | None](), list[Pose]()
     for own, pose in zip(columns, of_poses, strict=True):
         poses += [Pose(len(entries), own[0])] if pose else []
         entries += [None] * len(own) if pose else own
-    return _Actions(_statistics(directory, tensors, ACTION, shaped), True, steps, tuple(entries), tuple(poses))
+    statistics = _statistics(directory, tensors, ACTION, shaped)
+    return _Actions(statistics, True, gripper, steps, tuple(entries), tuple(poses))
 
 
 def _group(

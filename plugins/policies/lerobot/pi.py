@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ttscompile.core.spec import PolicySpec
+from ttscompile.core.spec import Instruction, PolicySpec
+from ttscompile.core.tokenizer import IN_WORDS, StateInWords
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
@@ -25,7 +26,8 @@ from ..networks.pi import Expert, Pi, PiConfig, Prefix
 from ..networks.siglip import SiglipConfig
 from . import vla
 from .config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig
-from .policy import read_weights
+from .policy import MASK, TOKENS, read_weights
+from .processors import Processors
 
 _VISION = "paligemma_with_expert.paligemma.model.vision_tower."
 _TEXT = "paligemma_with_expert.paligemma.model.language_model."
@@ -43,7 +45,7 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     if adaptive and options.task is not None:
         raise CheckpointError(
             f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"
-            " compiled in. Leave the task out: the policy takes tokens as an observation."
+            " compiled in. Leave the task out, and give it at each call."
         )
     weights = _weights(shared, options)
     try:
@@ -60,12 +62,22 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
         task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
     encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task, config.trained_prefix > 0)
     side = config.vision.image_size
-    spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options)
-    if adaptive:  # the instruction holds the state, which the network does not read; actions may be relative to it
-        unread = () if spec.chunk.relative else (processors.renamed.get(STATE, STATE),)
+    told = _with_state(shared, processors) if processors.state_in_prompt and shared.state_dim else None
+    spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options, told=told)
+    if adaptive:  # the network reads no state but in the instruction; actions may be relative to it
+        unread = () if told or spec.chunk.relative else (processors.renamed.get(STATE, STATE),)
         others = {key: each for key, each in spec.observations.items() if key not in unread}
-        spec = replace(spec, observations=others, instruction=None, trained_prefix=config.trained_prefix)
+        spec = replace(spec, observations=others, instruction=told, trained_prefix=config.trained_prefix)
     return EncodedDenoiser(encoder, Expert(network)).eval(), spec
+
+
+def _with_state(shared: LeRobotConfig, processors: Processors) -> Instruction:
+    """How pi0.5 is told its task, as lerobot's step writes it: with the state in words."""
+    key, own, count = processors.renamed.get(STATE, STATE), processors.normalizers.get(STATE), shared.state_dim
+    first, width = ([0.0] * count, [1.0] * count) if own is None else (own.first.tolist(), own.width.tolist())
+    state = StateInWords(key, tuple(first), tuple(width), own is not None and own.mode != "MEAN_STD")
+    around, after = ("Task: ", f", State: {IN_WORDS};"), ("Action: ",)
+    return Instruction(TOKENS, MASK, False, around=around, after=after, spaced=True, state=state)
 
 
 def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: bool) -> PiConfig:
@@ -96,6 +108,7 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
         actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
         periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
         trained_prefix=delay,
+        rounded=settings.choice("dtype", "float32", "bfloat16") == "bfloat16",
     )
 
 

@@ -249,7 +249,8 @@ def relative_entries(
     if orders[1].index(_ABSOLUTE) < max(i for i, name in enumerate(orders[1]) if name in _CHANGES):
         raise CheckpointError(f"{directory}: expected {_ABSOLUTE} after actions are unnormalised; found {orders[1]}.")
     if state < count:
-        raise own[0].error(f"the {count} numbers of an action are relative to those of a state that has {state}")
+        told = f"{_RELATIVE}: the {count} numbers of an action are relative to a state, which has {state}"
+        raise CheckpointError(f"{directory}: {told}; expected as many.")
     for entry in (names or [], excluded):
         if not isinstance(entry, list) or not all(isinstance(name, str) for name in entry):
             raise own[0].error(f"found {own[0].values!s:.300}; expected names in action_names and exclude_joints")

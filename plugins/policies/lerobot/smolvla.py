@@ -42,6 +42,10 @@ RELEASED: Mapping[str, Mapping[str, Any]] = {
 }
 """Configurations of the released models: with these names nothing but the policy's own weights is needed."""
 
+_LLAMA = {"hidden_size": 4096, "intermediate_size": 11008, "vocab_size": 32000}
+_LLAMA |= dict.fromkeys(("num_attention_heads", "num_hidden_layers"), 32)
+"""What transformers takes for an entry that a language model's file leaves out."""
+
 _UNREAD = (".vlm.lm_head.weight", ".text_model.norm.weight")
 """Weights of what the policy does not compute: the language model's answer."""
 
@@ -74,6 +78,8 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     settings = shared.settings
     settings.require(add_image_special_tokens=False, use_delta_joint_actions_aloha=False)
     vision_entries, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
+    text = Settings(_LLAMA | dict(text.values), text.where)
+    text.require(hidden_act="silu", attention_bias=False, mlp_bias=False)
     names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
     vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
     layers = _layers(settings, text.number("num_hidden_layers", None, MOST_LAYERS))

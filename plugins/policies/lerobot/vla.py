@@ -13,7 +13,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ttscompile.core.spec import COMMITTED, WITHOUT, Instruction, ObservationSpec, PolicySpec, SamplerTable
+from ttscompile.core.spec import (
+    COMMITTED,
+    LARGEST,
+    WITHOUT,
+    Instruction,
+    ObservationSpec,
+    PolicySpec,
+    SamplerTable,
+    Switch,
+)
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.loops import Make, loops_of
@@ -113,9 +122,7 @@ def vla_spec(
     if image is not None:
         resized = ObservationSpec((1, 3, *image), bounds=(0.0, 1.0), fit=fit)
         observations |= {processors.renamed.get(key, key): resized for key in config.cameras}
-    # The instruction of pi05 holds its state too, which only lerobot's processor can put there.
-    plain = language and not processors.state_in_prompt
-    read = told or Instruction(TOKENS, MASK, processors.new_line) if plain else None
+    read = told or Instruction(TOKENS, MASK, processors.new_line) if language else None
     sample = (config.horizon, sizes["actions"])
     return replace(spec, sample=sample, observations=observations, instruction=read)
 
@@ -168,6 +175,17 @@ def positive_number(settings: Settings, name: str, default: float) -> float:
     if type(value) not in (int, float) or not 0 < value < 2**31:
         raise settings.refusal(name, "a positive number", default)
     return float(value)
+
+
+def switch(processors: Processors, channel: int, limit: float, below: float, above: float) -> Switch:
+    """A number of the actions: ``above`` where it is more than ``limit`` in the robot's units, else ``below``."""
+    if processors.action is not None:
+        own = processors.action.inverse()
+        scale, offset = (float(each[..., channel].flat[0]) for each in (own.scale, own.offset))
+        limit, (below, above) = limit * scale + offset, (below, above) if scale > 0 else (above, below)
+    limit = float(np.clip(limit, -LARGEST, LARGEST))
+    # What is equal to the limit is not more.
+    return Switch(channel, float(np.nextafter(np.float32(limit), np.float32(np.inf))), below, above)
 
 
 class Gathered(nn.Module):

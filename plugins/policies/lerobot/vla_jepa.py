@@ -11,7 +11,6 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -117,17 +116,11 @@ def _switches(shared: LeRobotConfig, processors: Processors) -> tuple[Switch, ..
         told = "is relative to the state, and then made one of two values, which is not compiled"
         raise shared.settings.error(f"number {channel} of an action {told}; expected it in relative_exclude_joints")
     below, above = (ends if processors.action is None else processors.action.unnormalized(ends, channel)).tolist()
-    rising = above >= below
     if BINARIZE in names:
         below, above = (1.0 - 2.0 * (end > limits[BINARIZE]) for end in (below, above))
     if SNAP in names:
         return (Switch(channel, limits[SNAP], below, above),)
-    limit = limits[BINARIZE]
-    if processors.action is not None:
-        affine = processors.action.inverse()
-        limit = float(np.clip(limit * affine.scale[channel] + affine.offset[channel], -LARGEST, LARGEST))
-    beyond = float(np.nextafter(np.float32(limit), np.float32(np.inf)))  # what is equal to the limit is not beyond it
-    return (Switch(channel, beyond, 1.0 if rising else -1.0, -1.0 if rising else 1.0),)
+    return (vla.switch(processors, channel, limits[BINARIZE], 1.0, -1.0),)
 
 
 def _prompt(

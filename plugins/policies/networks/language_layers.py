@@ -206,9 +206,20 @@ class Rotation(NamedTuple):
     sin: Tensor
 
 
-def rotation(positions: Tensor, channels: int, base: float = 10_000) -> Rotation:
-    """The rotary embedding of positions ``[B, T]``; of several axes, ``[B, T, channels / 2]``."""
-    rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32, device=positions.device))
+def rounded_rates(channels: int, base: float = 10_000) -> Tensor:
+    """Frequencies of the rotary embedding as a model has them that was cast to bfloat16, as float32."""
+    made = 1.0 / (base ** (torch.arange(0, channels, 2, dtype=torch.float32, device="cpu") / channels))
+    return made.to(torch.bfloat16).to(torch.float32)
+
+
+def rotation(positions: Tensor, channels: int, base: float = 10_000, rates: Tensor | None = None) -> Rotation:
+    """The rotary embedding of positions ``[B, T]``; of several axes, ``[B, T, channels / 2]``.
+
+    Args:
+        rates: its frequencies, where they are others than ``base`` says.
+    """
+    if rates is None:
+        rates = base ** (-2.0 / channels * torch.arange(channels // 2, dtype=torch.float32, device=positions.device))
     own = positions if positions.ndim == 3 else positions[..., None]
     angles = (own.to(torch.float32) * rates)[:, None]
     return Rotation(angles.cos(), angles.sin())

@@ -25,6 +25,8 @@ class PiConfig:
         actions: numbers of an action, padded.
         periods: shortest and longest of the timestep's waves.
         trained_prefix: see ``PolicySpec``; pi0.5 alone may have one.
+        rounded: whether frequencies of rotary positions and the scale of words are rounded to bfloat16. LeRobot casts
+            them with a policy of this ``dtype``, and what it trained knows no others.
     """
 
     vision: SiglipConfig
@@ -35,6 +37,7 @@ class PiConfig:
     actions: int
     periods: tuple[float, float]
     trained_prefix: int = 0
+    rounded: bool = False
 
     @property
     def adaptive(self) -> bool:
@@ -132,13 +135,22 @@ class Pi(nn.Module):
             self.action_time_mlp_out = nn.Linear(width, width)
 
 
+def _rates(config: layers.LanguageConfig, rounded: bool) -> Tensor | None:
+    return layers.rounded_rates(config.channels) if rounded else None
+
+
 class Prefix(nn.Module):
     """What the network reads once a call."""
+
+    rates: Tensor | None
 
     def __init__(self, network: Pi) -> None:
         super().__init__()
         model = network.paligemma_with_expert.paligemma.model
         self.channels, self.width = network.config.text.channels, network.config.text.width
+        scale, rounded = math.sqrt(self.width), network.config.rounded
+        self.scale = float(torch.tensor(scale, dtype=torch.bfloat16, device="cpu")) if rounded else scale
+        self.register_buffer("rates", _rates(network.config.text, rounded), persistent=False)
         self.vision_model, self.language_model = model.vision_tower, model.language_model
         self.projector = model.multi_modal_projector.linear
         self.state_proj: nn.Module | None = None if network.config.adaptive else network.state_proj
@@ -154,9 +166,9 @@ class Prefix(nn.Module):
         """
         seen = self.projector(self.vision_model(torch.stack(images, 1).flatten(0, 1)))
         seen = seen.reshape(-1, len(images) * seen.shape[1], self.width)
-        words = self.language_model.embed_tokens(tokens) * math.sqrt(self.width)
+        words = self.language_model.embed_tokens(tokens) * self.scale
         valid = functional.pad(mask, (seen.shape[1], 0), value=True)
-        turns = layers.rotation(torch.cumsum(valid, 1) - 1, self.channels)
+        turns = layers.rotation(torch.cumsum(valid, 1) - 1, self.channels, rates=self.rates)
         x = torch.cat([seen, words], 1)
         cache = layers.read_prefix(self.language_model.layers, x, turns, layers.prefix_mask(valid))
         own = [] if self.state_proj is None or state is None else [self.state_proj(state)[:, None]]
@@ -166,10 +178,13 @@ class Prefix(nn.Module):
 class Expert(nn.Module):
     """The denoiser."""
 
+    rates: Tensor | None
+
     def __init__(self, network: Pi) -> None:
         super().__init__()
         model = network.paligemma_with_expert.gemma_expert.model
         self.config = network.config
+        self.register_buffer("rates", _rates(network.config.expert, network.config.rounded), persistent=False)
         self.layers, self.norm = model.layers, model.norm
         self.action_in_proj, self.action_out_proj = network.action_in_proj, network.action_out_proj
         adaptive = network.config.adaptive
@@ -202,7 +217,7 @@ class Expert(nn.Module):
             own = layers.added(groups[None, :] <= groups[:, None])
         count = x.shape[1]
         places = valid.sum(-1, keepdim=True) + torch.arange(count, device=x.device)[None]
-        turns = layers.rotation(places, self.config.expert.channels)
+        turns = layers.rotation(places, self.config.expert.channels, rates=self.rates)
         before = layers.added(valid[:, None, None, :]).expand(-1, -1, count, -1)
         mask = torch.cat([before, own.expand(len(sample), 1, count, count)], 3)
         for i, layer in enumerate(self.layers):

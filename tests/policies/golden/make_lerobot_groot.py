@@ -145,6 +145,12 @@ def main() -> None:
             numbers[f"{kind}.{call}"] = chunk(policy, call, groots.observation(call))
         given = {key: value for key, value in groots.observation(0).items() if key != CAMERAS[0]}
         numbers[f"{kind}.missing"] = chunk(policy, 0, given)
+        shutil.copytree("policy", "plain")
+        groots.with_liberos_rule(folder / "policy")
+        policy.config.action_decode_transform = "libero"
+        numbers[f"{kind}.libero"] = chunk(policy, 0, groots.observation(0))
+        shutil.rmtree("policy")
+        Path("plain").rename("policy")
         (folder / "policy" / "model.safetensors").unlink()
         (folder / groots.BASE / "model.safetensors").unlink()
         Path(BACKBONE, "video_preprocessor_config.json").unlink()

@@ -5,6 +5,7 @@ Not run by the tests. Needs lerobot 0.6.1 with transformers; this repository has
     PYTHONPATH=. python -m tests.policies.golden.make_lerobot_pi
 """
 
+import json
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +17,9 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
+from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
+from lerobot.processor import PolicyProcessorPipeline, TransitionKey
+from lerobot.processor.converters import batch_to_transition
 from safetensors.torch import load_file
 
 from .. import pis
@@ -39,9 +43,37 @@ def main() -> None:
             given = pis.observation(0)
             policy.config.input_features["observation.images.empty_camera_0"] = policy.config.input_features[CAMERAS[0]]
             numbers[f"{kind}.missing"] = chunk(policy, directory, {k: v for k, v in given.items() if k != CAMERAS[1]})
+            numbers[f"{kind}.rounded"] = rounded(kind, Path(folder) / "rounded")
+    for mode in ("MEAN_STD", "QUANTILES"):
+        numbers[f"pi05.prompts.{mode}"] = prompts(mode)
     path = Path(__file__).with_name("lerobot_pi.npz")
     np.savez_compressed(path, **numbers)
     print(path, path.stat().st_size, "bytes")
+
+
+def rounded(kind: str, directory: Path) -> Any:
+    """Of a policy in bfloat16 what lerobot rounds when it is made; its weights, and what it computes, are float32."""
+    policy = tiny(kind, pis.save(kind, directory, "bfloat16")).float()
+    filled(policy, directory)  # again: its first weights were rounded
+    return chunk(policy, directory, pis.observation(0))
+
+
+def prompts(mode: str) -> Any:
+    """What pi0.5 is told of each task and state."""
+    with TemporaryDirectory() as folder:
+        directory = pis.save("pi05", Path(folder) / "policy")
+        path = directory / "policy_preprocessor.json"
+        entries = json.loads(path.read_text())
+        entries["steps"][0]["config"]["norm_map"]["STATE"] = mode
+        path.write_text(json.dumps(entries))
+        before = PolicyProcessorPipeline.from_pretrained(directory, config_filename=path.name)
+        step = Pi05PrepareStateTokenizerProcessorStep(max_state_dim=pis.PADDED)
+        told = []
+        for number, state in enumerate(pis.states()):
+            batch = before({STATE: torch.from_numpy(state)[None], "task": [pis.TASKS[number % 2]]})
+            made = step(batch_to_transition(batch))
+            told += made[TransitionKey.COMPLEMENTARY_DATA]["task"]
+    return np.array(told)
 
 
 def chunk(policy: Any, directory: Path, given: dict[str, Any], left_over: Any = None, delay: int = 0) -> Any:
@@ -90,13 +122,18 @@ def tiny(kind: str, directory: Path) -> Any:
         patch.object(module, "PaliGemmaForConditionalGenerationWithPiGemma", smaller),
     ):
         policy = POLICIES[kind](PreTrainedConfig.from_pretrained(directory)).eval()
+    filled(policy, directory)
+    return policy
+
+
+def filled(policy: Any, directory: Path) -> None:
+    """Give it the weights of the directory."""
     saved = load_file(directory / "model.safetensors")
     own = {name.replace(".vision_tower.vision_model.", ".vision_tower."): name for name in policy.state_dict()}
     missing, unexpected = policy.load_state_dict({own[name]: value for name, value in saved.items()}, strict=False)
     unread = ("lm_head.weight", "language_model.norm.weight")
     assert not unexpected, unexpected
     assert all(name.endswith(unread) or ".vision_model.head." in name for name in missing), missing
-    return policy
 
 
 if __name__ == "__main__":

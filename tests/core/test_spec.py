@@ -1,0 +1,43 @@
+"""What a policy observes: names that can be, and what an instruction needs of them."""
+
+import numpy as np
+import pytest
+
+from ttscompile.core.spec import ChunkSpec, Instruction, ObservationSpec, PolicySpec
+from ttscompile.core.tokenizer import StateInWords
+from ttscompile.errors import SpecError
+from ttscompile.samplers.flow import flow_matching_table
+
+
+def policy(*keys: str, instruction: Instruction | None = None) -> PolicySpec:
+    seen = {key: ObservationSpec((1, 2)) for key in keys}
+    return PolicySpec((4, 2), seen, flow_matching_table(1), ChunkSpec(2, 0, 4), instruction=instruction)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (
+            ("images.a.b", "images.a_b"),
+            "'images.a.b' and 'images.a_b' are both the argument 'images_a_b', .*Rename one",
+        ),
+        (("sample",), "'sample' must be letters, .* and its argument 'sample' none of"),
+        (("a..b",), "'a..b' must be letters, digits and _, with single"),
+    ],
+)
+def test_every_observation_has_an_argument_of_its_own(keys: tuple[str, ...], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        policy(*keys)
+
+
+def test_what_an_instruction_is_made_of_is_observed() -> None:
+    told = Instruction("tokens", "mask", False, state=StateInWords("state", (0.0,), (1.0,), ranged=True))
+    with pytest.raises(SpecError, match=r"the instruction's keys \['mask', 'state'\] must be observations"):
+        policy("tokens", instruction=told)
+    assert policy("tokens", "mask", "state", instruction=told).instruction == told
+
+
+def test_a_state_in_words_says_in_which_of_256_parts_it_is() -> None:
+    """The ends of a range are edges: the upper one is in the last part, and what is outside is told, too."""
+    state = StateInWords("state", first=(-1.0,) * 5, width=(2.0,) * 5, ranged=True)
+    assert state(np.array([-1, 1, 0, -1.01, 9], np.float32)) == "0 255 128 -1 255"
