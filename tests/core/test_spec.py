@@ -1,5 +1,7 @@
 """What a policy observes: names that can be, and what an instruction needs of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -34,7 +36,15 @@ def test_what_an_instruction_is_made_of_is_observed() -> None:
     told = Instruction("tokens", "mask", False, state=StateInWords("state", (0.0,), (1.0,), ranged=True))
     with pytest.raises(SpecError, match=r"the instruction's keys \['mask', 'state'\] must be observations"):
         policy("tokens", instruction=told)
-    assert policy("tokens", "mask", "state", instruction=told).instruction == told
+    two = replace(told, state=StateInWords("state", (0.0, 1.0), (1.0, 2.0), ranged=True))
+    assert policy("tokens", "mask", "state", instruction=two).instruction == two
+    for wrong in (
+        told.state,
+        StateInWords("state", (0.0, 1.0), (1.0,), True),
+        StateInWords("state", (0, 1), (1, 0), True),
+    ):
+        with pytest.raises(SpecError, match="the state in the instruction must have as many numbers as widths"):
+            policy("tokens", "mask", "state", instruction=replace(told, state=wrong))
 
 
 def test_a_state_in_words_says_in_which_of_256_parts_it_is() -> None:

@@ -5,6 +5,7 @@ Nothing here imports torch; the same records are written to the artifact and rea
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -206,6 +207,10 @@ class PolicySpec:
         read = set() if words is None else {words.tokens, words.mask, *([words.state.key] if words.state else [])}
         if absent := sorted(read - self.observations.keys()):
             raise SpecError(f"the instruction's keys {absent} must be observations.")
+        if words is not None and words.state is not None:
+            counts = math.prod(self.observations[words.state.key].shape), len(words.state.first), len(words.state.width)
+            if len(set(counts)) > 1 or 0 in words.state.width:
+                raise SpecError(f"the state in the instruction must have as many numbers as widths, none 0: {counts}.")
         scale = np.ones(self.chunk.action_dim) if self.chunk.normalizer is None else self.chunk.normalizer.scale
         if scale.shape not in ((self.chunk.action_dim,), (horizon + self.left_out, self.chunk.action_dim)):
             expected = f"[{self.chunk.action_dim}], or a row for each of {horizon + self.left_out} steps"

@@ -38,7 +38,7 @@ class StateInWords:
     Attributes:
         key: of the observation, float32 ``[B, D]``, as the robot measures it.
         first: ``[D]``, what is subtracted from it.
-        width: ``[D]``, what the rest is divided by.
+        width: ``[D]``, what the rest is divided by; not zero.
         ranged: whether that is the width of a range, which becomes -1..1, and not a deviation.
     """
 
@@ -99,7 +99,7 @@ class Instruction:
         if self.spaced:
             text = text.strip().replace("_", " ").replace("\n", " ")
         if self.around:
-            text = text.join((self.around[0], self.around[1].replace(IN_WORDS, state)))
+            text = text.join(part.replace(IN_WORDS, state) for part in self.around)
         elif self.before:
             text = text.strip()
         text = "\n".join([*self.before, text, *self.after])

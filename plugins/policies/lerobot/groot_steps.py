@@ -197,11 +197,8 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
         statistics = _statistics(directory, tensors, ACTION, features)
         if tensors and statistics is None:
             raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
-        # LeRobot passes over the gripper of shorter actions.
-        bounded, gripper = (
-            settings.flag("clip_normalized_action", False),
-            count - 1 if count >= _LIBERO_NUMBERS else None,
-        )
+        gripper = count - 1 if count >= _LIBERO_NUMBERS else None  # LeRobot passes over that of shorter actions
+        bounded = settings.flag("clip_normalized_action", False)
         return _Actions(statistics, statistics is not None and bounded, gripper)
     ends = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
     try:
