@@ -19,6 +19,7 @@ from .capture.narrow import narrow, needed, unneeded
 from .core.coercion import integer
 from .core.paths import on_hub, require_free_or_path
 from .core.spec import FP32, ORIGINAL, PolicySpec
+from .core.untrusted_json import NOT_SHOWN
 from .errors import ArtifactError, NoResidualBlocksError, PassError, SpecError
 from .frontends import files_beside, load_checkpoint_policy, tokenizer_of
 from .frontends.encoded import own_copy, parts
@@ -117,6 +118,11 @@ def convert(
     """
     require_precision(precision, keep_fp32)  # before minutes of work
     require_replaceable(directory)
+    if task is not None and (found := NOT_SHOWN.search(task)):
+        raise SpecError(
+            f"the task {task!a:.100} has the character {found[0]!a}, which a terminal does not show, and an artifact"
+            " keeps no such text. Leave it out, or give the instruction at every call."
+        )
     origin: dict[str, str] = {}
     if on_hub(checkpoint):
         fetched = fetch_checkpoint(str(checkpoint))

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..core.coercion import integer
 from ..core.spec import WITHOUT, PolicySpec
-from ..core.untrusted_json import NOT_SHOWN
 from ..errors import CheckpointError, SpecError
 from ..samplers.flow import METHODS
 from .refusals import refuse_directory
@@ -52,11 +51,6 @@ class LoadOptions:
     def __post_init__(self) -> None:
         if self.steps is not None:
             object.__setattr__(self, "steps", integer(self.steps, "steps", SpecError, 1))
-        if self.task is not None and (found := NOT_SHOWN.search(self.task)):
-            raise SpecError(
-                f"the task {self.task!a:.100} has the character {found[0]!a}, which a terminal does not show, and an"
-                " artifact keeps no such text. Leave it out, or give the instruction at every call."
-            )
 
 
 AS_SAVED = LoadOptions()
