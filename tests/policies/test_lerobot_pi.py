@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from safetensors.torch import load_file, save_file
 
 import ttscompile
 from tests.once import Once
 from tests.word_tokenizer import write_tokenizer
+from ttscompile.cli import main
 from ttscompile.core.spec import Noise
 from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
@@ -70,6 +72,15 @@ def test_pi05_is_told_its_state_in_words_as_lerobot_tells_it(
     assert told is not None and told.state is not None and told.state.key == STATE
     lines = [told.line(pis.TASKS[i % 2], told.state(state)) for i, state in enumerate(pis.states())]
     assert lines == golden[f"pi05.prompts.{mode}"].tolist()
+
+
+def test_convert_says_where_a_policy_takes_no_text(tmp_path: Path) -> None:
+    directory = pis.save("pi0", tmp_path / "policy")
+    told = CliRunner().invoke(
+        main, ["convert", str(directory), "-o", str(tmp_path / "compiled")], catch_exceptions=False
+    )
+    assert "hint: an observation has tokens in place of text, since the artifact has no tokenizer: that" in told.stderr
+    assert "--encoders DIR" in told.stderr
 
 
 def test_pi05_takes_its_task_as_text(tmp_path: Path) -> None:

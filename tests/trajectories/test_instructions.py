@@ -132,7 +132,9 @@ def test_short_texts_are_padded(tmp_path: Path, tokenizer: Path) -> None:
 
 
 def test_a_data_set_with_instructions_says_how_they_become_tokens(tmp_path: Path) -> None:
-    with pytest.raises(TrajectoryError, match="no array 'observation.language.*--observation task=DIR makes tokens"):
+    with pytest.raises(
+        TrajectoryError, match="no array 'observation.language.*--observation task=DIR makes tokens .*--encoders DIR"
+    ):
         load_trajectories([data_set(tmp_path, 3)], OBSERVED, 3, None, TOLD)
 
 

@@ -107,6 +107,9 @@ def convert(
     for stage in stages:
         if stage["stage"] == "narrow" and prediction_horizon is None:
             say(console, " ".join(["hint:", *stage["notes"]]))
+        if stage["stage"] == "tokenizer_of" and artifact.tokenizer is None:
+            told = "an observation has tokens in place of text, since the artifact has no tokenizer"
+            say(console, f"hint: {told}: {stage['notes'][0]}. Name its folder: --encoders DIR.")
         if stage["stage"] == "lower_precision":
             say(console, f"precision: {told_precision(artifact.manifest)}")
     if as_json:

@@ -55,18 +55,18 @@ def tokenizer_of(
         encoders: see ``LoadOptions``.
     """
     if spec.instruction is None:
-        return None, "none: no text alone gives what this policy observes"
+        return None, "no text alone gives what this policy observes"
     find, bounds = function_of(spec, "tokenizer_file"), spec.observations[spec.instruction.tokens].bounds
     try:
         file = None if find is None else find(Path(path), encoders)
         if file is None or bounds is None:
-            return None, "none: its tokenizer is not on this machine, and whoever gives the policy text has to have it"
+            return None, "that of its language model is not on this machine"
         found = Tokenizer(file, CheckpointError)
     except CheckpointError as error:
-        return None, f"none: {error}"
+        return None, str(error).removesuffix(".")
     known = round(float(np.max(bounds[1]))) + 1
     if found.size > known:
-        return None, f"none: {file} has {found.size} tokens, of which the policy knows {known}"
+        return None, f"{file} has {found.size} tokens, of which the policy knows {known}"
     return found.json, f"{file}: {found.size} tokens"
 
 

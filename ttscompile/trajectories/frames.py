@@ -96,7 +96,10 @@ def _part(path: Path, frames: Frames, key: str, part: str, image: bool) -> Array
     name, colon, count = part.partition(":")
     if name not in frames.names:
         words = "language" in key and TASK in frames.names
-        remedy = " Of its instructions --observation task=DIR makes tokens, with DIR/tokenizer.json." if words else ""
+        told = (
+            "--observation task=DIR makes tokens of its instructions, with DIR/tokenizer.json, and so does an artifact"
+        )
+        remedy = f" {told} that was compiled with --encoders DIR." if words else ""
         if image:
             remedy = f" A vision-language-action model can do without it: convert --without-camera {key}."
         raise TrajectoryError(
