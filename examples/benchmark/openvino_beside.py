@@ -2,12 +2,12 @@
 
     pip install openvino nncf
     python examples/benchmark/large.py --smolvla --output DIR        # or --evo1, --pi0, or --groot
-    python examples/benchmark/openvino_beside.py DIR [--threads 1]
+    python examples/benchmark/openvino_beside.py DIR [--threads 1] [--floats f32]
 
 ``DIR`` is what ``large.py`` leaves. OpenVINO converts the original network as two models: what the original evaluates
 once a call, and one step. The loop between them is the original's. It runs with floats as it chooses, which is
-bf16 where the processor has it, and in eight bits as NNCF quantises both models on a few random observations. See
-``beside.py`` for what is timed.
+bf16 where the processor has it, or as ``--floats`` says, and in eight bits as NNCF quantises both models on a few
+random observations. See ``beside.py`` for what is timed.
 """
 
 from __future__ import annotations
@@ -65,9 +65,10 @@ class Denoiser(nn.Module):
 class Part(nn.Module):
     """A model of OpenVINO in place of a part of the policy."""
 
-    def __init__(self, model: Any, threads: int) -> None:
+    def __init__(self, model: Any, threads: int, floats: str | None) -> None:
         super().__init__()
         settings = {"INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY"}
+        settings |= {} if floats is None else {"INFERENCE_PRECISION_HINT": floats}
         self._model = openvino.Core().compile_model(model, "CPU", settings)
 
     def run(self, *given: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -102,9 +103,9 @@ class OpenVino:
 
     parts = "before the loop, loop"
 
-    def __init__(self, encoder: Any, denoiser: Any, spec: PolicySpec, threads: int) -> None:
-        self._encoder, self._spec = EncoderPart(encoder, threads), spec
-        self._run = eager_policy(EncodedDenoiser(self._encoder, DenoiserPart(denoiser, threads)), spec)
+    def __init__(self, encoder: Any, denoiser: Any, spec: PolicySpec, threads: int, floats: str | None) -> None:
+        self._encoder, self._spec = EncoderPart(encoder, threads, floats), spec
+        self._run = eager_policy(EncodedDenoiser(self._encoder, DenoiserPart(denoiser, threads, floats)), spec)
 
     def predict(self, obs: Mapping[str, Array], noise: Noise) -> tuple[Array, list[float]]:
         """The actions ``[T, D]``, and seconds."""
@@ -122,8 +123,9 @@ def quantized(model: Any, seen: list[tuple[Array, ...]]) -> Any:
 
 @click.command(context_settings={"show_default": True})
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--floats", type=click.Choice(["f32", "bf16"]), help="Of OpenVINO; by default as it chooses.")
 @race_options
-def main(folder: Path, threads: int, rounds: int, fp32: bool) -> None:
+def main(folder: Path, threads: int, rounds: int, fp32: bool, floats: str | None) -> None:
     """Time calls of the policy in FOLDER, and of OpenVINO with the same weights."""
     directory, task = saved(folder, policy_of(folder))
     module: Any
@@ -139,9 +141,9 @@ def main(folder: Path, threads: int, rounds: int, fp32: bool) -> None:
             tuple(np.ascontiguousarray(seen[key]) for key in obs) for seen, _ in random_calls(spec, LEARNED, seed=3)
         ]
         steps = [(step[0].numpy(), np.array([t]), *(each.numpy() for each in encoded)) for t in spec.sampler.timesteps]
-    floats = OpenVino(encoder, denoiser, spec, threads)
-    few = OpenVino(quantized(encoder, learned), quantized(denoiser, steps), spec, threads)
-    rivals = {"OpenVINO": floats, "OpenVINO, int8 by NNCF": few}
+    whole = OpenVino(encoder, denoiser, spec, threads, floats)
+    few = OpenVino(quantized(encoder, learned), quantized(denoiser, steps), spec, threads, floats)
+    rivals = {"OpenVINO": whole, "OpenVINO, int8 by NNCF": few}
     print(f"OpenVINO {openvino.__version__}, NNCF {nncf.__version__}")
     race(folder, rivals, threads, rounds, fp32)
 
