@@ -1,16 +1,16 @@
 """The text of a task in place of its tokens, for a robot that has the policy's tokenizer. Imports no torch."""
 
 import os
-from collections.abc import Callable, Mapping
-from functools import cached_property
+from collections.abc import Mapping
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.core.coercion import plain
+from ttscompile.core.coercion import Errors, plain
 from ttscompile.core.spec import PolicySpec
-from ttscompile.core.tokenizer import TASK, Tokenizer, padded
+from ttscompile.core.tokenizer import TASK, ReadTokenizer, Tokenizer, padded
 from ttscompile.errors import ObservationError
 
 
@@ -22,7 +22,7 @@ class Instruct:
         read: gives its tokenizer; called when the first text comes.
     """
 
-    def __init__(self, spec: PolicySpec, read: Callable[[], Tokenizer]) -> None:
+    def __init__(self, spec: PolicySpec, read: ReadTokenizer) -> None:
         assert spec.instruction is not None
         self._told, self._keys, self._read = spec.instruction, tuple(spec.observations), read
         self._length = spec.observations[self._told.tokens].shape[0]
@@ -30,7 +30,7 @@ class Instruct:
 
     @cached_property
     def _tokenizer(self) -> Tokenizer:
-        return self._read()
+        return self._read(ObservationError)
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
         """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is."""
@@ -89,19 +89,15 @@ def instruct_of(artifact: Artifact, tokenizer: str | os.PathLike[str] | None = N
     Raises:
         ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
     """
-    spec, own = artifact.manifest.spec, artifact.tokenizer
-    if tokenizer is not None and spec.instruction is None:
-        remedy = "Leave the tokenizer out."
-        raise ObservationError(f"{tokenizer}: this policy takes no text that alone would give its tokens. {remedy}")
-    if spec.instruction is None or (tokenizer is None and own is None):
-        return None
+    spec = artifact.manifest.spec
     if tokenizer is not None:
-        given = Tokenizer(tokenizer, ObservationError)
-        return Instruct(spec, lambda: given)
+        if spec.instruction is None:
+            remedy = "Leave the tokenizer out."
+            raise ObservationError(f"{tokenizer}: this policy takes no text that alone would give its tokens. {remedy}")
+        return Instruct(spec, partial(_same, Tokenizer(tokenizer, ObservationError)))
+    return None if spec.instruction is None or artifact.tokenizer is None else Instruct(spec, artifact.tokenizer)
 
-    def read() -> Tokenizer:
-        assert own is not None
-        with artifact.reading(own.name):
-            return Tokenizer(own, ObservationError)
 
-    return Instruct(spec, read)
+def _same(tokenizer: Tokenizer, _: Errors) -> Tokenizer:
+    """One that is read already."""
+    return tokenizer

@@ -126,11 +126,11 @@ def compare(
     policy = open_policy(artifact, plan=artifact.plan(f"dense@{precisions[0]}"))
     obs, noise = call(spec)
     times = Times(Arithmetic(artifact))
-    halves = not {"amx_bf16", "avx512_bf16"}.isdisjoint(cpuinfo().get("flags", "").split())
+    halves = exact and not {"amx_bf16", "avx512_bf16"}.isdisjoint(cpuinfo().get("flags", "").split())
     for _ in range(rounds + 1):  # the first does not count
         times.next_round()
         expected, split = eager()
-        if exact and halves:
+        if halves:
             with torch.autocast("cpu", torch.bfloat16):
                 rounded, seconds = eager()
         for precision in precisions:
@@ -141,13 +141,13 @@ def compare(
                     error = float(np.abs(found - expected).max())
                     assert policy.last_report is not None
                     times.add(f"eager: {parts}", "fp32", split, policy.last_report)
-                    if exact and halves:
+                    if halves:
                         times.add(f"eager, autocast: {parts}", "bf16", seconds, policy.last_report)
     times.tell(1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     told = f"the dense call, {precisions[0]}, from eager; {peak:.2f} GiB at most, all of them loaded"
     print(f"{error:8.1e}  {told}")
-    if exact and halves:
+    if halves:
         print(f"{np.abs(rounded - expected).mean():8.2g}  eager in bf16 by autocast, from eager in fp32 on average")
     if exact:
         tell_precision(artifact, policy)

@@ -1,6 +1,7 @@
 """Parity with LeRobot 0.6.1: from raw state, image and tokens to the action, in the loop and in both runtimes."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.core.tokenizer import Tokenizer
-from ttscompile.errors import ObservationError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import LoadOptions
@@ -164,7 +164,7 @@ def test_runtimes_agree_on_random_plans(golden: Golden, compiled: Path) -> None:
 def test_a_task_in_words(golden: Golden) -> None:
     """The robot's own text gives LeRobot's tokens, and a text that is too long keeps CLIP's end token."""
     clip = golden.directory.parent / "clip-tiny"
-    told = Instruct(golden.spec, lambda: Tokenizer(clip, ObservationError))
+    told = Instruct(golden.spec, partial(Tokenizer, clip))
     mask = golden.numbers["attention_mask"]
     made = told({"task": str(golden.numbers["task"])})
     assert np.array_equal(made[MASK], mask)

@@ -81,7 +81,7 @@ def test_liberos_rule_makes_the_gripper_one_of_two_numbers(tmp_path: Path, golde
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"modality_keys": ["arm", "hand"]}, "actions have no group 'gripper' of one number"),
+        ({"modality_keys": ["arm", "hand"]}, "no group 'gripper' of actions has one number"),
         ({"action_configs": [{"rep": "ABSOLUTE"}, {"rep": "RELATIVE", "type": "NON_EEF"}]}, "gripper is relative"),
     ],
 )

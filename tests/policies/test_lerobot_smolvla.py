@@ -16,7 +16,7 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.contestants import original_policy
 from ttscompile.core.spec import Noise
-from ttscompile.errors import ArtifactError, CheckpointError, ObservationError
+from ttscompile.errors import ArtifactChangedError, ArtifactError, CheckpointError, ObservationError
 from ttscompile.frontends import load_checkpoint_policy, tokenizer_of
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import parts
@@ -135,7 +135,11 @@ def test_the_artifact_has_its_tokenizer(compiled: Path, directory: Path, tmp_pat
     assert (compiled / "tokenizer.json").read_bytes() == own.read_bytes()
     assert "tokenizer" not in (compiled / "policy_preprocessor.json").read_text()
     shutil.copytree(compiled, tmp_path / "compiled")
+    before = load_artifact(tmp_path / "compiled").tokenizer
     (tmp_path / "compiled" / "tokenizer.json").write_bytes(own.read_bytes().replace(b" ", b"\t", 1))
+    assert before is not None
+    with pytest.raises(ArtifactChangedError):
+        before(ObservationError)
     with pytest.raises(ArtifactError, match="tokenizer.json: expected sha256"):
         ttscompile.load(tmp_path / "compiled")
 

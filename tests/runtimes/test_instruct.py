@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 
 from tests.runtimes.executor.simulation import FakeClock, ScriptedPolicy
 from tests.word_tokenizer import write_tokenizer
+from ttscompile.core.coercion import Errors
 from ttscompile.core.spec import Instruction, ObservationSpec
 from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import ArtifactChangedError, ObservationError
@@ -34,7 +34,7 @@ def spec() -> Any:
 @pytest.fixture
 def instruct(spec: Any, tmp_path: Path) -> Instruct:
     folder = write_tokenizer(tmp_path / "language", WORDS)
-    return Instruct(spec, lambda: Tokenizer(folder, ObservationError))
+    return Instruct(spec, partial(Tokenizer, folder))
 
 
 def test_every_stream_has_the_tokens_of_its_text(instruct: Instruct) -> None:
@@ -52,15 +52,13 @@ def test_an_artifacts_own_tokenizer_is_read_when_a_text_comes(spec: Any, tmp_pat
     """Whoever gives tokens needs none; and one that was replaced since it was checked is not read."""
     folder, reads, refused = write_tokenizer(tmp_path / "own", WORDS), list[str](), ArtifactChangedError("replaced")
 
-    @contextmanager
-    def reading(name: str) -> Iterator[None]:
-        reads.append(name)
+    def read(error: Errors) -> Tokenizer:
+        reads.append("tokenizer.json")
         if len(reads) == 1:
             raise refused
-        yield
+        return Tokenizer(folder, error)
 
-    manifest = SimpleNamespace(spec=spec)
-    own: Any = SimpleNamespace(manifest=manifest, tokenizer=folder / "tokenizer.json", reading=reading)
+    own: Any = SimpleNamespace(manifest=SimpleNamespace(spec=spec), tokenizer=read)
     instruct = instruct_of(own)
     assert instruct is not None
     assert instruct({"state": STATE}) == {"state": STATE} and not reads

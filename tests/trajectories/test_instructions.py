@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 from tests.word_tokenizer import write_tokenizer
 from ttscompile.core.spec import Instruction, ObservationSpec
-from ttscompile.core.tokenizer import StateInWords
+from ttscompile.core.tokenizer import StateInWords, Tokenizer
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import load_trajectories
 from ttscompile.trajectories.fits import examine_recordings
@@ -65,7 +66,7 @@ def data_set(path: Path, version: int) -> Path:
 
 def require_told(path: Path, tokenizer: Path) -> None:
     """Both episodes have the tokens of their texts, at every call: by the user's tokenizer, and by the policy's own."""
-    for asked, own in (({"task": (str(tokenizer),)}, None), (None, tokenizer)):
+    for asked, own in (({"task": (str(tokenizer),)}, None), (None, partial(Tokenizer, tokenizer))):
         first, second = load_trajectories([path], OBSERVED, 3, asked, TOLD, own)
         assert first.calls == second.calls == 2
         np.testing.assert_array_equal(first.observations[TOKENS], [[1, 2, 4]] * 2)
@@ -94,7 +95,7 @@ def test_recorded_tokens_come_before_the_policys_own_tokenizer(tmp_path: Path, t
     kept: dict[str, Any] = {"state": arrays()["state"], "episode_ends": np.array(ENDS), "meta": meta}
     np.savez(path, task=np.array(["push"] * rows), **tokens, **kept)
     with pytest.warns(UserWarning, match="arrays .'task'. are no keys of the observation"):
-        recorded = load_trajectories([path], OBSERVED, 3, None, TOLD, tokenizer)
+        recorded = load_trajectories([path], OBSERVED, 3, None, TOLD, partial(Tokenizer, tokenizer))
     asked = {"task": (str(tokenizer),)}
     with pytest.warns(UserWarning, match=f"arrays .'{MASK}', '{TOKENS}'. are no keys of the observation"):
         made = load_trajectories([path], OBSERVED, 3, asked, TOLD)
@@ -102,7 +103,7 @@ def test_recorded_tokens_come_before_the_policys_own_tokenizer(tmp_path: Path, t
     assert made[0].observations[TOKENS].tolist() == [[1, 4, 0]] * 2
     np.savez(path, **kept)
     with pytest.raises(TrajectoryError, match=f"no array '{TOKENS}'"):
-        load_trajectories([path], OBSERVED, 3, None, TOLD, tokenizer)
+        load_trajectories([path], OBSERVED, 3, None, TOLD, partial(Tokenizer, tokenizer))
 
 
 def test_a_state_stands_in_the_instruction_of_each_row(tmp_path: Path) -> None:
@@ -116,11 +117,11 @@ def test_a_state_stands_in_the_instruction_of_each_row(tmp_path: Path) -> None:
     observed |= {TOKENS: ObservationSpec((4,), dtype="int64"), MASK: ObservationSpec((4,), dtype="bool")}
     path = tmp_path / "it.npz"
     np.savez(path, state=rows, task=np.array(["push"] * 3), episode_ends=np.array([3]), meta=meta)
-    (episode,) = load_trajectories([path], observed, 1, None, told, tokenizer)
+    (episode,) = load_trajectories([path], observed, 1, None, told, partial(Tokenizer, tokenizer))
     assert episode.observations[TOKENS].tolist() == [[1, 2, 3, 4], [1, 2, 5, 4], [1, 2, 3, 4]]
     one = replace(told, state=replace(state, first=(1.0,), width=(2.0,)))
     with pytest.raises(TrajectoryError, match=r"'state' is \[3, 2\]; expected \[3, 1\], a state for each text"):
-        load_trajectories([path], observed, 1, None, one, tokenizer)
+        load_trajectories([path], observed, 1, None, one, partial(Tokenizer, tokenizer))
 
 
 def test_short_texts_are_padded(tmp_path: Path, tokenizer: Path) -> None:
@@ -132,9 +133,8 @@ def test_short_texts_are_padded(tmp_path: Path, tokenizer: Path) -> None:
 
 
 def test_a_data_set_with_instructions_says_how_they_become_tokens(tmp_path: Path) -> None:
-    with pytest.raises(
-        TrajectoryError, match="no array 'observation.language.*--observation task=DIR makes tokens .*--encoders DIR"
-    ):
+    told = "--encoders DIR makes tokens of its instructions; so does --observation task=DIR"
+    with pytest.raises(TrajectoryError, match=f"no array 'observation.language.*{told}"):
         load_trajectories([data_set(tmp_path, 3)], OBSERVED, 3, None, TOLD)
 
 

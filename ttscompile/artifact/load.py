@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.coercion import Errors
 from ..core.envelope import Envelope
 from ..core.lattice import check_schedule, dense_plan
 from ..core.paths import require_path
 from ..core.plan import DENSE, ORIGINAL, Plan
 from ..core.spec import BF16, FP16, FP32, INT4, INT8
+from ..core.tokenizer import ReadTokenizer, Tokenizer
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir import pieces as names
 from ..ir.graph import Graph
@@ -97,10 +99,15 @@ class Artifact:
             )
 
     @property
-    def tokenizer(self) -> Path | None:
-        """What makes an instruction's text the policy's tokens, to be read within ``reading``; None without."""
+    def tokenizer(self) -> ReadTokenizer | None:
+        """Reads what makes an instruction's text the policy's tokens; None where the artifact has no such file."""
+        return None if self.manifest.stores.tokenizer is None else self._read_tokenizer
+
+    def _read_tokenizer(self, error: Errors) -> Tokenizer:
         name = self.manifest.stores.tokenizer
-        return None if name is None else self.files / name
+        assert name is not None
+        with self.reading(name):
+            return Tokenizer(self.files / name, error)
 
     @property
     def files(self) -> Path:

@@ -4,7 +4,6 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..core.spec import PolicySpec
+from ..core.tokenizer import ReadTokenizer
 from ..errors import CalibrationError
 from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
@@ -54,7 +54,7 @@ def load_episodes(
     spec: PolicySpec,
     trajectories: Sequence[str | os.PathLike[str]],
     observation: Mapping[str, Sequence[str]] | None,
-    tokenizer: Path | None = None,
+    tokenizer: ReadTokenizer | None = None,
 ) -> list[Episode]:
     """The recorded episodes, as the policy observes them; see ``load_trajectories``.
 

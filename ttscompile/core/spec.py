@@ -171,19 +171,17 @@ class PolicySpec:
 
     def _require_arguments(self) -> None:
         """Raise unless every observation has an argument of its own."""
-        taken = {self.sample_argument, self.timestep_argument, *[COMMITTED] * bool(self.trained_prefix)}
+        own = self.sample_argument, self.timestep_argument, *[COMMITTED] * bool(self.trained_prefix)
+        taken = dict.fromkeys(own, "an input of the loop")
         for key in self.observations:
+            if not _KEY.fullmatch(key):
+                expected = "expected letters, digits and _, with single . / - or blanks between them"
+                raise SpecError(f"observation key {key!r}: {expected}.")
             argument = self.arguments[key]
-            if alike := [other for other in self.observations if other != key and self.arguments[other] == argument]:
-                told = f"observation keys {key!r} and {alike[0]!r} are both the argument {argument!r}, where . is _"
-                remedy = "Rename one: in a policy of LeRobot's by rename_map of its preprocessor."
-                raise SpecError(f"{told}. {remedy}")
-            if argument in taken or not _KEY.fullmatch(key):
-                raise SpecError(
-                    f"observation key {key!r} must be letters, digits and _, with single . / - or blanks between them,"
-                    f" and its argument {argument!r} none of {sorted(taken)}."
-                )
-            taken.add(argument)
+            if argument in taken:
+                told = f"observation key {key!r} is the argument {argument!r}, and so is {taken[argument]}"
+                raise SpecError(f"{told}. Rename it: in a policy of LeRobot's by rename_map of its preprocessor.")
+            taken[argument] = repr(key)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in the sample's shape", SpecError, 1) for n in self.sample)

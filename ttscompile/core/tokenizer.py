@@ -1,10 +1,10 @@
 """Text to tokens, with the small ``tokenizers`` wheel; imported when it is used."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -186,6 +186,10 @@ class Tokenizer:
             found = f"{len(tokens)} tokens, and the policy reads {length}"
             raise self._error(f"the task {text!r:.100} has {found}. Use fewer words, or compile it in: convert --task.")
         return tokens
+
+
+ReadTokenizer: TypeAlias = Callable[[Errors], Tokenizer]
+"""Reads a tokenizer when it is called, with errors of this class: whoever has tokens needs none."""
 
 
 def _clip(vocabulary: Path) -> Any:

@@ -12,6 +12,7 @@ import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy.typing as npt
 from ..core.coercion import integer
 from ..core.paths import on_hub, require_path
 from ..core.spec import Instruction, ObservationSpec, PolicySpec
-from ..core.tokenizer import TASK
+from ..core.tokenizer import TASK, ReadTokenizer, Tokenizer
 from ..core.untrusted_json import parse_json
 from ..core.values import check_values, fitted
 from ..core.zip_files import open_zip
@@ -62,7 +63,7 @@ def load_trajectories(
     action_steps: int,
     sources: Mapping[str, Sequence[str]] | None = None,
     instruction: Instruction | None = None,
-    tokenizer: Path | None = None,
+    tokenizer: ReadTokenizer | None = None,
 ) -> list[Episode]:
     """Read episodes from files.
 
@@ -112,7 +113,7 @@ def episodes_of(
     spec: PolicySpec,
     paths: Sequence[str | os.PathLike[str]],
     sources: Mapping[str, Sequence[str]] | None = None,
-    tokenizer: Path | None = None,
+    tokenizer: ReadTokenizer | None = None,
 ) -> list[Episode]:
     """Recorded episodes as a policy observes them, with a call for each chunk that it executes."""
     executed = spec.chunk.stop - spec.chunk.start
@@ -130,7 +131,7 @@ def _read(
     action_steps: int,
     given: Mapping[str, Sequence[str]],
     instruction: Instruction | None,
-    tokenizer: Path | None,
+    read: ReadTokenizer | None,
 ) -> list[Episode]:
     path, limits = local_path(given_path), {"most": MOST_EPISODES} if on_hub(given_path) else {}
     sources = {key: parts for key, parts in given.items() if key != TASK}
@@ -138,11 +139,11 @@ def _read(
     if asked and instruction is None:
         told = f"{given[TASK][0]}: this policy takes no text that alone would give its tokens. Leave the tokenizer out"
         raise TrajectoryError(f"{told}, and record tokens if it observes any.")
-    tokenizer = Path(given[TASK][0]) if asked else tokenizer
-    other, held, frames = _opened(path, limits, sorted({*_arrays(observations, sources), TASK}))
-    words = instruction if asked or (tokenizer and _in_text_alone(held, instruction, sources)) else None
+    read = partial(Tokenizer, given[TASK][0]) if asked else read
+    other, held, frames = _opened(path, limits, sorted({*array_names(observations, sources), TASK}))
+    words = instruction if asked or (read and _in_text_alone(held, instruction, sources)) else None
     seen = {key: spec for key, spec in observations.items() if words is None or key not in (words.tokens, words.mask)}
-    used = _arrays(seen, sources) | ({TASK} if words else set())
+    used = array_names(seen, sources) | ({TASK} if words else set())
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")
@@ -153,8 +154,8 @@ def _read(
         held, action_steps = frames_of_calls(held, action_steps), 1
         ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
-    if words and tokenizer:
-        arrays |= instruction_rows(path, held, words, observations, tokenizer, arrays)
+    if words and read:
+        arrays |= instruction_rows(path, held, words, observations, read, arrays)
     if other is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}
@@ -177,7 +178,7 @@ def _read(
     return episodes
 
 
-def _arrays(keys: Iterable[str], sources: Mapping[str, Sequence[str]]) -> set[str]:
+def array_names(keys: Iterable[str], sources: Mapping[str, Sequence[str]]) -> set[str]:
     """Names of the arrays of a recording that these keys of the observation are made of."""
     return {part.partition(":")[0] for key in keys for part in sources.get(key, (key,))}
 

@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from ..core.finding import Finding, Level
 from ..core.spec import Affine, PolicySpec
-from ..core.tokenizer import TASK
+from ..core.tokenizer import TASK, ReadTokenizer
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .episodes import Episode, episodes_of, local_path, recorded_names
+from .episodes import Episode, array_names, episodes_of, local_path, recorded_names
 from .frames import few, one_error
 from .lerobot_dataset import MAX_INFO
 
@@ -125,7 +125,7 @@ def examine_recordings(
     paths: Sequence[str | os.PathLike[str]],
     spec: PolicySpec,
     sources: Mapping[str, Sequence[str]],
-    tokenizer: Path | None = None,
+    tokenizer: ReadTokenizer | None = None,
 ) -> list[Finding]:
     """Look at recordings, which are given as to ``load_trajectories``, as the policy would observe them."""
     found, renamed = list[Finding](), dict(sources)
@@ -133,13 +133,14 @@ def examine_recordings(
     if tokenizer is None and (said := [key for key in language if not {key, TASK} & set(sources)]):
         observed = {key: one for key, one in spec.observations.items() if key not in said}
         spec = replace(spec, observations=observed, instruction=None)
-        told = f"{', '.join(said)}: not looked at; recordings seldom have them, and convert --task compiles a text in"
+        made = "an artifact with its tokenizer makes them of recorded instructions, and convert --task compiles one in"
+        told = f"{', '.join(said)}: not looked at; {made}"
         found.append(Finding(PART, "instruction", told, Level.NOTE))
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         try:
             for path in map(local_path, paths):
-                found += [*_names(path, spec, renamed, tokenizer), *_rate(path, spec)]
+                found += [*_names(path, spec, renamed, tokenizer is not None), *_rate(path, spec)]
             episodes = episodes_of(spec, paths, renamed, tokenizer)
         except TrajectoryError as error:
             return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
@@ -148,11 +149,11 @@ def examine_recordings(
     return [*found, *map(judged, placed(episodes, spec))]
 
 
-def _names(path: Path, spec: PolicySpec, renamed: dict[str, Sequence[str]], tokenizer: Path | None) -> list[Finding]:
+def _names(path: Path, spec: PolicySpec, renamed: dict[str, Sequence[str]], reads_text: bool) -> list[Finding]:
     """Keys that a recording lacks; a name that may stand for one is added to ``renamed``, and said."""
     names, frames = recorded_names(path)
-    used = {part.partition(":")[0] for key in spec.observations for part in renamed.get(key, (key,))}
-    worded = TASK in renamed or (tokenizer is not None and TASK in names)
+    used = array_names(spec.observations, renamed)
+    worded = TASK in renamed or (reads_text and TASK in names)
     text = {spec.instruction.tokens, spec.instruction.mask} if worded and spec.instruction else set[str]()
     missing = [key for key in spec.observations if key not in renamed and key not in names and key not in text]
     free = [name for name in names if name not in used]

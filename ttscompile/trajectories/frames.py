@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.spec import Instruction, ObservationSpec
-from ..core.tokenizer import TASK, Tokenizer, padded
+from ..core.tokenizer import TASK, ReadTokenizer, padded
 from ..errors import TrajectoryError
 
 Array = npt.NDArray[Any]
@@ -96,10 +96,8 @@ def _part(path: Path, frames: Frames, key: str, part: str, image: bool) -> Array
     name, colon, count = part.partition(":")
     if name not in frames.names:
         words = "language" in key and TASK in frames.names
-        told = (
-            "--observation task=DIR makes tokens of its instructions, with DIR/tokenizer.json, and so does an artifact"
-        )
-        remedy = f" {told} that was compiled with --encoders DIR." if words else ""
+        own = "An artifact that was compiled with --encoders DIR makes tokens of its instructions"
+        remedy = f" {own}; so does --observation task=DIR, with DIR/tokenizer.json." if words else ""
         if image:
             remedy = f" A vision-language-action model can do without it: convert --without-camera {key}."
         raise TrajectoryError(
@@ -211,14 +209,14 @@ def instruction_rows(
     held: Frames,
     told: Instruction,
     observations: Mapping[str, ObservationSpec],
-    tokenizer: Path,
+    read: ReadTokenizer,
     others: Mapping[str, Array],
 ) -> dict[str, Array]:
     """Tokens and mask of every row, from its text.
 
     Args:
         held: what it holds: ``task``, texts ``[F]`` or their bytes ``[F, L]``.
-        tokenizer: path of ``tokenizer.json``, or of its folder.
+        read: gives the policy's tokenizer.
         others: by key the other observations, ``[F, ...]``, of which the instruction may hold the state.
 
     Returns:
@@ -232,7 +230,7 @@ def instruction_rows(
         texts = np.ascontiguousarray(texts).view(f"S{texts.shape[1]}")[:, 0]
     if texts.dtype.kind not in "US" or texts.ndim != 1:
         raise TrajectoryError(f"{path}: {TASK!r} is {texts.dtype}{list(texts.shape)}; expected texts [F].")
-    made, length = Tokenizer(tokenizer, TrajectoryError), observations[told.tokens].shape[-1]
+    made, length = read(TrajectoryError), observations[told.tokens].shape[-1]
     lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in texts.tolist()]
     states = [""] * len(lines)
     if told.state is not None:

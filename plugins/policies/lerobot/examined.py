@@ -14,10 +14,9 @@ from ttscompile.frontends.saved_weights import read_tensors
 from ttscompile.frontends.settings import read_json
 
 from .config import ACTION, CONFIG
-from .groot_steps import read_groot_processors
 from .policy import TOKENS
-from .processors import NORMALIZE, PREPROCESSOR, Features, Processors, read_processors
-from .tokenizer import tokenizer_file, tokenizer_name
+from .processors import NORMALIZE, PREPROCESSOR, Features, Processors
+from .tokenizer import features_and_processors, file_of_name, tokenizer_name
 
 
 def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
@@ -30,10 +29,8 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
 
 def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | None) -> list[Finding]:
     entries, steps = read_json(directory / CONFIG), read_json(directory / PREPROCESSOR)["steps"]
-    both = {**entries["input_features"], **entries["output_features"]}
-    features: Features = {key: (str(one["type"]), tuple(one["shape"])) for key, one in both.items()}
-    how, own = (directory, features), (one for one in steps if one.get("registry_name") == NORMALIZE)
-    found = read_groot_processors(*how) if entries["type"] == "groot" else read_processors(*how, str(entries["type"]))
+    features, found = features_and_processors(directory, entries)
+    own = (one for one in steps if one.get("registry_name") == NORMALIZE)
     step: dict[str, Any] = {"config": {}} | next(own, {})
     doubts, action = [], {} if found.action is None else {ACTION: found.action}
     measured = _measured(directory, step)
@@ -61,7 +58,8 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
         told = f"n_action_steps is {wanted}, and only {executed} predicted steps are left from the first executed on"
         remedy = f"Set it to {executed} in {CONFIG}: a robot that waits for more runs out of actions."
         doubts.append(Finding(PART, "chunk", told, Level.WARNING, remedy))
-    return [*doubts, *_cameras(features, step, measured), *_tokenizer(directory, found, spec, encoders)]
+    name = tokenizer_name(entries, found)
+    return [*doubts, *_cameras(features, step, measured), *_tokenizer(directory, name, found, spec, encoders)]
 
 
 def _embodiment(steps: Sequence[Mapping[str, Any]]) -> list[Finding]:
@@ -103,14 +101,14 @@ def _cameras(features: Features, step: Mapping[str, Any], measured: set[str]) ->
 
 
 def _tokenizer(
-    directory: Path, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
+    directory: Path, name: str, found: Processors, spec: PolicySpec, encoders: str | os.PathLike[str] | None
 ) -> list[Finding]:
     """Of a policy that reads an instruction: whether the tokenizer is of its language model."""
     one = spec.observations.get(TOKENS)
     if one is None or one.bounds is None:
         return []
-    file, name = tokenizer_file(directory, encoders), tokenizer_name(directory) or "none"
-    level, told, remedy = Level.NOTE, f"{name:.100}, which is not on this machine, and so was not tried", ""
+    file = file_of_name(name, directory, encoders)
+    level, told, remedy = Level.NOTE, f"{name or 'none':.100}, which is not on this machine, and so was not tried", ""
     if (length := found.tokenizer.get("max_length", one.shape[0])) != one.shape[0]:
         level, told = Level.WARNING, f"makes {length!s:.20} tokens of an instruction; {one.shape[0]} are read"
         remedy = f"Correct max_length in {PREPROCESSOR}."

@@ -39,9 +39,9 @@ def files_beside(directory: Path, spec: PolicySpec, text: bool = False) -> dict[
     """
     entries = read_json(directory / CONFIG)
     steps = read_json(directory / PREPROCESSOR)["steps"]
-    worded = spec.instruction is not None and (spec.instruction.before or spec.instruction.around) and not text
+    worded = spec.instruction is not None and (spec.instruction.before or spec.instruction.around)
     held = entries["type"] == "pi05" or any(step.get("registry_name") == PROMPT for step in steps)
-    if worded or (held and not text):
+    if (worded or held) and not text:
         return {}
     renamed = {
         new: old

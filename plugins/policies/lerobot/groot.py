@@ -96,10 +96,14 @@ def _switches(shared: LeRobotConfig, processors: GrootProcessors) -> tuple[Switc
     rule = settings.values.get("action_decode_transform") or "none"
     if rule not in ("none", "libero", "auto"):
         raise settings.refusal("action_decode_transform", "libero, none or auto")
-    if rule == "none" or channel is None or (rule == "auto" and processors.kind != "libero_sim"):
+    if rule == "none" or (rule == "auto" and processors.kind != "libero_sim"):
         return ()
-    if channel >= shared.action_dim:
-        raise settings.error("action_decode_transform is 'libero', and actions have no group 'gripper' of one number")
+    if channel is None or channel >= shared.action_dim:
+        if processors.grouped:  # else LeRobot passes over it
+            raise settings.error(
+                "action_decode_transform is 'libero', and no group 'gripper' of actions has one number"
+            )
+        return ()
     if processors.relative and processors.relative[channel] is not None:
         raise settings.error("action_decode_transform is 'libero', and the gripper is relative to the state")
     return (vla.switch(processors, channel, 0.5, 1.0, -1.0),)

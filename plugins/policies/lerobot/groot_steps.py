@@ -22,7 +22,7 @@ from ttscompile.frontends.settings import Settings
 from . import processors as lerobot
 from .config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 
-(_PACK, _UNPACK, _DECODE), ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
+(_PACK, _UNPACK, _DECODE), _ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
 _MOST_FRAMES, _EPSILON = 64, 1e-8
@@ -45,8 +45,8 @@ class GrootProcessors(lerobot.Processors):
         plain: whether instructions are in lower case and without signs.
         bounded: whether actions are clipped before they are unnormalised.
         executed: actions of a chunk that mean something; None for all.
-        gripper: which number of an action LIBERO's rule is for; one that no action has where lerobot would look for
-            it in vain, and None where it would pass over it.
+        grouped: whether actions are in groups that have names.
+        gripper: which number of an action is the gripper's; None where none is known to be.
         padded: numbers of a state and of an action, padded.
         geometry: of the images.
     """
@@ -58,6 +58,7 @@ class GrootProcessors(lerobot.Processors):
     plain: bool
     bounded: bool
     executed: int | None
+    grouped: bool
     gripper: int | None
     padded: tuple[int, int]
     geometry: Geometry
@@ -91,11 +92,11 @@ class Seen(nn.Module):
 
 def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootProcessors:
     """The pipelines of a policy with these features."""
-    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, (_PACK, ENCODE, *_OLD))
+    before = lerobot.read_steps(directory, lerobot.PREPROCESSOR, (_PACK, _ENCODE, *_OLD))
     after = lerobot.read_steps(directory, lerobot.POSTPROCESSOR, (_UNPACK, _DECODE, *_OLD))
     if old := next((step["registry_name"] for step in (*before, *after) if step["registry_name"] in _OLD), None):
         raise CheckpointError(f"{directory}: the step {old} is {OLD}.")
-    pack, encode = (_one(directory, before, name) for name in (_PACK, ENCODE))
+    pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
     decode = _one(directory, after, _UNPACK, _DECODE)
     packing = _settings(directory, pack)
     packing.require(state_horizon=1, language_key=TASK, clip_outliers=True)
@@ -126,6 +127,7 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         plain=packing.flag("formalize_language", True),
         bounded=actions.bounded,
         executed=executed,
+        grouped=decode["registry_name"] == _DECODE,
         gripper=actions.gripper,
         padded=(packing.number("max_state_dim", 132), packing.number("max_action_dim", 132)),
         geometry=_geometry(encoding),
@@ -197,7 +199,7 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
         statistics = _statistics(directory, tensors, ACTION, features)
         if tensors and statistics is None:
             raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
-        gripper = count - 1 if count >= _LIBERO_NUMBERS else None  # LeRobot passes over that of shorter actions
+        gripper = count - 1 if count >= _LIBERO_NUMBERS else None
         bounded = settings.flag("clip_normalized_action", False)
         return _Actions(statistics, statistics is not None and bounded, gripper)
     ends = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
@@ -218,7 +220,7 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
     steps = min(steps or rows[0], *rows) if rows else steps
     sizes = [len(each) for each in columns]
     single = "gripper" in names and sizes[at := names.index("gripper")] == 1
-    gripper = sum(sizes[:at]) if single else count
+    gripper = sum(sizes[:at]) if single else None
     shaped, entries, poses = {ACTION: ("ACTION", (*rows, count))}, list[int | None](), list[Pose]()
     for own, pose in zip(columns, of_poses, strict=True):
         poses += [Pose(len(entries), own[0])] if pose else []

@@ -20,7 +20,7 @@ from ttscompile.frontends.settings import Settings, read_json
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
-_RENAME, TOKENIZE, NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
+_RENAME, _TOKENIZE, NORMALIZE = "rename_observations_processor", "tokenizer_processor", "normalizer_processor"
 _UNNORMALIZE, _BATCH, _DEVICE = "unnormalizer_processor", "to_batch_processor", "device_processor"
 _NEW_LINE = ("smolvla_new_line_processor", "pi0_new_line_processor")
 PROMPT = "pi05_prepare_state_tokenizer_processor_step"
@@ -30,7 +30,7 @@ _CROP = "evo1_action_processor"
 """What it does is in the policy's configuration, which lerobot prefers to the step's own."""
 _COMMON = {PREPROCESSOR: (_RENAME, _BATCH, _DEVICE, _RELATIVE), POSTPROCESSOR: (_BATCH, _DEVICE, _ABSOLUTE)}
 """Steps that all policies have, or may have."""
-_BEFORE, _AFTER = (TOKENIZE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT), (_UNNORMALIZE, _CROP)
+_BEFORE, _AFTER = (_TOKENIZE, NORMALIZE, *_NEW_LINE, *_PAD, PROMPT), (_UNNORMALIZE, _CROP)
 """Beside them, those before and after a policy."""
 IMAGENET, DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
 GROOT = ("groot_n1_7_pack_inputs_v1", "groot_action_unpack_unnormalize_v2", "groot_n1_7_action_decode_v1")
@@ -210,7 +210,7 @@ def read_processors(directory: Path, features: Features, kind: str = "") -> Proc
         renamed=renamed_observations(directory, before, features),
         normalizers=_statistics(directory, before, NORMALIZE, features, padded),
         action=_statistics(directory, after, _UNNORMALIZE, features, padded).get("action"),
-        tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == TOKENIZE), {}),
+        tokenizer=next((dict(step["config"]) for step in before if step["registry_name"] == _TOKENIZE), {}),
         new_line=any(step["registry_name"] in _NEW_LINE for step in before),
         state_in_prompt=any(step["registry_name"] == PROMPT for step in before),
         own={
