@@ -100,7 +100,7 @@ test-openpi: $(READY)
 		typing_extensions  # which it imports and does not ask for
 	$(BIN)/pytest tests/serving/test_openpi_client.py
 
-# Python 3.11 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
+# Python 3.10 to 3.13, one core, AVX2 alone, as far as they are here; see docs/machines.md.
 test-matrix: $(READY)
 	$(BIN)/python tests/machines/matrix.py
 

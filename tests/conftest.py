@@ -143,6 +143,18 @@ def _one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
+def toy_compiled(once: Once) -> Path:
+    """A toy artifact: five steps, five blocks, an untrained pruner, not calibrated. Copy it before changing it."""
+
+    def make(directory: Path) -> object:
+        from .runtimes.toys import toy_program, written_artifact  # they need torch, and --made brings the toy along
+
+        return written_artifact(toy_program(), directory)
+
+    return once.folder("toy", make)
+
+
+@pytest.fixture(scope="session")
 def compiled_pusht(pusht_checkpoint: Path, once: Once) -> Path:
     """The artifact of the Push-T policy, not calibrated, and ``call.onnx``, its single file, beside it.
 

@@ -18,6 +18,7 @@ from ttscompile import __version__
 from ttscompile.measure.versions import VERSION
 
 from . import release
+from .machines import matrix
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +105,14 @@ def workflow(name: str) -> dict[Any, Any]:
 
 
 def test_continuous_integration_runs_all_tests_on_each_python_that_the_package_names() -> None:
-    job = workflow("ci")["jobs"]["test"]
+    """But for the first, on which artifacts run: there what a robot needs is tried."""
+    jobs = workflow("ci")["jobs"]
+    job, robot = jobs["test"], jobs["robot"]["steps"]
     named = [str(each).rpartition(" ")[2] for each in release.project()["classifiers"] if "Python :: 3." in each]
-    assert job["strategy"]["matrix"]["python"] == named
+    assert job["strategy"]["matrix"]["python"] == named[1:]
+    assert robot[1]["with"]["python-version"].split() == named[:2]
+    assert robot[-1]["run"] == "make test-matrix"
+    assert list(matrix.PYTHONS) == named
     assert f">={named[0]}" == release.project()["requires-python"]
     assert job["env"]["PYTHON"] == "python${{ matrix.python }}"
     assert job["steps"][-1]["run"] == ".ci/run"

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 from uuid import uuid4
 
 from .artifact.load import Artifact, load_artifact
@@ -121,7 +121,7 @@ class RayPool:
                 " same command with --resume goes on, with --ray or without."
             ) from error
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "RayPool":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -15,7 +15,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from http import HTTPStatus
 from ipaddress import ip_address, ip_network
 from math import prod
@@ -270,5 +270,5 @@ def _shown(peer: tuple[Any, ...]) -> str:
 
 
 def _write(event: str, peer: str, **more: Any) -> None:
-    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
     AUDIT.info(json.dumps({"time": now, "event": event, "from": peer, **more}))

@@ -112,8 +112,7 @@ class RayCopies:
         from ray import serve
 
         try:
-            async with asyncio.timeout(HEALTH_SECONDS):
-                found = await asyncio.to_thread(serve.status)
+            found = await asyncio.wait_for(asyncio.to_thread(serve.status), HEALTH_SECONDS)
         except Exception as error:  # whatever Ray raises where there is no cluster any more
             return f"the cluster does not answer: {first_line(error)}"
         application = found.applications.get(self._name)

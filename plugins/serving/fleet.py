@@ -139,9 +139,8 @@ class FleetServer(Listener):
         start, limit = time.monotonic(), self._limits.action_timeout
         self._waiting += 1
         try:
-            async with asyncio.timeout(limit):
-                answered = await self._copies.predict(plan, obs)
-        except TimeoutError as error:
+            answered = await asyncio.wait_for(self._copies.predict(plan, obs), limit)
+        except asyncio.TimeoutError as error:
             raise DeadlineMissedError(f"no copy answered within {limit:g} s.") from error
         finally:
             self._waiting -= 1

@@ -234,15 +234,13 @@ class Listener(ABC):
             while True:
                 if reply is not None:
                     try:
-                        async with asyncio.timeout(self._limits.send_timeout):
-                            await connection.send(reply)
-                    except TimeoutError:
+                        await asyncio.wait_for(connection.send(reply), self._limits.send_timeout)
+                    except asyncio.TimeoutError:
                         connection.transport.abort()
                         return
                 try:
-                    async with asyncio.timeout(self._limits.idle_timeout):
-                        message = await connection.recv()
-                except TimeoutError:
+                    message = await asyncio.wait_for(connection.recv(), self._limits.idle_timeout)
+                except asyncio.TimeoutError:
                     await connection.close(1008, f"no complete request for {self._limits.idle_timeout:g} s")
                     return
                 self._admission.requested(peer, own)

@@ -14,11 +14,13 @@ Who owns what:
   that is over.
 """
 
+import sys
+import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from numbers import Real
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from ttscompile.core.spec import FloatArray
 from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadError
@@ -199,7 +201,7 @@ class AsyncExecutor:
         if not self._failure_told:
             self._raise_failure()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "AsyncExecutor":
         return self
 
     def __exit__(
@@ -210,7 +212,11 @@ class AsyncExecutor:
         except ExecutorError as closing:
             if error is None:
                 raise
-            error.add_note(f"closing the executor failed too: {closing}")
+            note = f"closing the executor failed too: {closing}"
+            if sys.version_info >= (3, 11):
+                error.add_note(note)
+            else:
+                warnings.warn(note, stacklevel=2)
 
     def statistics(self) -> ExecutorStatistics:
         """What happened so far; works after ``close`` too."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from copy import copy
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ _ROUNDING = torch.backends.cuda.matmul, _CUDNN.conv, _CUDNN.rnn, _ONEDNN.matmul,
 _EXACT = ("ieee", "none")
 
 Setting = TypeVar("Setting")
+Own = TypeVar("Own", bound="OnTensors")
 
 
 def device_of(name: str) -> torch.device:
@@ -91,7 +92,7 @@ class OnTensors:
         """What it computes with, by name."""
         return {name: value for name in self.TENSORS if isinstance(value := getattr(self, name), Tensor)}
 
-    def on(self, tensors: Mapping[str, Tensor]) -> Self:
+    def on(self: Own, tensors: Mapping[str, Tensor]) -> Own:
         """The same with other tensors in the place of ``tensors()``."""
         other = copy(self)
         for name in self.TENSORS:

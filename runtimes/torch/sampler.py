@@ -7,7 +7,7 @@ allows it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -77,7 +77,7 @@ class Advance(devices.OnTensors):
         """Inner, middle and outer of its jumps; none if it has none."""
         return tuple(each for each in (self.inner, self.middle, self.outer) if each is not None)
 
-    def on(self, tensors: Mapping[str, Tensor]) -> Self:
+    def on(self, tensors: Mapping[str, Tensor]) -> Advance:
         """See ``OnTensors.on``."""
         other = super().on(tensors)
         other._of_step = [one.expand(len(each), -1, -1) for one, each in zip(other.updates, self._of_step, strict=True)]

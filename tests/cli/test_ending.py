@@ -23,7 +23,7 @@ from ttscompile.cli import main
 from ttscompile.cli.ending import Status
 from ttscompile.errors import CalibrationFailedError, TtscompileError
 
-COMMAND = [sys.executable, "-P", "-m", "ttscompile"]
+COMMAND = [sys.executable, *(["-P"] if sys.version_info >= (3, 11) else []), "-m", "ttscompile"]
 
 
 def test_a_warning_is_one_line_and_shows_no_python(tmp_path: Path, toy_compiled: Path) -> None:

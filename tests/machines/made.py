@@ -19,7 +19,7 @@ import numpy.typing as npt
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
-from ttscompile.core.spec import PRECISIONS
+from ttscompile.core.spec import FP32, INT8
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.random_calls import random_calls
 
@@ -48,7 +48,7 @@ def make(folder: Path) -> None:
     unfinished.mkdir(parents=True)
     for name, checkpoint in CHECKPOINTS.items():
         artifact = unfinished / name / "artifact"
-        ttscompile.convert(checkpoint, artifact, sampler="dpmsolver++", steps=STEPS, precision="int8")
+        ttscompile.convert(checkpoint, artifact, sampler="dpmsolver++", steps=STEPS, precision=INT8)
         calibrate(artifact, unfinished / name / "calls.npz")
         made: dict[str, Any] = dict(answers(artifact))
         np.savez(unfinished / name / ACTIONS, **made)
@@ -65,7 +65,7 @@ def calibrate(artifact: Path, recording: Path) -> None:
     ttscompile.calibrate(artifact, [recording], 0.5, "interval", correct=True, progress=False)
 
 
-def answers(artifact: Path, precisions: Sequence[str] = PRECISIONS) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+def answers(artifact: Path, precisions: Sequence[str] = (FP32, INT8)) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """Of each call its observation and noise, and its actions.
 
     They are ``CALL/obs/KEY``, ``CALL/noise`` and, where the loop of a plan draws any, ``CALL/steps/PLAN``; and

@@ -2,7 +2,7 @@
 
     python tests/machines/matrix.py [--all]
 
-For each of Python 3.11, 3.12 and 3.13 that is found, ``build/matrix`` gets an environment as a robot has it, and
+For each of Python 3.10 to 3.13 that is found, ``build/matrix`` gets an environment as a robot has it, and
 ``robot.py`` runs there; then once on one core; then, where ``qemu-x86_64-static`` is installed, on an emulated Haswell,
 which has AVX2 and no AVX-512. With ``--all`` the whole suite runs as well, in this environment: as it is, on one core,
 and with the switches of ``make test-avx2``. Every row is printed at the end; what was not found is a row too.
@@ -24,7 +24,9 @@ from tests.machines.arm import CUSTOMIZE, pip, written_script  # noqa: E402
 from tests.source import source_copy  # noqa: E402
 
 PLACE = ROOT / "build" / "matrix"
-PYTHONS = ("3.11", "3.12", "3.13")
+COMPILING = ("3.11", "3.12", "3.13")
+"""Those that the versions in ``constraints.txt`` are for."""
+PYTHONS = ("3.10", *COMPILING)
 BESIDE = ("pytest", "pytest-benchmark", "hypothesis")
 EMULATOR, PROCESSOR = "qemu-x86_64-static", "Haswell-noTSX"
 ABSENT = "not here"
@@ -107,7 +109,8 @@ def environment(version: str, interpreter: Path) -> Path:
         subprocess.run([interpreter, "-m", "venv", "--without-pip", folder], check=True)
     with tempfile.TemporaryDirectory() as name:
         source = source_copy(Path(name) / "source")
-        pip("--python", python, "install", "-c", ROOT / "constraints.txt", f"{source}[serve]", *BESIDE)
+        known = ("-c", ROOT / "constraints.txt") if version in COMPILING else ()
+        pip("--python", python, "install", *known, f"{source}[serve]", *BESIDE)
         pip("--python", python, "install", "--force-reinstall", "--no-deps", source)
     (packages,) = folder.glob("lib/python*/site-packages")
     (packages / "sitecustomize.py").write_text(CUSTOMIZE)

@@ -51,6 +51,14 @@ def test_what_a_loop_draws_in_its_steps_goes_along(tmp_path: Path) -> None:
     assert [check.passed for check in found(tmp_path)] == [False]
 
 
+def test_the_tests_of_a_robot_are_collected_without_the_compiler(tmp_path: Path) -> None:
+    """What their modules import is there; an absent package is as one whose entry in sys.modules is None."""
+    code = f"import sys; sys.modules.update(dict.fromkeys({robot.COMPILERS})); import pytest; sys.exit(pytest.main())"
+    words = [sys.executable, "-c", code, *robot.selected(tmp_path), "--collect-only"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=robot.ROOT, check=False)
+    assert done.returncode == 0, done.stdout
+
+
 @pytest.mark.parametrize(("off", "passed"), [(0.5e-5, True), (2e-5, False)])
 def test_actions_may_differ_by_a_hundred_thousandth_of_their_range(
     folder: Path, tmp_path: Path, off: float, passed: bool

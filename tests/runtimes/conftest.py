@@ -12,8 +12,6 @@ from tests.plans import store_schedules
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.ir.program import Program
 
-from .toys import pencil_program, toy_program, written_artifact
-
 MakeArtifact = Callable[[Program], Artifact]
 
 
@@ -39,12 +37,14 @@ def failing_prologue(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def toy_artifact(once: Once) -> Artifact:
-    return load_artifact(once.folder("toy", lambda directory: written_artifact(toy_program(), directory)))
+def toy_artifact(toy_compiled: Path) -> Artifact:
+    return load_artifact(toy_compiled)
 
 
 @pytest.fixture(scope="session")
 def pencil_artifact(once: Once) -> Artifact:
+    from .toys import pencil_program, written_artifact
+
     return load_artifact(once.folder("pencil", lambda directory: written_artifact(pencil_program(), directory)))
 
 
@@ -63,4 +63,6 @@ def pruned(own_artifact: Artifact) -> Artifact:
 
 @pytest.fixture
 def make_artifact(tmp_path: Path) -> MakeArtifact:
+    from .toys import written_artifact
+
     return lambda program: written_artifact(program, tmp_path / "artifact")

@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 
 from tests.plans import store_schedules
-from tests.runtimes.executor.conftest import _no_thread_is_left, toy_compiled
-from tests.runtimes.toys import toy_program, written_artifact
+from tests.runtimes.executor.conftest import _no_thread_is_left as _no_thread_is_left
 from ttscompile import Source
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.serving.admission import AUDIT
-
-__all__ = ["_no_thread_is_left", "toy_compiled"]
 
 
 @pytest.fixture
@@ -44,6 +41,8 @@ def audit() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def planned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The toy policy with two plans: ``evenly``, and ``memory``, which reads the call before."""
+    from tests.runtimes.toys import toy_program, written_artifact  # they need torch
+
     artifact = written_artifact(toy_program(pruner=False), tmp_path_factory.mktemp("fleet") / "artifact")
     evenly = uniform_plan(artifact.manifest.steps, len(artifact.manifest.groups), 2)
     memory = np.where(evenly == Source.TIMESTEP, Source.ROLLOUT.value, evenly).astype(np.int8)

@@ -25,7 +25,15 @@ PARTIAL = ".partial"
 def describe(path: Path) -> FileRecord:
     """Size and hash of a file. Raises OSError: it cannot be read."""
     with path.open("rb") as file:
-        return FileRecord(sha256=hashlib.file_digest(file, "sha256").hexdigest(), bytes=path.stat().st_size)
+        return FileRecord(sha256=_sha256(file), bytes=path.stat().st_size)
+
+
+def _sha256(file: BufferedReader) -> str:
+    """The hash of what is left to read, as ``hashlib.file_digest`` of Python 3.11 makes it."""
+    digest, part = hashlib.sha256(), memoryview(bytearray(2**18))
+    while size := file.readinto(part):
+        digest.update(part[:size])
+    return digest.hexdigest()
 
 
 def content_hash(content: bytes) -> str:
@@ -69,7 +77,7 @@ def check_file(path: Path, record: FileRecord) -> None:
         if size != record.bytes:
             kind = "truncated" if size < record.bytes else "longer than it was"
             raise ArtifactError(f"{path}: expected {record.bytes} bytes; found {size}: the file is {kind}. {_AGAIN}")
-        found = hashlib.file_digest(file, "sha256").hexdigest()
+        found = _sha256(file)
     if found != record.sha256:
         raise ArtifactError(
             f"{path}: expected sha256 {record.sha256[:12]}...; found {found[:12]}...: the file was changed since it was"

@@ -22,7 +22,7 @@ from ..core.finding import Finding, Level
 from ..measure.machine import BUSY, X86, cpuinfo
 from ..measure.versions import release
 
-PYTHON = (3, 11)
+PYTHON = (3, 10)
 PROJECT = "ttscompile"
 ENABLES = {
     "compile": "convert, calibrate, bench -t, inspect -o, pictures, runtime='torch' and 'reference'",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -131,7 +131,7 @@ class Pieces(Loop):
         towers = {frame_name(i): tower for i, tower in enumerate(self.towers)}
         return {**rows, **towers, CONDITION: self.condition}
 
-    def in_loop(self, name: str) -> Self:
+    def in_loop(self, name: str) -> Pieces:
         """Those of one loop alone, as of the original."""
         tables, pruner = self.loop_tables.get(name, self.tables), self.loop_pruners.get(name, self.pruner)
         return replace(self, tables=tables, pruner=pruner, loop_tables={}, loop_pruners={})

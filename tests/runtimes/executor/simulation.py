@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -211,6 +211,9 @@ class Quick(ScriptedPolicy):
         return {"action_pred": np.zeros((1, 16, 3), np.float32)}
 
 
+Own = TypeVar("Own", bound="World")
+
+
 class World:
     """An executor over a scripted policy; times are offsets from the start, so that float32 actions hold them."""
 
@@ -279,7 +282,7 @@ class World:
             self.clock.advance(1 / self.hz)
         raise AssertionError("never starved")
 
-    def __enter__(self) -> Self:
+    def __enter__(self: Own) -> Own:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -183,6 +184,7 @@ def test_an_error_that_nobody_was_told_is_raised_by_close_and_only_once() -> Non
     quiet.executor.close()
 
 
+@pytest.mark.filterwarnings("ignore:closing the executor failed too")
 def test_an_error_under_way_is_not_hidden_by_the_error_of_closing() -> None:
     with pytest.raises(KeyError) as caught, World(fault={0: "raise"}).executor as executor:  # noqa: PT012
         clock: FakeClock = executor._clock  # type: ignore[assignment]
@@ -190,7 +192,8 @@ def test_an_error_under_way_is_not_hidden_by_the_error_of_closing() -> None:
             executor.observe({"obs": np.array([0.0, at])})
             clock.advance(0.1)
         raise KeyError("mine")
-    assert "ZeroDivisionError" in caught.value.__notes__[0]
+    if sys.version_info >= (3, 11):  # before it a warning says so
+        assert "ZeroDivisionError" in caught.value.__notes__[0]
 
 
 def test_a_prediction_of_the_wrong_shape_is_an_error() -> None:
