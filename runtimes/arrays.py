@@ -134,8 +134,8 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
     if noise.steps is None:
         remedy = f"Give [K, B, T, D] = {shape}, or noise=None to have all of it drawn."
         raise ObservationError(f"noise.steps is missing: the sampler draws noise in its steps. {remedy}")
-    steps = noise.steps
-    if isinstance(steps, np.ndarray) and steps.ndim and len(steps) > shape[0]:
+    steps = plain(noise.steps, "noise.steps", ObservationError)
+    if steps.ndim and len(steps) > shape[0]:
         steps = steps[: shape[0]]  # that of a longer loop, so that plans of several loops can have the same
     return Noise(initial, _noise(steps, "noise.steps", "[K, B, T, D]", shape, spec.left_out))
 

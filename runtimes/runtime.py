@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from ttscompile.artifact.corrections import require_fit
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import View, view_of
 from ttscompile.core.envelope import FAR, plain_cells
-from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal
+from ttscompile.core.lattice import BoolArray, PlanArray, Source, check_plan, require_legal, without_illegal_reads
 from ttscompile.core.plan import DENSE, Plan, Variant
 from ttscompile.core.spec import FloatArray, Noise, PolicySpec
 from ttscompile.core.update import bounded
@@ -201,6 +202,8 @@ class Runtime:
         same = opened is self._used  # else what earlier calls kept is of another variant
         written = self._written if same and self._written is not None else np.zeros(cells, dtype=np.bool_)
         dropped = self._dropped if same and self._dropped is not None else np.zeros(cells, dtype=np.bool_)
+        if name is None and plan.correction is not None:
+            require_fit(plan.correction, self._artifact.manifest, plan.loop)
         if plan.cells is None and PRUNER not in manifest.pieces:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
@@ -304,12 +307,10 @@ class Runtime:
         Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
         """
         streams, steps, blocks = written.shape
-        if repair:
-            plans, legalised = repair_plan(plan, written)
-        else:
-            plans, legalised = check_plan(plan, steps, blocks, streams), (0,) * streams
-        rollout = plans == Source.ROLLOUT.value
-        if (rollout & dropped).any():
+        wanted = check_plan(plan, steps, blocks, streams)
+        plans = without_illegal_reads(wanted, written) if repair else wanted
+        rollout = wanted == Source.ROLLOUT.value
+        if (rollout & dropped).any():  # nor are they repaired: there was a residual, and nobody kept it
             _, k, b = np.argwhere(rollout & dropped)[0].tolist()
             raise IllegalPlanError(
                 f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
@@ -317,8 +318,9 @@ class Runtime:
                 " computes all, as plan='dense' does): from a first matrix on every call keeps what it computes."
             )
         check = partial(require_legal, plans, opened.view.manifest.groups, written)
-        if (rollout & ~written).any():
+        if not repair and (rollout & ~written).any():
             check()
+        legalised = tuple(np.count_nonzero(plans != wanted, axis=(1, 2)).tolist())
         return _Settled(plans, tuple(opened.lowering.lower(one, check) for one in plans), legalised)
 
 

@@ -27,6 +27,9 @@ from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 from .idle_steps import IdleSteps
 from .sessions import FIRST_STEP, Array, Bound, run_named, run_prologue
 
+KEPT_CORRECTIONS = 64
+"""Whose bindings a workspace keeps; there are two of each, with a prefix and without."""
+
 
 class Workspace:
     """Buffers and bindings for B streams.
@@ -239,6 +242,8 @@ class Workspace:
             updates = matrices(self._sampler, used) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
             made = _Advances(used, used.anchors.tolist(), updates, steps, masked)
+            while len(self._advances) > KEPT_CORRECTIONS:  # who makes one for each call must not fill the memory
+                del self._advances[next(iter(self._advances))]
             self._advances[id(correction), known is not None] = made
         if made.masked is not None and known is not None:
             made.masked.mask(known)

@@ -20,10 +20,13 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import View, view_of
 from ttscompile.core.correction import Correction
 from ttscompile.core.lattice import PlanArray, Source, check_plan, require_legal
+from ttscompile.core.plan import Plan
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.ir.pieces import PRUNER
 from ttscompile.runtimes.instructions import Instructions, instructions_of
 from ttscompile.runtimes.plans import LoweringCache, pruner_plan, repair_plan
+from ttscompile.runtimes.policy import plan_of
+from ttscompile.runtimes.report import GIVEN
 
 from .loop import denoise
 from .plain_network import CPU, CallModule, PlainNetwork
@@ -40,15 +43,15 @@ def to_module(path: str | Path, plan: Literal["pruner"]) -> PrunedCall: ...
 
 
 @overload
-def to_module(path: str | Path, plan: str | None = None) -> SparseCall | PrunedCall: ...
+def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | PrunedCall: ...
 
 
-def to_module(path: str | Path, plan: str | None = None) -> SparseCall | PrunedCall:
+def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | PrunedCall:
     """The call of a compiled policy with one of its plans, as a module that can be exported.
 
     Args:
         path: the directory that ``convert`` wrote, or the same zipped.
-        plan: ``dense`` or the name of a plan of the artifact; None for its default plan.
+        plan: of the artifact or of one's own, or the name of one; None for the default. The module computes it in fp32.
 
     Returns:
         On the CPU, in fp32, and in evaluation mode; ``to`` moves it. See ``SparseCall.forward``; and
@@ -60,12 +63,15 @@ def to_module(path: str | Path, plan: str | None = None) -> SparseCall | PrunedC
             the pruner's, and the artifact has no such plan.
     """
     artifact = load_artifact(path)
-    name = artifact.manifest.default_plan if plan is None else plan
     if plan == PRUNER and PRUNER not in artifact.plans:
         known = [one for one, each in artifact.plans.items() if each.otherwise is None]
         problem = f"{artifact.path}: no plan of it is made by a pruner; it has {known}"
         raise IllegalPlanError(f"{problem}. Use one of these, or calibrate with a proposer that trains the pruner.")
-    own = artifact.plan(name).exact
+    chosen = plan_of(artifact, plan)
+    name, own = artifact.told(chosen) or GIVEN, chosen.exact
+    if "@" in name and chosen.precision:
+        problem = f"plan {name!r} has weights of {', '.join(sorted(set(chosen.precision.values())))}"
+        raise IllegalPlanError(f"{problem}, and a module computes in fp32. Leave out what follows the @.")
     if own.otherwise is not None:
         problem = f"plan {name!r} begins with the chunk of the call before, and a module keeps nothing between calls"
         raise IllegalPlanError(f"{problem}. Give another plan, or use load(..., runtime='torch').")

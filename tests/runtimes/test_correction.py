@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,6 +111,43 @@ def test_the_first_call_binds_nothing(
     with pytest.raises(AttributeError):  # what stands in for a binding cannot run
         runtime.predict(obs, noise, replace(fast, correction=another))
     assert len(made) == artifact.manifest.steps
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_one_of_another_size_is_refused_and_the_episode_goes_on(
+    corrected: tuple[Path, Correction, np.ndarray], runtime: str
+) -> None:
+    artifact = load_artifact(corrected[0])
+    steps, (horizon, dimensions) = artifact.manifest.steps, artifact.manifest.spec.sample
+    opened = open_runtime(artifact, runtime)
+    obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
+    opened.predict(obs, noise, artifact.plans["dense"])
+    for k, size in ((steps - 1, (horizon, dimensions)), (steps + 1, (horizon, dimensions)), (steps, (horizon - 1, 2))):
+        with pytest.raises(IllegalPlanError, match=f"the correction has weights .* this policy needs .{steps}, "):
+            opened.predict(obs, noise, replace(artifact.plans["dense"], correction=no_correction(k, size)))
+    assert opened.streams == 1
+
+
+def test_corrections_without_end_do_not_fill_the_memory(
+    corrected: tuple[Path, Correction, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ttscompile.runtimes.onnxruntime.workspace.KEPT_CORRECTIONS", 3)
+    artifact = load_artifact(corrected[0])
+    runtime = open_runtime(artifact, "onnxruntime")
+    obs, noise = random_inputs(artifact, np.random.default_rng(1), 1)
+    fast = artifact.plans["fast"]
+    assert fast.correction is not None
+    found, kept = [], list[weakref.ref[Correction]]()
+    for _ in range(6):
+        plan = replace(fast, correction=replace(fast.correction))
+        assert plan.correction is not None
+        kept.append(weakref.ref(plan.correction))
+        found.append(runtime.predict(obs, noise, plan)[0])
+        runtime.reset()
+    del plan
+    gc.collect()
+    assert sum(one() is not None for one in kept) <= 4
+    assert all(np.array_equal(one, found[0]) for one in found)
 
 
 def test_it_is_part_of_the_identity(corrected: tuple[Path, Correction, np.ndarray]) -> None:

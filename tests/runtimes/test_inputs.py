@@ -109,6 +109,14 @@ def test_how_numbers_lie_in_memory_changes_nothing(policy: CompiledPolicy, layou
     np.testing.assert_array_equal(np.asarray(found), expected)
 
 
+def test_of_the_noise_of_a_longer_loop_the_first_steps_are_taken_whatever_holds_it(policy: CompiledPolicy) -> None:
+    noise, expected = some_noise(), actions(policy)
+    assert noise.steps is not None
+    longer = np.concatenate([noise.steps, noise.steps])
+    for steps in (longer, torch.from_numpy(longer)):
+        np.testing.assert_array_equal(actions(policy, noise=Noise(noise.initial, steps)), expected)
+
+
 def test_streams_of_stride_zero_are_streams(policy: CompiledPolicy) -> None:
     same = np.broadcast_to(OBS[:1], (2, 2))
     np.testing.assert_array_equal(actions(policy, same), actions(policy, same.copy()))

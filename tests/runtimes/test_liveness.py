@@ -124,6 +124,8 @@ def test_a_matrix_reads_no_older_residual_than_the_last_computed(scheduled: Arti
     gone, there = np.where(row, R, plain), np.where(row, T, np.where(plain == T, R, plain))
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):
         runtime.predict(obs, noise, Plan(cells=gone))
+    with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):  # nor is that repaired
+        runtime.predict(obs, noise, replace(scheduled.plans["plain"], cells=gone))
     assert_alike(scheduled, (runtime, reference), Plan(cells=there), rng)
     with pytest.raises(IllegalPlanError, match=rf"step {k}, block 0, .* did not keep"):  # that call computed none of it
         runtime.predict(obs, noise, Plan(cells=gone))

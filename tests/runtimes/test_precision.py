@@ -75,7 +75,7 @@ def test_parts_may_be_named_one_by_one(int8: Path) -> None:
         assert all(not np.array_equal(one, other) for other in found[:i])
     with pytest.raises(ArtifactError, match="wants 'nonsense' in 'int8'"):
         ttscompile.load(int8, plan="dense@int8+nonsense")
-    for wrong in ("dense@fp32+blocks", "dense@+blocks"):
+    for wrong in ("dense@fp32+blocks", "dense@+blocks", "dense@", "dense@int8+"):
         with pytest.raises(IllegalPlanError, match="has no plan"):
             artifact.plan(wrong)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,15 @@ def test_the_default_plan_is_the_artifacts(artifact: Artifact) -> None:
     given = inputs(1)
     found, named = (ttscompile.to_module(artifact.path, plan)(*given) for plan in (None, "evenly"))
     assert torch.equal(found, named)
+
+
+def test_a_plan_of_ones_own_and_one_that_it_cannot_compute(artifact: Artifact) -> None:
+    given = inputs(1)
+    mixed, own = artifact.plans["mixed"], replace(artifact.plans["mixed"], precision={"blocks": "int8"})
+    found = [ttscompile.to_module(artifact.path, plan)(*given) for plan in ("mixed", mixed, own)]
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2]), "in fp32, as it says"
+    with pytest.raises(IllegalPlanError, match="plan 'mixed@bf16' has weights of bf16, and a module computes in fp32"):
+        ttscompile.to_module(artifact.path, "mixed@bf16")
 
 
 @pytest.mark.slow

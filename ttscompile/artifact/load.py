@@ -146,9 +146,10 @@ class Artifact:
         if not isinstance(name, str):
             found = f"found a {type(name).__name__}. A matrix is for predict_action(plan=...), call by call"
             raise IllegalPlanError(f"expected a ttscompile.Plan, or the name of one, {list(self.plans)}; {found}.")
-        own, _, rest = name.partition("@")
+        own, at, rest = name.partition("@")
         precision, *parts = rest.split("+")
-        if own not in self.plans or precision not in ("", *PRECISIONS) or (parts and precision in ("", FP32)):
+        known = own in self.plans and (not at or precision in PRECISIONS) and all(parts)
+        if not known or (parts and precision == FP32):
             remedy = "Use one of these, NAME@PRECISION or NAME@int8+PART for another precision, or dataclasses.replace"
             raise IllegalPlanError(f"the artifact has no plan {name!r}; it has {list(self.plans)}. {remedy}.")
         if not precision:

@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from numbers import Real
 from types import MappingProxyType
 
 from ..errors import IllegalPlanError
+from .coercion import integer
 from .correction import Correction
 from .lattice import PlanArray, Source
 from .rules import NotNegative, Positive
@@ -37,6 +39,14 @@ class TokenReuse:
 
     threshold: NotNegative
     refresh: Positive
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "refresh", integer(self.refresh, "refresh of a plan's tokens", IllegalPlanError, 1))
+        number = isinstance(self.threshold, Real) and not isinstance(self.threshold, bool)
+        if not number or not float(self.threshold) >= 0:  # a patch is never further than NaN from another one
+            wanted = "threshold of a plan's tokens: expected a number that is not negative"
+            raise IllegalPlanError(f"{wanted}; found {self.threshold!r:.80}.")
+        object.__setattr__(self, "threshold", float(self.threshold))
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,12 @@ class Plan:
         for name in ("loop", "weights"):
             if not isinstance(getattr(self, name), str):
                 raise IllegalPlanError(f"a plan's {name}: expected a name; found {getattr(self, name)!r:.80}.")
+        for name, kind in (("correction", Correction), ("tokens", TokenReuse), ("otherwise", Plan)):
+            if not isinstance(value := getattr(self, name), kind | None):
+                raise IllegalPlanError(f"a plan's {name}: expected a {kind.__name__}, or None; found {value!r:.80}.")
+        if not isinstance(self.precision, Mapping):
+            wanted = "expected a precision by part, {'blocks': 'int8'}"
+            raise IllegalPlanError(f"a plan's precision: {wanted}; found {self.precision!r:.80}.")
         narrow = {part: one for part, one in self.precision.items() if one != FP32}
         object.__setattr__(self, "precision", MappingProxyType(narrow))
 
