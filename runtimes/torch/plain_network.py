@@ -209,8 +209,8 @@ class CallModule(nn.Module):
             shape = None if value is None else tuple(value.shape)
             if value is None or shape != (len(initial), *one.shape) or value.dtype != getattr(torch, one.dtype):
                 expected = f"{one.dtype} [{', '.join(map(str, (len(initial), *one.shape)))}]"
-                found = "none" if value is None else f"{value.dtype} {list(value.shape)}"
-                raise ObservationError(f"observation {key!r} must be {expected}; found {found}.")
+                found = "none" if value is None else f"a {type(value).__name__}, {value.dtype} {list(value.shape)}"
+                raise ObservationError(f"observation {key!r} must be a Tensor, {expected}; found {found}.")
             normalizer = self.kept(f"normalizer {key}")
             given[key] = value * normalizer["scale"] + normalizer["offset"] if normalizer else value
         return PlainNetwork(self, given, len(initial))
