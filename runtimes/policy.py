@@ -103,7 +103,7 @@ class CompiledPolicy:
             default_plan=self._artifact.told(default) or GIVEN,
             precision=" and ".join(dict.fromkeys(default.precision.values())) or FP32,
             rollout=rollout_needs(view),
-            prefix_refusal=self._prefix_refusal(default),
+            prefix_refusal=self.prefix_refusal(),
             frames=len(self._runtime.frames),
             reuses_tokens=self._runtime.frames.reuses_tokens,
             follows=default.otherwise is not None,
@@ -307,7 +307,7 @@ class CompiledPolicy:
         self._runtime.require_streams(streams)
         reference = spec.chunk.reference(obs)
         if prefix is not None:
-            prefix = check_prefix(prefix, streams, spec, self._prefix_refusal(wanted), reference)
+            prefix = check_prefix(prefix, streams, spec, self.prefix_refusal(wanted), reference)
         if noise is None:
             noise = noise_of_any_horizon(self._runtime.noise_spec(wanted), self._rng, streams)
         with np.errstate(all="ignore"):  # onnxruntime and torch raise no flags either: a call is judged by its actions
@@ -335,9 +335,10 @@ class CompiledPolicy:
         cells: Any = plan  # whatever it is: the runtime checks it
         return Plan(own.loop, cells, precision=own.precision, tokens=own.tokens)
 
-    def _prefix_refusal(self, plan: Plan) -> str | None:
-        """Why a call with this plan takes no prefix; None if it does."""
-        return NO_PREFIX if plan.otherwise is not None else prefix_refusal(self._runtime.view(plan).manifest.spec)
+    def prefix_refusal(self, plan: AnyPlan = None) -> str | None:
+        """Why a call with this plan takes no ``prefix``; None if it does. Raises IllegalPlanError: it is unknown."""
+        own = self._plan(plan)
+        return NO_PREFIX if own.otherwise is not None else prefix_refusal(self._runtime.view(own).manifest.spec)
 
     def _turn(self) -> threading.Lock:
         """The lock, to hold during a call. Not a manager of contexts of our own: an interrupt might keep it locked.

@@ -27,7 +27,7 @@ from ttscompile.errors import ExecutorClosedError, ExecutorError, WorkerDeadErro
 from ttscompile.runtimes.arrays import check_seed
 
 from .feasibility import Feasibility
-from .measure import Clock, MonotonicClock, require_prefix
+from .measure import Clock, MonotonicClock, require_plans
 from .settings import ExecutorSettings, Policy, resolve
 from .state import ExecutorState
 from .statistics import CONTROL, ExecutorStatistics, Trace, statistics
@@ -54,7 +54,7 @@ class AsyncExecutor:
         settings: everything else.
         clock: what time it is; None for ``time.monotonic``.
         latencies: seconds of the longest call of each tier, and of ``stall_plan`` where that may be run, if they are
-            known; None has them measured now.
+            known; None has them measured now. A plan that begins with the chunk before makes calls that have none, too.
         open_timeout: seconds, of real time, that this may take.
 
     Raises:
@@ -77,8 +77,7 @@ class AsyncExecutor:
         settings = settings or ExecutorSettings()
         info = policy.info
         self._resolved = resolve(settings, info, control_hz)
-        if settings.seam == "prefix":
-            require_prefix(policy)
+        require_plans(policy, self._resolved)
         self._with_tokens: Callable[[Mapping[str, Any]], Mapping[str, Any]] = getattr(policy, "with_tokens", _as_it_is)
         self._clock = clock or MonotonicClock()
         self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
@@ -179,7 +178,7 @@ class AsyncExecutor:
         """End the thread, after the call that it is in. The policy may be used again after this.
 
         Closing twice is closing once. Called by the policy itself, this waits for nothing: the thread ends with the
-        call. A forked process, where there is no thread to end, does nothing.
+        call. A forked process, where there is no thread to end, does nothing. The handler of a signal may call it.
 
         Args:
             timeout: seconds, of real time, to wait for it.
@@ -241,14 +240,17 @@ class AsyncExecutor:
 
     @property
     def trouble(self) -> str:
-        """Why no action comes: the policy failed, this was closed, or frames make no window. Else empty."""
+        """Why no action comes: the policy failed, this was closed, frames make no window, or no chunk may be played.
+
+        Empty where one may come. Of an episode that is ``ready`` the error of ``action`` says more.
+        """
         failure = self._worker.failure
         if failure is not None:
             return f"the thread that owns the policy has ended: a call raised {type(failure).__name__}: {failure}"
         if self._closed:
             return "the executor was closed"
         with self._here().lock:
-            return self._state.trouble
+            return self._state.trouble(self._clock.now())
 
     @property
     def frames(self) -> FrameSpec:
@@ -302,7 +304,7 @@ def _as_it_is(frame: Mapping[str, Any]) -> Mapping[str, Any]:
     return frame
 
 
-def _seconds(value: Any, what: str) -> Any:
+def _seconds(value: Any, what: str) -> float | None:
     if value is None or isinstance(value, Real):
-        return value
+        return None if value is None else float(value)
     raise ExecutorError(f"{what} is a number of seconds on the executor's clock, or None; found {value!r:.80}.")

@@ -71,7 +71,7 @@ class Guard:
         low, high = -unlimited, unlimited
         if normalizer is not None:
             ends = np.stack([normalizer.unnormalize(np.full(channels, end, np.float32)) for end in (-1.0, 1.0)])
-            low, high = ends.min(axis=0), ends.max(axis=0)
+            low, high = (f(ends.reshape(-1, channels), axis=0) for f in (np.min, np.max))  # of all steps with a row
             low, high = low - limits.margin * (high - low), high + limits.margin * (high - low)
         self._low = _vector(limits.low, channels, "low", low)
         self._high = _vector(limits.high, channels, "high", high)

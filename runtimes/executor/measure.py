@@ -14,7 +14,7 @@ from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ExecutorError
 from ttscompile.measure.timer import Timer, Times
 
-from .settings import Policy, Resolved
+from .settings import NO_CHUNK, Policy, Resolved
 
 
 class Clock(Protocol):
@@ -45,14 +45,30 @@ class MonotonicClock:
         condition.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
 
 
-def require_prefix(policy: Policy) -> None:
+def require_plans(policy: Policy, settings: Resolved) -> None:
+    """Raise ExecutorError unless every plan that calls may run goes with the seam and the horizon."""
+    info, plans = policy.info, getattr(policy, "plans", None)
+    executed = info.action.stop - info.action.start
+    for name in settings.plans:
+        if settings.seam == "prefix":
+            _require_prefix(policy, settings, name)
+        own = plans.get(name.partition("@")[0]) if isinstance(plans, Mapping) else None
+        follows = own is None and name == info.default_plan and getattr(info, "follows", False)
+        if settings.horizon > executed and (follows or getattr(own, "otherwise", None) is not None):
+            told = f"begins with the chunk of the call before, but not after more than the policy's {executed} actions"
+            remedy = f"Give at most {executed}, or other tiers"
+            raise ExecutorError(f"horizon = {settings.horizon}: plan {name!r} {told}. {remedy}.")
+
+
+def _require_prefix(policy: Policy, settings: Resolved, plan: str) -> None:
     """Raise unless ``predict_action`` has a parameter of the name ``prefix``, and the policy has nothing against it."""
     takes = "prefix" in inspect.signature(policy.predict_action).parameters
-    refusal = getattr(policy.info, "prefix_refusal", None)
+    refusal_of = getattr(policy, "prefix_refusal", lambda plan=None: getattr(policy.info, "prefix_refusal", None))
+    refusal = refusal_of(**settings.asked(plan)) if takes else None
     if not takes or refusal is not None:
-        why = f"this one does not: {refusal}" if takes else f"{type(policy).__name__} does not."
+        why = f"plan {plan!r} of this one does not: {refusal}" if takes else f"{type(policy).__name__} does not."
         needed = "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it"
-        raise ExecutorError(f"{needed}; {why} Use seam='blend' or seam='replace'.")
+        raise ExecutorError(f"{needed}; {why} Use seam='blend' or seam='replace', or other plans.")
 
 
 def some_observation(specs: Mapping[str, ObservationSpec]) -> dict[str, npt.NDArray[Any]]:
@@ -64,10 +80,11 @@ def some_observation(specs: Mapping[str, ObservationSpec]) -> dict[str, npt.NDAr
 def measure_latencies(policy: Policy, clock: Clock, settings: Resolved) -> dict[str, Times]:
     """What the measured calls of each plan take on ``some_observation``; with a prefix, if calls will have one.
 
-    The plans take turns. The caller resets the policy before and after.
+    The plans take turns. Every third call has no chunk to begin with, as one after a late call, and may take longer for
+    that. The caller resets the policy before and after.
     """
     plans = settings.plans
-    obs, known = some_observation(policy.info.observation), {}
+    obs, known = some_observation(policy.info.observation), dict[str, Any]()
     if settings.seam == "prefix":  # one action that the normaliser maps to 0, with poses as they are measured
         chunk = policy.info.action
         reference = chunk.reference(obs)
@@ -75,9 +92,12 @@ def measure_latencies(policy: Policy, clock: Clock, settings: Resolved) -> dict[
         for pose in () if chunk.relative is None else chunk.relative.poses:
             known["prefix"][..., pose.numbers] = reference[..., pose.numbers]
     forget: Callable[[], object] = getattr(policy, "forget_frames", lambda: None)  # a call may have to compute them all
+    follow: Callable[[int], object] = getattr(policy, "follow", lambda _: None)
     timer = Timer(len(plans), settings.warm_up, clock.now)
-    for _ in range(settings.warm_up + settings.measured_calls):
+    for number in range(-settings.warm_up, settings.measured_calls):
         for i in timer.round():
             forget()
-            timer.time(i, partial(policy.predict_action, obs, plan=plans[i], **known))
+            if number % 3 == 0:
+                follow(NO_CHUNK)
+            timer.time(i, partial(policy.predict_action, obs, **settings.asked(plans[i]), **known))
     return dict(zip(plans, timer.times, strict=True))

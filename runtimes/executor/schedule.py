@@ -33,6 +33,7 @@ class Schedule:
         self.due = 0
         self.refusal: str | None = None
         self._first = 0  # no chunk begins before this tick: that of the first action, where the robot stood until then
+        self._ahead = 0.0  # seconds before its time at which the last action was asked for
         most = (settings.horizon + settings.reserve) * settings.ticks_per_step
         self._played: deque[tuple[int, FloatArray]] = deque(maxlen=max(most, 3))
 
@@ -55,6 +56,7 @@ class Schedule:
             what = f"an action was asked for {self.last[0] - tick} ticks before the last one that was given out"
             remedy = "Times must not go backwards within an episode; one control loop asks for actions."
             raise ExecutorError(f"{what}. {remedy}")
+        self._ahead = max(time - now, 0.0)
         return tick
 
     def give(self, tick: int, action: FloatArray, time: float) -> None:
@@ -76,7 +78,7 @@ class Schedule:
         if self._guard.refuse(actions[settings.horizon :]) is not None:
             actions = actions[: settings.horizon]
         rows = expand(actions, settings.ticks_per_step, settings.interpolation)
-        start = max(self.grid.tick(observed), self._first)
+        start, reached = max(self.grid.tick(observed), self._first), self.grid.tick(now + self._ahead)
         new = Timeline.of(start, rows, observed)
         if self._guard.clips:
             new = new.clipped_to(self._guard.bounded(rows))
@@ -84,12 +86,12 @@ class Schedule:
         blend = settings.blend_steps if settings.seam == "blend" else 0
         ensemble = settings.ensemble_coefficient if settings.seam == "ensemble" and not alone else None
         if settings.displacements and self.last is not None:
-            late = max(seam, self.grid.tick(now)) - start
+            late = max(seam, reached) - start
             new = replace(new, rows=self._caught_up(new, rows, late, max(blend, 1)))
         # Before the first action nothing of an older chunk was played and the robot stood: the newest takes its place.
         old = None if self.last is None else self.timeline
         spliced = splice(old, new, seam, blend, ensemble, settings.displacements)
-        if spliced is None or new.end <= self.grid.tick(now):
+        if spliced is None or new.end <= reached:
             return "overdue"
         past = self._past
         if self._guard.clips:
@@ -153,22 +155,29 @@ class Schedule:
         begun = max(float(self.timeline.observed.max()), self.grid.time(self._first))
         return begun + self._settings.horizon / self._settings.policy_hz
 
+    def steps(self, since: float, until: float) -> int:
+        """Steps of the policy that are given out from one frame to another; none while the robot stands still."""
+        if self.last is None:
+            return 0
+        first = self.grid.time(self._first)
+        return round((max(until, first) - max(since, first)) * self._settings.policy_hz)
+
     def need_by(self, time: float) -> None:
         """Say when the next chunk is needed: at the end of what is scheduled, or after a time, if that is sooner."""
         if self.timeline is not None:
-            self.due = min(self.grid.tick(time) + 1, self.timeline.end)
+            self.due = min(self.grid.tick(time + self._ahead) + 1, self.timeline.end)
 
     def runs_out(self, now: float) -> float | None:
-        """When the first tick comes for which nothing is scheduled but the reserve; None if that is so already."""
+        """When the first tick is asked for that has nothing scheduled but the reserve; None if that is so already."""
         if self.timeline is None:
             return None
-        end = self.grid.time(self.due)
+        end = self.grid.time(self.due) - self._ahead
         return end if end > now else None
 
     def committed(self, observed: float, until: float) -> FloatArray:
-        """Actions given out and scheduled between two times, one a step of the policy, no more than it takes."""
+        """Actions given out by a time, or scheduled till then, one a step of the policy, no more than it takes."""
         most = min(self._settings.horizon, self._settings.trained_prefix or self._settings.horizon)
-        tick, last = self.grid.tick(observed), self.grid.tick(until)
+        tick, last = self.grid.tick(observed), self.grid.tick(until + self._ahead)
         played, timeline, rows = dict(self._played), self.timeline, list[FloatArray]()
         if timeline is not None and not played:  # it begins with the first action, and so does the next chunk
             timeline = replace(timeline, start=tick)

@@ -36,8 +36,15 @@ _MAY_BE_ZERO = frozenset(
 _MOST = 10**9
 """Of any of them: a week of ticks at a kilohertz, and a queue that Python can have."""
 
-_MOST_COEFFICIENT = 10.0
-"""Of a seam ``ensemble``, either way: one prediction then weighs more than 20,000 times as much as the next."""
+_BETWEEN: dict[str, tuple[Any, ...]] = {
+    "rate_tolerance": (0.5, "between 0 and 0.5 periods"),
+    "ensemble_coefficient": (10.0, "between -10 and 10", -10.0),
+}
+"""Of the numbers among the settings those that are not any positive one; see ``require_number``. At a coefficient of 10
+one prediction weighs more than 20,000 times as much as the next."""
+
+NO_CHUNK = 10**6
+"""Steps to tell ``follow``: more than any chunk has, so that the next call begins with noise."""
 
 
 class Policy(Protocol):
@@ -53,8 +60,9 @@ class Policy(Protocol):
     def predict_action(self, obs_dict: Mapping[str, Any], *, plan: str) -> Mapping[str, Any]:
         """``{"action": [1, Ta, Da], "action_pred": [1, T, Da]}``.
 
-        A policy that has ``follow``, too, is told how many steps of its last chunk are executed before the next call.
-        One that has ``with_tokens`` puts them into frames, in any thread.
+        One whose ``default_plan`` is none of its ``plans`` is called without a plan for it. One that has ``follow``,
+        too, is told how many steps of its last chunk are executed before the next call, and ``NO_CHUNK`` where that is
+        not played. One that has ``with_tokens`` puts them into frames, in any thread.
         """
 
 
@@ -73,7 +81,7 @@ class ExecutorSettings:
         policy_hz: rate of frames and actions that the policy was trained with; None: the control rate. The control rate
             has to be a multiple of it.
         interpolation: between actions, if the control loop is faster than the policy: ``hold`` or ``linear``.
-        n_obs_steps: To; None: what the policy's chunking implies, ``start + 1``.
+        n_obs_steps: To; None: of the observations' windows; of several, what the chunking implies, ``start + 1``.
         horizon: actions from one call to the next; None: as many as the policy executes of a chunk.
         reserve: actions of a chunk after its horizon that may be played; None: all that the policy predicts. Of these
             as many are planned with as a call and the margin take, so that a chunk which comes late by its latency is
@@ -95,7 +103,8 @@ class ExecutorSettings:
             bounds: at once, or with ``blend`` over ``blend_steps``. Otherwise it is lost at every seam.
         margin_ticks: control ticks that a chunk shall be there before it is needed.
         warm_up: first calls of each plan whose latency does not count.
-        measured_calls: calls of each plan, after these, that measure its latency before the executor is ready.
+        measured_calls: calls of each plan, after these, that measure its latency before the executor is ready. Of one
+            that begins with the chunk of the call before, some have none.
         latency_window: calls whose longest latency is reckoned with.
         refuse_infeasible: raise if no tier is fast enough; False lets a loop miss its deadlines knowingly.
         tiers: plans from slow to fast; None: the policy's default plan alone.
@@ -147,36 +156,33 @@ class ExecutorSettings:
             if one.type == "int" or (one.type == "int | None" and value is not None):
                 least = 0 if one.name in _MAY_BE_ZERO else 1
                 object.__setattr__(self, one.name, integer(value, one.name, ExecutorError, least, _MOST))
+            if one.type == "float" or (one.type == "float | None" and value is not None):
+                own = require_number(value, one.name, *_BETWEEN.get(one.name, ()))
+                object.__setattr__(self, one.name, own)
         for name, what in (("cores", "a processor"), ("displacements", "a channel")):
             if (given := getattr(self, name)) is not None:
                 if not isinstance(given, tuple | list | range):
                     raise ExecutorError(f"{name} must be a tuple of whole numbers; found {given!r:.80}.")
                 object.__setattr__(self, name, tuple(integer(n, f"{what} in {name}", ExecutorError) for n in given))
-        for name in ("policy_hz", "max_age", "stall_after"):
-            value = getattr(self, name)
-            if value is not None:
-                require_number(value, name)
-        require_number(self.rate_tolerance, "rate_tolerance", 0.5, "between 0 and 0.5 periods")
-        require_number(self.stall_range, "stall_range")
         if not isinstance(self.stall_plan, str):
             raise ExecutorError(f"stall_plan must be the name of a plan; found {self.stall_plan!r}.")
-        most, name = _MOST_COEFFICIENT, "ensemble_coefficient"
-        require_number(self.ensemble_coefficient, name, most, f"between {-most:g} and {most:g}", -most)
         if self.interpolation not in INTERPOLATIONS:
             raise ExecutorError(f"interpolation must be one of {INTERPOLATIONS}; found {self.interpolation!r}.")
         if self.seam not in SEAMS:
             raise ExecutorError(f"seam must be one of {SEAMS}; found {self.seam!r}.")
-        text = isinstance(self.tiers, str)  # whose letters would be taken for names
-        if self.tiers is not None and (text or not self.tiers or len(set(self.tiers)) < len(self.tiers)):
-            raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r}.")
+        names = self.tiers if isinstance(self.tiers, tuple | list) else ()
+        distinct = {name for name in names if isinstance(name, str)}
+        if self.tiers is not None and not 0 < len(names) == len(distinct):
+            raise ExecutorError(f"tiers must be a tuple of names of plans, each once; found {self.tiers!r:.80}.")
 
 
 def require_number(
     value: object, name: str, below: float = inf, wanted: str = "positive and finite", above: float = 0.0
-) -> None:
-    """Raise ExecutorError unless a value is a number between two others."""
+) -> float:
+    """A number between two others, as a float: in float32 times would be one. Raises ExecutorError: it is no such."""
     if isinstance(value, bool) or not isinstance(value, Real) or not above < float(value) < below:
         raise ExecutorError(f"{name} must be a number, {wanted}; found {value!r}.")
+    return float(value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,6 +199,7 @@ class Resolved(ExecutorSettings):
         trained_prefix: see ``PolicyInfo``; 0 where the seam is not ``prefix``.
         switches: numbers of an action that have two values alone.
         poses: nine numbers of an action each, of which six are a rotation.
+        unnamed: what a default plan is called that was given to ``load`` and is none of ``plans``; None for others.
     """
 
     policy_hz: float
@@ -209,6 +216,11 @@ class Resolved(ExecutorSettings):
     trained_prefix: int
     switches: tuple[Switch, ...]
     poses: tuple[Pose, ...]
+    unnamed: str | None
+
+    def asked(self, plan: str) -> dict[str, str]:
+        """The words that ask ``predict_action`` for a plan."""
+        return {} if plan == self.unnamed else {"plan": plan}
 
     def possible(self, row: FloatArray, before: FloatArray | None) -> FloatArray:
         """An action with the nearer of two values where it has no other: a seam or ``linear`` may be between them.
@@ -240,7 +252,7 @@ class Resolved(ExecutorSettings):
 
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy. Raises ExecutorError: they do not fit."""
-    require_number(control_hz, "control_hz")
+    control_hz = require_number(control_hz, "control_hz")
     policy_hz = settings.policy_hz or control_hz
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0
@@ -268,13 +280,15 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     if clash := sorted(of_poses.intersection(settings.displacements)):
         where = "are numbers of poses, which say where to be, and not how far to move. Leave them out"
         raise ExecutorError(f"displacements = {settings.displacements}: {clash} {where}.")
+    windows = {spec.frames for spec in info.observation.values() if spec.frames is not None}
+    of_window = chunk.start + 1 if len(windows) != 1 else max(windows)
     stall = None
     if settings.stall_after is not None:
         reach = np.float32(settings.stall_range) / np.atleast_2d(chunk.scale).max(0)
         after = ceil(settings.stall_after * control_hz)
         stall = StallRule(after, reach, settings.stall_plan, settings.displacements)
     named = tiers if stall is None else (*tiers, stall.plan)
-    if unknown := [name for name in named if name.partition("@")[0] not in info.plans]:
+    if unknown := [name for name in named if name.partition("@")[0] not in (*info.plans, info.default_plan)]:
         known = list(info.plans)
         raise ExecutorError(
             f"the policy has no plan {unknown[0]!r}; it has {known}. Name tiers and stall_plan among these."
@@ -289,10 +303,11 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         "ticks_per_step": ticks_per_step,
         "first": chunk.start,
         "channels": chunk.action_dim,
-        "frames": FrameSpec.of(info.observation, settings.n_obs_steps or chunk.start + 1),
+        "frames": FrameSpec.of(info.observation, settings.n_obs_steps or of_window, chunk),
         "stall": stall,
         "trained_prefix": info.trained_prefix if settings.seam == "prefix" else 0,
         "switches": chunk.switches,
         "poses": poses,
+        "unnamed": None if info.default_plan.partition("@")[0] in info.plans else info.default_plan,
     }
     return Resolved(**found)

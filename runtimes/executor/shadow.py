@@ -97,9 +97,8 @@ class Shadow:
         noise: Callable[[Mapping[str, Any]], Any] | None = None,
         clock: Clock | None = None,
     ) -> None:
-        if deadline is not None:
-            require_number(deadline, "deadline")
-        self._original, self._compiled, self._noise, self._deadline = original, compiled, noise, deadline
+        self._deadline = None if deadline is None else require_number(deadline, "deadline")
+        self._original, self._compiled, self._noise = original, compiled, noise
         self._other_noise = getattr(getattr(compiled, "info", None), "other_noise", None)
         self._clock = clock or MonotonicClock()
         self._lock = threading.Lock()

@@ -14,7 +14,7 @@ from ttscompile.errors import DeadlineMissedError, ObservationError, StaleObserv
 from .feasibility import LatencyWindow, Tiers
 from .guard import Guard, Watchdog
 from .schedule import Schedule
-from .settings import Resolved
+from .settings import NO_CHUNK, Resolved
 from .statistics import Recorder
 from .window import Frame, ObservationWindow
 
@@ -36,6 +36,8 @@ class Job:
         prefix: actions that are committed, ``[N, Da]`` from the observation on, one a step of the policy; None unless
             the seam is ``prefix``.
         stalled: whether the policy has stopped moving, so that it has to forget what a call goes on from.
+        executed: steps of the chunk before that are given out up to the newest frame, or ``NO_CHUNK`` if none of it is
+            scheduled; None for the first call of an episode.
     """
 
     epoch: int
@@ -46,6 +48,7 @@ class Job:
     deadline: float | None
     prefix: FloatArray | None
     stalled: bool
+    executed: int | None
 
 
 class ExecutorState:
@@ -75,6 +78,7 @@ class ExecutorState:
         self._watchdog = Watchdog(settings.stall)
         self._early: deque[Frame] = deque(maxlen=2 * settings.frames.steps)  # handed out
         self._used = float("-inf")  # time of the newest frame that a call was made from
+        self._outcome: str | None = None  # what became of the last chunk
         self._holds = 0
         self._gap = False
 
@@ -88,10 +92,12 @@ class ExecutorState:
         """Whether a chunk of this episode has been scheduled."""
         return self._schedule.timeline is not None
 
-    @property
-    def trouble(self) -> str:
-        """Why no call can start though frames come; empty where it can, or might with the next frame."""
-        return self._window.trouble
+    def trouble(self, now: float) -> str:
+        """Why there is no chunk though frames come; empty where there is, or may be with the next call or frame."""
+        if self.ready or self._window.complete is None:
+            return "" if self.ready else self._window.trouble
+        may = self._outcome is None and (self._job is not None or self.next_start(now) is not None)
+        return "" if may else self._reason(now)[0]
 
     def reset(self) -> None:
         """A new episode: nothing from before is given out any more."""
@@ -264,13 +270,16 @@ class ExecutorState:
         """Start the call that ``next_start`` announced."""
         window = self._window.complete
         assert window is not None  # next_start said so
+        schedule, prefix = self._schedule, None
+        executed = None if self._outcome is None else NO_CHUNK
+        if self._outcome == "scheduled":
+            executed = schedule.steps(self._used, window.time)
         self._used = window.time
         self.recorder.samples.observation_age_ms.add(1e3 * (now - window.time))
-        schedule, prefix = self._schedule, None
         if self._settings.seam == "prefix":
             prefix = schedule.committed(window.time, now + self._latency)
         stalled, runs_out = self._watchdog.plan is not None, schedule.runs_out(now)
-        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, runs_out, prefix, stalled)
+        self._job = Job(self.epoch, window.frames, window.time, self.plan, now, runs_out, prefix, stalled, executed)
         return self._job
 
     def finish(self, job: Job, actions: FloatArray, now: float, far: bool = False) -> str:
@@ -295,7 +304,7 @@ class ExecutorState:
         if job.stalled:
             self._watchdog.restart()
             self._update_due()
-        outcome = self._schedule.add(job.observed, actions, now, alone=job.stalled)
+        self._outcome = outcome = self._schedule.add(job.observed, actions, now, alone=job.stalled)
         if outcome == "scheduled":
             counts.chunks += 1
             self._update_due()

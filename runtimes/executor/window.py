@@ -10,12 +10,13 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from ttscompile.core.spec import ObservationSpec
+from ttscompile.core.spec import ChunkSpec, ObservationSpec
 from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.arrays import read_observation
@@ -27,6 +28,9 @@ MOST_FRAMES = 1024
 """Frames that are kept at most. At usual rates they are thrown away by age long before; at several kilohertz some are
 left out, so that those which are kept go back far enough for a window."""
 
+_TIME = itemgetter(0)
+"""Of a frame that is kept."""
+
 
 @dataclass(frozen=True)
 class FrameSpec:
@@ -36,21 +40,23 @@ class FrameSpec:
         specs: by key, of one frame.
         history: keys of which the policy sees To frames; of the others it sees the newest.
         steps: To; 1 if there is no history.
+        action: which numbers have to be a pose, since actions are relative to them; None where that is not known.
     """
 
     specs: Mapping[str, ObservationSpec]
     history: frozenset[str]
     steps: int
+    action: ChunkSpec | None = None
 
     @classmethod
-    def of(cls, specs: Mapping[str, ObservationSpec], steps: int) -> FrameSpec:
+    def of(cls, specs: Mapping[str, ObservationSpec], steps: int, action: ChunkSpec | None = None) -> FrameSpec:
         """The frame of a policy whose window has ``steps`` frames.
 
         A key is a history if its first axis is time, and of the length ``steps``.
         """
         history = frozenset(key for key, spec in specs.items() if spec.frames == steps)
         frame = {key: spec.one_frame if key in history else spec for key, spec in specs.items()}
-        return cls(frame, history, steps if history else 1)
+        return cls(frame, history, steps if history else 1, action)
 
     def check(self, obs: Mapping[str, Any]) -> Frame:
         """One frame as numpy arrays of its own, which the caller may not change any more.
@@ -59,7 +65,10 @@ class FrameSpec:
             ObservationError: a key, a shape, a dtype or a number is not such as the policy takes.
         """
         arrays, _ = read_observation(obs, self.specs)
-        return {key: self._own(key, array, self.specs[key]) for key, array in arrays.items()}
+        frame = {key: self._own(key, array, self.specs[key]) for key, array in arrays.items()}
+        if self.action is not None:  # which refuses a measured pose without a rotation: better here than in a call
+            self.action.reference({key: array[None] for key, array in frame.items()})
+        return frame
 
     def _own(self, key: str, array: Array, spec: ObservationSpec) -> Array:
         if array.shape != spec.shape or array.dtype != spec.dtype:
@@ -116,17 +125,17 @@ class ObservationWindow:
         self._steps, self._period, self._slack = steps, period, tolerance * period
         self._keep = max_age + (steps - 1) * period + self._slack  # older ones are part of windows that are too old
         self._apart = 2 * steps * period / MOST_FRAMES  # of frames in a row, from one to the next but one
-        self._times: list[float] = []
-        self._frames: list[Frame] = []
+        self._frames: list[tuple[float, Frame]] = []  # one list: the handler of a signal may raise between two changes
         self._first = float("inf")  # time of the first frame
+        self._late, self._behind = 0, 0.0  # frames in a row that were thrown away, and how old the last one was
         self.complete: Window | None = None
         self.delay = 0.0
 
     @property
     def interval(self) -> float:
         """Seconds until the next frame is to be expected: what the last two were apart, the policy's period at most."""
-        times = self._times
-        return min(times[-1] - times[-2], self._period) if len(times) > 1 else self._period
+        frames = self._frames
+        return min(frames[-1][0] - frames[-2][0], self._period) if len(frames) > 1 else self._period
 
     def add(self, time: float, frame: Frame, now: float) -> str:
         """Take a frame.
@@ -135,29 +144,28 @@ class ObservationWindow:
             ``added``; ``replaced`` if there was one of the same time; or ``late``: too old to be part of a window, and
             thrown away.
         """
-        times, frames = self._times, self._frames
-        place = bisect_left(times, time)
-        if place < len(times) and times[place] == time:
-            frames[place] = frame
-            self.complete = self._newest(place)
+        frames = self._frames
+        self._late, self._behind = self._late + 1, now - time
+        place = bisect_left(frames, time, key=_TIME)
+        if place < len(frames) and frames[place][0] == time:
+            frames[place] = time, frame
+            self.complete, self._late = self._newest(place), 0
             return "replaced"
         if time < now - self._keep:
             return "late"
         self._first = min(self._first, time)
-        if place == len(times):
+        if place == len(frames):
             self.delay = max(now - time, 0.0)
-        times.insert(place, time)
-        frames.insert(place, frame)
-        middle = min(place, len(times) - 2)  # the newest frame is never left out
-        if middle > 0 and times[middle + 1] - times[middle - 1] < self._apart:
-            del times[middle], frames[middle]
+        frames.insert(place, (time, frame))
+        middle = min(place, len(frames) - 2)  # the newest frame is never left out
+        if middle > 0 and frames[middle + 1][0] - frames[middle - 1][0] < self._apart:
+            del frames[middle]
             place = middle
-        gone = max(bisect_left(times, times[-1] - self._keep), len(times) - MOST_FRAMES, 0)
-        if gone:
-            del times[:gone], frames[:gone]
+        gone = max(bisect_left(frames, frames[-1][0] - self._keep, key=_TIME), len(frames) - MOST_FRAMES, 0)
+        del frames[:gone]
         if place < gone:
             return "late"
-        self.complete = self._newest(place - gone)
+        self.complete, self._late = self._newest(place - gone), 0
         return "added"
 
     @property
@@ -167,35 +175,40 @@ class ObservationWindow:
 
     @property
     def _waited(self) -> bool:
-        """Whether frames came for longer than a window takes."""
+        """Whether frames came for longer than a window takes, or more than it has were thrown away."""
         lasts = (self._steps - 1) * self._period + self._slack
-        return bool(self._times) and self._times[-1] - self._first > lasts + 1e-9
+        newest = self._first if self.newest is None else self.newest
+        return self._late > self._steps or newest > self._first + lasts + 1e-9
 
     @property
     def newest(self) -> float | None:
         """When the newest frame was taken; None before the first."""
-        return self._times[-1] if self._times else None
+        return self._frames[-1][0] if self._frames else None
 
     def before(self, time: float) -> list[Frame]:
         """Of the To - 1 frames that stand before one of a time those that have come, newest first.
 
         One that is not where it should be is left out, if the next frame is expected nearer to that.
         """
-        found, before = list[Frame](), len(self._times)
+        found, before = list[Frame](), len(self._frames)
         for back in range(1, self._steps):
             place = time - back * self._period
             nearest = self._nearest(place, before)
-            if nearest >= 0 and abs(self._times[nearest] - place) <= self.interval / 2 + 1e-6:
-                found.append(self._frames[nearest])
+            if nearest >= 0 and abs(self._frames[nearest][0] - place) <= self.interval / 2 + 1e-6:
+                found.append(self._frames[nearest][1])
                 before = nearest
         return found
 
     def why_incomplete(self) -> str:
         """What a complete window lacks, for people."""
-        found = len(self._times)
+        found = len(self._frames)
+        if found < self._steps and self._late:
+            told = f"the last one {self._behind:.4g} s after it was taken, and {self._keep:.2g} s is the most"
+            remedy = "Stamp frames with time.monotonic(), or with the executor's clock, and give them sooner"
+            return f"frames came too late and were thrown away, {self._late} in a row; {told}. {remedy}"
         if found < self._steps and not self._waited:
             return f"{found} of {self._steps} frames came"
-        gaps = np.diff(self._times[-self._steps :])
+        gaps = np.diff([time for time, _ in self._frames[-self._steps :]])
         apart = ", ".join(f"{gap:.4g}" for gap in gaps) or f"more than {self._keep:.2g}"
         return (
             f"the policy wants {self._steps} frames every {self._period:.4g} s, to within {self._slack:.2g} s; the"
@@ -204,7 +217,7 @@ class ObservationWindow:
 
     def _newest(self, changed: int) -> Window | None:
         """The newest complete window after the frame of this index has changed: older ones are what they were."""
-        for newest in range(len(self._times) - 1, max(changed, self._steps - 1) - 1, -1):
+        for newest in range(len(self._frames) - 1, max(changed, self._steps - 1) - 1, -1):
             found = self._window(newest)
             if found is not None:
                 return found
@@ -212,17 +225,16 @@ class ObservationWindow:
 
     def _window(self, newest: int) -> Window | None:
         """The window whose newest frame has this index; None if it is not complete."""
-        times, chosen, before = self._times, [newest], newest
+        time, chosen, before = self._frames[newest][0], [newest], newest
         for back in range(1, self._steps):
-            before = self._nearest(times[newest] - back * self._period, before)
+            before = self._nearest(time - back * self._period, before)
             if before < 0:
                 return None
             chosen.append(before)
-        return Window(times[newest], [self._frames[i] for i in reversed(chosen)])
+        return Window(time, [self._frames[i][1] for i in reversed(chosen)])
 
     def _nearest(self, time: float, before: int) -> int:
         """Index under ``before`` of the frame nearest to ``time``; -1 if none is within the tolerance."""
-        times = self._times
-        right = bisect_left(times, time, 0, before)
-        candidates = [i for i in (right - 1, right) if 0 <= i < before and abs(times[i] - time) <= self._slack + 1e-9]
-        return min(candidates, key=lambda i: abs(times[i] - time), default=-1)
+        right = bisect_left(self._frames, time, 0, before, key=_TIME)
+        off = {i: abs(self._frames[i][0] - time) for i in (right - 1, right) if 0 <= i < before}
+        return min((i for i in off if off[i] <= self._slack + 1e-9), key=off.__getitem__, default=-1)

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Mapping
 from functools import partial
 from math import inf, nextafter
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -40,20 +40,19 @@ class Worker:
         self._clock, self._trace = clock, trace
         prepares = bool(getattr(policy.info, "frames", 0)) and settings.frames.seen_before
         self._seeing = cast("SeeingPolicy", policy) if prepares else None
-        self.lock = threading.Lock()
+        self.lock = threading.RLock()  # the handler of a signal may come in while it is held, and close
         self._work, self.news = threading.Condition(self.lock), threading.Condition(self.lock)
         self.process = Process()
         self._state: ExecutorState | None = None
         self.feasibility: dict[str, Feasibility] = {}
         self.failure: BaseException | None = None
-        self._ending = False
+        self._ending = self._ended = False
         self._waiting = False  # there is nothing to do
         self._timed = False  # and the thread looks again by itself
         self._reset_due = True
         self._reset_seed: int | None = None
         self._ready = threading.Event()
         self._latencies: Mapping[str, float] | None = None  # as they were given
-        self._followed = -1, 0.0  # epoch and observation of the last call
         self._thread = threading.Thread(target=self._run, name="ttscompile-executor", daemon=True)
 
     # Everybody else's side
@@ -115,7 +114,9 @@ class Worker:
         """Whether the thread has ended, some seconds from now at most. The thread itself does not wait for its end."""
         if threading.current_thread() is self._thread:
             return True
-        self._thread.join(timeout)
+        with self.news:  # which lets go of the lock where the handler of a signal came in while it was held
+            self.news.wait_for(lambda: self._ended, timeout)
+        self._thread.join(timeout if self._ended else 0)
         return not self._thread.is_alive()
 
     def abandon(self) -> None:
@@ -141,8 +142,10 @@ class Worker:
                 self.failure = error
                 if self._state is not None:
                     self._state.fail()
-                self.news.notify_all()
         finally:
+            with self.lock:
+                self._ended = True
+                self.news.notify_all()
             atexit.unregister(self._end_at_exit)
             self._ready.set()
 
@@ -157,10 +160,11 @@ class Worker:
         elif missing := [name for name in settings.plans if name not in given]:
             raise ExecutorError(f"latencies lacks the plan {missing[0]!r}; give one for each of {settings.plans}.")
         else:
-            below_zero = nextafter(0.0, -1.0)  # a latency of 0 is one
-            for name in settings.plans:
-                require_number(given[name], f"the latency of plan {name!r}", inf, "of seconds", below_zero)
-            measured = {name: [given[name]] for name in settings.plans}
+            allowed = inf, "of seconds", nextafter(0.0, -1.0)  # a latency of 0 is one
+            measured = {
+                name: [require_number(given[name], f"the latency of plan {name!r}", *allowed)]
+                for name in settings.plans
+            }
         latencies = {name: LatencyWindow(settings.latency_window, values) for name, values in measured.items()}
         self.feasibility = {name: settings.feasibility(max(measured[name])) for name in settings.tiers}
         tiers = fast_enough(self.feasibility, settings.refuse_infeasible)
@@ -206,15 +210,14 @@ class Worker:
     def _call(self, job: Job) -> None:
         settings = self._settings
         obs = settings.frames.observation(job.frames)
-        prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
+        words: dict[str, Any] = settings.asked(job.plan) | ({} if job.prefix is None else {"prefix": job.prefix[None]})
         last = settings.first + settings.horizon + settings.reserve
         if job.stalled:  # all but the sequence of its noise is forgotten
             self._policy.reset()
-        elif (follow := getattr(self._policy, "follow", None)) is not None and job.epoch == self._followed[0]:
-            follow(round((job.observed - self._followed[1]) * settings.policy_hz))
-        self._followed = job.epoch, job.observed
+        elif (follow := getattr(self._policy, "follow", None)) is not None and job.executed is not None:
+            follow(job.executed)
         try:
-            predicted = np.asarray(self._policy.predict_action(obs, plan=job.plan, **prefix)["action_pred"])
+            predicted = np.asarray(self._policy.predict_action(obs, **words)["action_pred"])
         except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out
             predicted = np.full((1, last, settings.channels), np.nan, np.float32)
         streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)

@@ -187,7 +187,7 @@ class ChunkSpec:
         scale, offset = self.normalizer.scale.copy(), self.normalizer.offset.copy()
         for one in self.switches:
             width = abs(one.above - one.below) or 2.0
-            scale[one.channel], offset[one.channel] = 2 / width, -(one.above + one.below) / width
+            scale[..., one.channel], offset[..., one.channel] = 2 / width, -(one.above + one.below) / width
         return Affine(scale, offset)
 
     def executed(self, samples: Any) -> Any:

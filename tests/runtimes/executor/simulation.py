@@ -24,6 +24,9 @@ TO, TA = 2, 8
 NORMALIZER = Affine(np.array([0.5, -0.1]), np.array([0.0, 1.0]))
 """Of two numbers, which are in -2..2 and 0..20."""
 
+AS_IT_IS = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+"""With the two numbers before them they are a pose: a position, and two rows of a rotation that turns nothing."""
+
 
 def rows(*values: tuple[float, float]) -> np.ndarray:
     return np.array(values, np.float32)
@@ -136,6 +139,7 @@ class ScriptedPolicy:
         fault: by number of the call: ``raise``, ``hang``, ``nan``, ``shape`` or seconds that it takes instead.
         calls: what it was called with.
         reserve: actions that it predicts beyond the TA that are executed.
+        also: what every frame has after the two numbers.
     """
 
     clock: FakeClock
@@ -145,9 +149,10 @@ class ScriptedPolicy:
     calls: list[tuple[float, str, np.ndarray]] = field(default_factory=list)
     resets: list[int | None] = field(default_factory=list)
     reserve: int = 0
+    also: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        spec, chunk = ObservationSpec((TO, 2), dtype="float64"), ChunkSpec(3, TO - 1, TO - 1 + TA)
+        spec, chunk = ObservationSpec((TO, 2 + len(self.also)), dtype="float64"), ChunkSpec(3, TO - 1, TO - 1 + TA)
         self.predicted = TO - 1 + TA + self.reserve
         plans = tuple(self.latency)
         self.info: Any = Facts({"obs": spec}, chunk, (self.predicted, 3), plans, plans[0])  # for ``PolicyInfo``
@@ -165,7 +170,7 @@ class ScriptedPolicy:
         self._take(fault if isinstance(fault, float) else self.latency[plan], fault == "hang")
         if fault == "raise":
             raise ZeroDivisionError("scripted")
-        episode, seen = obs[0, -1]
+        episode, seen = obs[0, -1, :2]
         count = self.predicted
         chunk = np.stack([np.full(count, episode), np.full(count, seen), np.arange(count) - (TO - 1)], axis=1)
         if self.actions is not None:
@@ -204,6 +209,16 @@ class Told(ScriptedPolicy):
         return super().predict_action(obs_dict, plan=plan)
 
 
+@dataclass
+class Following(ScriptedPolicy):
+    """It may begin with its last chunk. Attributes: followed: by number of the call to come, what it was told of it."""
+
+    followed: dict[int, int] = field(default_factory=dict)
+
+    def follow(self, executed: int) -> None:
+        self.followed[len(self.calls)] = executed
+
+
 class Quick(ScriptedPolicy):
     """It takes no time, not even its clock's, and nothing moves."""
 
@@ -240,7 +255,7 @@ class World:
         return self.clock.now() - self.start
 
     def frame(self, at: float | None = None) -> dict[str, np.ndarray]:
-        return {"obs": np.array([self.episode, self.time if at is None else at])}
+        return {"obs": np.array([self.episode, self.time if at is None else at, *self.policy.also])}
 
     def observe(self, at: float | None = None) -> None:
         """A frame of now, or of an earlier time."""
@@ -296,7 +311,8 @@ def given_out(
     settings: ExecutorSettings, action: ChunkSpec, reserve: int, actions: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """Thirty actions of a policy of these chunks, whose loop has two ticks a step where it interpolates."""
-    policy = ScriptedPolicy(FakeClock(), actions=actions, reserve=reserve)
+    also = () if action.relative is None else AS_IT_IS
+    policy = ScriptedPolicy(FakeClock(), actions=actions, reserve=reserve, also=also)
     policy.info = replace(policy.info, action=action, sample=(policy.predicted, action.action_dim))
     with World(20.0 if settings.interpolation == "linear" else 10.0, settings, policy) as world:
         return world.run(30)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ttscompile import Affine, ObservationSpec
+from ttscompile import Affine, ChunkSpec, ObservationSpec
+from ttscompile.core.poses import Pose
+from ttscompile.core.spec import Relative
 from ttscompile.core.values import check_values
 from ttscompile.errors import ExecutorError, ObservationError, StaleObservationError
 from ttscompile.runtimes.executor import ExecutorSettings
 from ttscompile.runtimes.executor.window import FrameSpec
 
-from .simulation import TA, World
+from .simulation import AS_IT_IS, TA, TO, FakeClock, ScriptedPolicy, World
 
 
 def test_observations_that_stop_end_in_a_stale_observation() -> None:
@@ -91,6 +94,29 @@ def test_wrong_frames_are_the_callers_error_and_change_nothing() -> None:
         for _ in range(20):
             assert world.tick() is not None
         assert world.executor.statistics().frames == 22
+
+
+@pytest.mark.parametrize("history", [True, False])
+def test_a_measured_pose_without_a_rotation_is_the_callers_error_and_changes_nothing(history: bool) -> None:
+    """A detector that lost the arm gives zeros: as the newest of a call they would end the policy's thread."""
+
+    class Arm(ScriptedPolicy):
+        def predict_action(self, obs_dict: Any, *, plan: str) -> dict[str, Any]:
+            self.info.action.reference(obs_dict)  # as a compiled policy does
+            return {"action_pred": np.zeros((1, self.predicted, 10))}
+
+    policy = Arm(FakeClock(), also=AS_IT_IS)
+    action = ChunkSpec(10, TO - 1, TO - 1 + TA, relative=Relative("obs", (None,) * 10, (Pose(1, 0),)))
+    specs = policy.info.observation if history else {"obs": ObservationSpec((9,), dtype="float64", window=False)}
+    policy.info = replace(policy.info, action=action, sample=(policy.predicted, 10), observation=specs)
+    with World(policy=policy) as world:
+        world.begin()
+        for _ in range(3 * TA):
+            with pytest.raises(ObservationError, match="numbers 3 to 8 are to be two rows of a rotation.* which gives"):
+                world.executor.observe({"obs": np.zeros(9)})
+            world.tick()
+        counted = world.executor.statistics()
+    assert (counted.frames, counted.deadlines_missed) == ((TO if history else 2) + 3 * TA, 0)
 
 
 def test_a_frame_is_held_against_what_the_policy_takes_before_it_is_kept() -> None:

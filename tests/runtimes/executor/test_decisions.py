@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from ttscompile import Affine, ChunkSpec
+from ttscompile.core.spec import Switch
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor.feasibility import MOST_PATIENCE, Feasibility, LatencyWindow, Tiers
 from ttscompile.runtimes.executor.guard import Guard, GuardLimits
@@ -131,6 +133,18 @@ def test_the_guard_takes_its_bounds_from_the_normaliser() -> None:
     assert "channel 1, is -2.1" in str(guard.refuse(rows((0, -2.1))))
     assert Guard(GuardLimits(), None, 2).refuse(rows((1e30, -1e30))) is None
     assert Guard(GuardLimits(low=0.0), NORMALIZER, 2).refuse(rows((-0.1, 5))) is not None
+
+
+def test_a_normaliser_with_a_row_for_each_step_bounds_by_all_of_them() -> None:
+    """In the first row the numbers are in -2..2 and 0..20, in the last one in -4..4 and 10..30."""
+    steps = Affine(np.array([[0.5, -0.1], [0.25, -0.1]]), np.array([[0.0, 1.0], [0.0, 2.0]]))
+    guard = Guard(GuardLimits(margin=0.0), steps, 2)
+    assert guard.refuse(rows((-4, 0), (4, 30), (0, 15))) is None
+    assert "channel 0, is 4.1; the bounds are -4 to 4" in str(guard.refuse(rows((4.1, 5))))
+    assert "channel 1, is -0.1; the bounds are -0 to 30" in str(guard.refuse(rows((0, -0.1))))
+    usual = ChunkSpec(2, 0, 2, steps, switches=(Switch(1, 0.5, 3.0, 5.0),)).usual
+    assert usual is not None
+    assert "the bounds are 3 to 5" in str(Guard(GuardLimits(margin=0.0), usual, 2).refuse(rows((0, 6))))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -12,6 +12,7 @@ import threading
 import time
 import weakref
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 
 from ttscompile.errors import DeadlineMissedError, ExecutorClosedError, ExecutorError, WorkerDeadError
-from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, MonotonicClock
 
 from .simulation import REAL_LIMIT, FakeClock, ScriptedPolicy, World, workers
 
@@ -144,6 +145,43 @@ def test_whatever_a_policy_raises_is_told(error: BaseException) -> None:
         executor.action(timeout=REAL_LIMIT)
     assert caught.value.__cause__ is error
     executor.close()
+
+
+@pytest.mark.parametrize("during", ["a wait", "a call"])
+@pytest.mark.parametrize("raises", [True, False])
+def test_the_handler_of_a_signal_may_close_the_executor_that_it_interrupts(during: str, raises: bool) -> None:
+    """Which holds its lock then. In real time; the clock stands for any place where the signal may arrive."""
+    inside = list[bool]()
+
+    class Signalled(MonotonicClock):
+        def now(self) -> float:
+            if armed and threading.current_thread() is threading.main_thread():
+                armed.clear()
+                signal.raise_signal(signal.SIGINT)
+            return super().now()
+
+    def handler(*_: object) -> None:
+        inside.append(executor._worker.lock._is_owned())  # type: ignore[attr-defined]
+        executor.close(timeout=REAL_LIMIT)
+        assert workers() == []
+        if raises:
+            raise KeyError("stopped")
+
+    armed, policy = list[bool](), Calling(lambda: time.sleep(0.2))
+    executor = AsyncExecutor(policy, 10, ExecutorSettings(max_hold=0), clock=Signalled(), latencies=LATENCIES)
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        if during == "a call":
+            start_a_call(executor)
+            assert policy.inside.wait(REAL_LIMIT)
+        armed.append(True)
+        with pytest.raises(KeyError, match="stopped") if raises else nullcontext():
+            executor.observe({"obs": np.zeros(2)})
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert inside == [True]
+    with pytest.raises(ExecutorClosedError):
+        executor.action()
 
 
 def test_a_clock_that_fails_is_told_to_who_asked_and_everything_goes_on() -> None:

@@ -9,7 +9,6 @@ import threading
 import time
 from dataclasses import replace
 from itertools import pairwise
-from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from ttscompile.errors import (
     WorkerDeadError,
 )
 from ttscompile.runtimes.arrays import check_observation
-from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits, settings
+from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
 from ttscompile.runtimes.executor.measure import some_observation
 
 from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, Told, World, opened_meanwhile
@@ -210,6 +209,40 @@ def test_the_prefix_seam_gives_the_policy_what_is_committed(trained: int) -> Non
         assert trained or prefix[2, 2] == prefix[1, 2] + 1
 
 
+def test_what_is_asked_for_ahead_is_committed_too() -> None:
+    """By the end of a call of two ticks the action of four ticks later has been given out."""
+    policy = Told(FakeClock(), {"dense": 0.2}, reserve=TA)
+    with World(settings=ExecutorSettings(seam="prefix"), policy=policy) as world:
+        for _ in range(30):
+            world.observe()
+            if world.executor.ready:
+                world.executor.action(world.clock.now() + 0.2)
+            world.clock.advance(0.1)
+    assert {len(prefix) for prefix in policy.prefixes[1:]} == {5}
+
+
+@pytest.mark.parametrize("default", ["warm", "full"])
+def test_the_prefix_seam_is_refused_for_plans_of_which_one_takes_none(default: str) -> None:
+    """Whatever the default plan takes, and whether or not latencies are known."""
+
+    class Some(Told):
+        def prefix_refusal(self, plan: str) -> str | None:
+            return "it keeps to it." if plan == "warm" else None
+
+    def opened(*tiers: str, stall_after: float | None = None) -> World:
+        policy = Some(FakeClock(), {"full": 0.1, "warm": 0.1})
+        vars(policy.info).update(default_plan=default, prefix_refusal="it keeps to it." if default == "warm" else None)
+        made = ExecutorSettings(seam="prefix", tiers=tiers or None, stall_after=stall_after, stall_plan="warm")
+        return World(settings=made, policy=policy)
+
+    for tiers, stall_after in ((("full", "warm"), None), (("full",), 1.0), *([((), None)] * (default == "warm"))):
+        with pytest.raises(ExecutorError, match="plan 'warm' of this one does not: it keeps to it. Use seam='blend'"):
+            opened(*tiers, stall_after=stall_after)
+    with opened("full") as world:
+        world.begin()
+        assert len(world.run(20)) == 20
+
+
 def test_what_is_infeasible_is_refused_with_the_arithmetic() -> None:
     with pytest.raises(
         InfeasibleError,
@@ -264,54 +297,6 @@ def test_the_guard_refuses_and_the_loop_goes_on_with_what_it_has() -> None:
         assert counted.chunks_refused > 0
         assert counted.holds == 2
         assert "the bounds are -1 to 3" in str(counted.last_refusal)
-
-
-@pytest.mark.parametrize(
-    ("made", "message"),
-    [
-        ({"policy_hz": -1}, "policy_hz must be a number, positive"),
-        ({"max_age": inf}, "max_age must be a number, positive and finite"),
-        ({"policy_hz": "10"}, "policy_hz must be a number, positive and finite; found '10'"),
-        ({"max_hold": -1}, "max_hold must be an integer of at least 0"),
-        ({"rate_tolerance": "0.3"}, "rate_tolerance must be a number, between 0 and 0.5 periods; found '0.3'"),
-        ({"rate_tolerance": 0.5}, "rate_tolerance must be a number, between 0 and 0.5 periods; found 0.5"),
-        ({"max_age": True}, "max_age must be a number, positive and finite; found True"),
-        ({"seam": "glue"}, "seam must be one of"),
-        ({"interpolation": "cubic"}, "interpolation must be one of"),
-        ({"tiers": ()}, "tiers must be a tuple of names"),
-        ({"tiers": "fast"}, "each once; found 'fast'"),
-        ({"tiers": ("a", "a")}, "each once"),
-        ({"stall_after": 0}, "stall_after must be a number, positive and finite; found 0"),
-        ({"stall_after": "2"}, "stall_after must be a number, positive and finite; found '2'"),
-        ({"stall_range": -0.1}, "stall_range must be a number, positive and finite"),
-        ({"stall_plan": None}, "stall_plan must be the name of a plan; found None"),
-    ],
-)
-def test_settings_are_checked(made: dict[str, object], message: str) -> None:
-    with pytest.raises(ExecutorError, match=message):
-        ExecutorSettings(**made)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("made", "hz", "message"),
-    [
-        ({}, 0, "control_hz must be a number, positive"),
-        ({}, inf, "control_hz must be a number, positive and finite"),
-        ({}, "10", "control_hz must be a number, positive and finite; found '10'"),
-        ({"policy_hz": 1e-320}, 10, "no multiple of policy_hz"),
-        ({"policy_hz": 20}, 50, "no multiple of policy_hz = 20: an action would last 2.5 ticks"),
-        ({"policy_hz": 20}, 10, "no multiple"),
-        ({"horizon": 16}, 10, "Give at most 15"),
-        ({"horizon": 10, "reserve": 6}, 10, "Give at most 5, or None"),
-        ({"reserve": 8}, 10, "Give at most 7, or None"),
-        ({"tiers": ("dense", "quick")}, 10, "no plan 'quick'; it has"),
-        ({"stall_after": 1.0, "stall_plan": "slow"}, 10, "no plan 'slow'; it has .* Name tiers and stall_plan among"),
-    ],
-)
-def test_settings_have_to_fit_the_policy(made: dict[str, object], hz: float, message: str) -> None:
-    info = ScriptedPolicy(FakeClock(), reserve=7).info
-    with pytest.raises(ExecutorError, match=message):
-        settings.resolve(ExecutorSettings(**made), info, hz)  # type: ignore[arg-type]
 
 
 def test_a_policys_thread_is_pinned() -> None:

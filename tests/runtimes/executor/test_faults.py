@@ -64,22 +64,6 @@ def test_a_gap_holds_the_last_action_for_a_bounded_number_of_ticks() -> None:
         assert world.executor.statistics().deadlines_missed == 1
 
 
-def test_frames_at_another_rate_than_the_policys_are_a_trouble_until_one_fits() -> None:
-    """The rate of the policy was left out, and the camera gives 30 frames a second."""
-    with World(hz=50.0, latency={"dense": 0.01}) as world:
-        for number in range(10):
-            assert (world.executor.trouble == "") is (number < 2)
-            world.observe()
-            assert not world.executor.ready
-            world.clock.advance(1 / 30)
-        assert "the policy wants 2 frames every 0.02 s, to within 0.006 s; the newest came 0.03333" in (
-            world.executor.trouble
-        )
-        world.observe(world.time - 1 / 30 + 0.02)
-        assert world.executor.trouble == ""
-    assert world.executor.trouble == "the executor was closed"
-
-
 def test_a_hold_of_nothing_raises_at_once() -> None:
     with World(fault={1: 1.0}, settings=ExecutorSettings(max_hold=0)) as world:
         made, _ = world.run_until_starved()

@@ -17,7 +17,7 @@ from .simulation import REAL_LIMIT, FakeClock, Quick, ScriptedPolicy, World, wor
 
 def kept(executor: AsyncExecutor) -> int:
     """Frames that the window of an executor holds."""
-    return len(executor._state._window._times)
+    return len(executor._state._window._frames)
 
 
 def test_four_cameras_at_10_khz_are_one_window_and_no_tick_is_missed() -> None:

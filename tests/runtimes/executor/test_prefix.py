@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,8 @@ from tests.rounding import allowed, assert_equal_but_for_rounding
 from tests.runtimes import committed
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import AsyncExecutor, ExecutorSettings
+from ttscompile.artifact.manifest import StartRecord
+from ttscompile.artifact.write import update_plans
 from ttscompile.core.spec import Relative
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor.settings import resolve
@@ -95,9 +98,27 @@ def test_a_policy_that_cannot_inpaint_is_refused_when_the_executor_is_made(toy_c
     policy = ttscompile.load(toy_compiled)
     with pytest.raises(
         ExecutorError,
-        match=r"inpaints it; this one does not: the table of its sampler 'toy' does not give.*Use seam='blend'",
+        match=r"inpaints it; plan 'dense' of this one does not: the table of its sampler 'toy' does not give.*='blend'",
     ):
         AsyncExecutor(policy, HZ, ExecutorSettings(seam="prefix"))
+
+
+def test_each_plan_says_for_itself_whether_it_takes_a_prefix(inpainting: Path, tmp_path: Path) -> None:
+    """Of a policy whose plan ``warm`` begins with the chunk of the call before, and so takes none."""
+    shutil.copytree(inpainting, tmp_path / "warm")
+    plans = dict(ttscompile.load(inpainting).plans)
+    base = plans["dense"]
+    plans["warm"] = replace(base, loop="last-2", cells=np.zeros((2, 5), np.int8), otherwise=base)
+    update_plans(tmp_path / "warm", plans, "warm", {}, starts={"last-2": StartRecord(base.loop, 2)})
+    for loaded in ("warm", "dense"):
+        policy = ttscompile.load(tmp_path / "warm", plan=loaded)
+        assert (policy.prefix_refusal("dense"), policy.prefix_refusal(plans["dense"])) == (None, None)
+        assert "begins with the chunk of the call before" in (policy.prefix_refusal("warm") or "")
+        assert policy.prefix_refusal() == policy.info.prefix_refusal == policy.prefix_refusal(loaded)
+        settings = ExecutorSettings(seam="prefix", n_obs_steps=1, tiers=("dense", "warm"))
+        with pytest.raises(ExecutorError, match="plan 'warm' of this one does not: its plan begins with"):
+            AsyncExecutor(policy, HZ, settings, latencies={"dense": LATENCY, "warm": LATENCY})
+        AsyncExecutor(policy, HZ, replace(settings, tiers=("dense",)), latencies={"dense": LATENCY}).close()
 
 
 def test_latencies_are_measured_with_a_prefix(inpainting: Path) -> None:

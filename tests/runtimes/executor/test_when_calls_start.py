@@ -33,6 +33,7 @@ class Loop:
         offset: from a control tick to when a frame is taken.
         delay: until it comes.
         jitter: at most so much later.
+        ahead: how much sooner than for its time an action is asked for.
         took: latency of a call by its number, for those that take another time than their plan.
     """
 
@@ -45,6 +46,7 @@ class Loop:
     offset: float = 0.0
     delay: float = 0.0
     jitter: float = 0.0
+    ahead: float = 0.0
     took: dict[int, float] = field(default_factory=dict)
 
     # C901: its functions are the events
@@ -92,8 +94,8 @@ class Loop:
             return come
 
         def act(now: float) -> None:
-            if state.play(now, now) is None:
-                state.hold(now, now)
+            if state.play(now + self.ahead, now) is None:
+                state.hold(now + self.ahead, now)
 
         frame = 1 / (self.frame_hz or resolved.policy_hz)
         seconds = chunks * (resolved.horizon + resolved.reserve) / resolved.policy_hz + 3 * max(self.latency.values())
@@ -122,6 +124,16 @@ def test_neither_the_phase_of_the_frames_nor_their_delay_changes_when_calls_star
     assert apart(calls) == pytest.approx([0.8] * (len(calls) - 2))
     assert [job.started - job.observed for job in calls] == pytest.approx([delay] * len(calls))
     assert counts.deadlines_missed == 0
+
+
+@pytest.mark.parametrize("plans", [{"dense": 0.02}, {"slow": 0.02, "fast": 0.01}])
+@pytest.mark.parametrize("ahead", [0.02, 0.06, 0.1, 0.15])
+def test_actions_that_are_asked_for_ahead_are_needed_sooner(plans: dict[str, float], ahead: float) -> None:
+    """For the latency of an actuator. Push-T at 50 Hz: 300 ms of actions, of which calls and a frame take 80."""
+    calls, counts, _ = Loop(latency=plans, ahead=ahead).run(30)
+    assert (counts.deadlines_missed, counts.reserve, counts.holds, counts.switches_down) == (0, 0, 0, 0)
+    assert min(apart(calls)) == pytest.approx(0.16 if ahead < 0.1 else 0.14 if ahead < 0.15 else 0.08, abs=0.021)
+    assert all(job.deadline is None or job.started < job.deadline for job in calls)
 
 
 def test_another_tier_does_not_change_how_far_calls_are_apart() -> None:
@@ -191,6 +203,7 @@ def test_the_frame_before_is_used_when_the_next_does_not_come() -> None:
     phase=st.floats(0, 0.99),
     share=st.floats(0.02, 0.97),
     jitter=st.sampled_from([0.0, 0.3]),
+    ahead=st.sampled_from([0.0, 0.1, 0.4]),
     feasible=st.booleans(),
 )
 def test_what_is_feasible_never_misses_and_what_clearly_is_not_does(  # noqa: PLR0913  # drawn by hypothesis
@@ -204,11 +217,14 @@ def test_what_is_feasible_never_misses_and_what_clearly_is_not_does(  # noqa: PL
     phase: float,
     share: float,
     jitter: float,
+    ahead: float,
     feasible: bool,
 ) -> None:
     """Clearly: by more than a frame, which a call need not wait for if the phase is lucky, and a margin."""
     hz = rate * ticks_per_step
-    longest = Feasibility(1.0, hz, rate, horizon, margin, beyond if reserve is None else 0).max_latency
+    own = Feasibility(1.0, hz, rate, horizon, margin, beyond if reserve is None else 0)
+    ahead = min(ahead, max(own.predicted - own.frame_period - own.margin, 0.0) / 2)
+    longest = min(own.play, own.max_latency, (own.predicted - own.frame_period - own.margin - ahead) / 2)
     latency = (
         share * longest if feasible else max(longest, 0.0) + 1.3 / rate + (margin + 1.6) / hz + share * horizon / rate
     )
@@ -223,6 +239,7 @@ def test_what_is_feasible_never_misses_and_what_clearly_is_not_does(  # noqa: PL
         frame_hz=hz if often else rate,
         offset=phase / hz,
         jitter=jitter / hz,
+        ahead=ahead,
     )
     loop.settings["refuse_infeasible"] = False
     _, counts, arithmetic = loop.run(6)

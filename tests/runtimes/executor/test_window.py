@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,11 @@ def window(steps: int = 2, tolerance: float = 0.3, times: list[float] | None = N
 
 def values(made: ObservationWindow) -> list[float] | None:
     return None if made.complete is None else [float(each["obs"][0]) for each in made.complete.frames]
+
+
+def times_of(made: ObservationWindow) -> list[float]:
+    """Times of the frames that are kept."""
+    return [time for time, _ in made._frames]
 
 
 def test_the_first_axis_of_a_history_is_time() -> None:
@@ -146,9 +153,9 @@ def test_the_tolerance(time: float, complete: bool) -> None:
 
 def test_old_frames_are_thrown_away() -> None:
     made = window(times=[i * 0.01 for i in range(90)])
-    assert len(made._times) == len(made._frames) == 44  # of 0.3 s, a period and the tolerance
+    assert len(made._frames) == 44  # of 0.3 s, a period and the tolerance
     made.add(10.0, frame(10), 10.0)
-    assert made._times == [10.0]
+    assert times_of(made) == [10.0]
     assert window(times=[]).complete is None  # of the next episode, which has a window of its own
 
 
@@ -160,9 +167,33 @@ def test_frames_at_any_rate_make_windows_in_a_bounded_memory(hz: int, jitter: fl
     times: list[float] = [(i + chance.uniform(0, jitter)) / hz for i in range(2 * hz // 5)]
     for time in times:
         made.add(time, frame(time), time)
-        assert len(made._times) == len(made._frames) <= MOST_FRAMES
+        assert len(made._frames) <= MOST_FRAMES
     assert values(made) == pytest.approx([max(times) - 0.2, max(times) - 0.1, max(times)], abs=0.001)
-    assert made._times == sorted(made._times)
+    assert times_of(made) == sorted(times_of(made))
+
+
+@pytest.mark.parametrize("added", [0.3, 0.2, 0.25, 5.0, -9.0])
+@pytest.mark.parametrize("line", range(15))
+def test_a_handler_that_raises_between_two_changes_leaves_a_window_that_goes_on(added: float, line: int) -> None:
+    """As of a signal, at any line of ``add``, whatever it does there: add, replace, leave out, throw away."""
+    made, left = window(times=[0.0, 0.1, 0.2]), iter(range(line))
+
+    def interrupt(code: Any, event: str, _: object) -> Any:
+        if code.f_code.co_name == "add" and event == "line" and next(left, None) is None:
+            raise KeyboardInterrupt
+        return interrupt
+
+    tracing = sys.gettrace()
+    sys.settrace(interrupt)
+    try:
+        with suppress(KeyboardInterrupt):
+            made.add(added, frame(added), max(added, 0.2))
+    finally:
+        sys.settrace(tracing)
+    assert times_of(made) == sorted({*times_of(made)})
+    for time in (5.1, 5.2):
+        assert made.add(time, frame(time), time) == "added"
+    assert values(made) == [5.1, 5.2]
 
 
 def test_the_next_frame_is_expected_when_the_last_ones_say() -> None:
@@ -178,7 +209,7 @@ def test_a_window_is_always_the_newest_there_is(times: list[int], steps: int) ->
     now = max(times)
     for time in times:
         made.add(float(time), frame(time), float(now))
-    kept = set(made._times)
+    kept = set(times_of(made))
     assert kept == {float(t) for t in times if t >= now - (4.0 + 2.0 * (steps - 1) + 0.6)}
     whole = [t for t in kept if all(t - 2.0 * back in kept for back in range(steps))]
     expected = None if not whole else [max(whole) - 2.0 * back for back in reversed(range(steps))]
