@@ -18,6 +18,7 @@ from ttscompile.lower.precision import lower_precision, quantize_model
 COUNT, CHANNELS = 3, 8
 WIDTH = COUNT * CHANNELS
 PLAIN: dict[str, Any] = {"q_num_heads": COUNT, "kv_num_heads": COUNT}
+PRODUCTS = ("DynamicQuantizeMatMul", "MatMulIntegerToFloat")
 WEIGHTS = {"w": np.eye(WIDTH, dtype=np.float32)}
 
 
@@ -162,6 +163,17 @@ def test_an_axis_of_heads_makes_no_difference() -> None:
     given = {name: heads(value) for name, value in inputs.items()}
     found = session(made, {**WEIGHTS, **constants}).run(["y"], {**given, "x": np.zeros((2, WIDTH), np.float32)})[0]
     np.testing.assert_array_equal(found, heads(both(FEWEST, FEWEST, inputs)[0]))
+
+
+def test_older_versions_of_onnxruntime_open_it() -> None:
+    """1.25 to 1.29 end where a product leaves out the zero point, and 1.23 has no QuantizeLinear of this opset."""
+    model = model_of(attention(), {"q": FEWEST, "k": FEWEST, "v": FEWEST})
+    graph = quantize_model(model, WEIGHTS)[0].graph
+    bodies = [each.g for node in graph.node for each in node.attribute if each.name == "body"]
+    nodes = [node for one in (graph, *bodies) for node in one.node]
+    given = {kind: {len(node.input) for node in nodes if node.op_type == kind} for kind in PRODUCTS}
+    assert given == {"DynamicQuantizeMatMul": {4}, "MatMulIntegerToFloat": {6}}
+    assert {node.domain for node in nodes if node.op_type == "QuantizeLinear"} == {"com.microsoft"}
 
 
 def test_streams_and_heads_do_not_see_each_other() -> None:

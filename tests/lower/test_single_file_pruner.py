@@ -14,7 +14,7 @@ from onnx import GraphProto
 from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
 import ttscompile
-from tests.lower.whole_call import Episode, inputs, lowered, make_toy
+from tests.lower.whole_call import Episode, inputs, lowered, make_toy, opened
 from tests.rounding import assert_equal_but_for_rounding
 from tests.runtimes.agreement import call_terms
 from tests.runtimes.pruners import calibrated, random_pruner
@@ -67,6 +67,35 @@ def test_episodes_of_its_plans(tmp_path: Path, options: dict[str, Any], correcte
     assert (reads > 0).all()
     assert repaired > 0
     assert len(plans) > seen / 2
+
+
+def test_older_versions_of_onnxruntime_open_it(tmp_path: Path) -> None:
+    """Before 1.31 there is no Where of eight-bit integers, of which plans are."""
+    _, _, model = make_toy(tmp_path, steps=3)
+    graph = onnx.shape_inference.infer_shapes(onnx.load_from_string(model)).graph
+    kinds = {one.name: one.type.tensor_type.elem_type for one in graph.value_info}
+    chosen = [kinds[node.output[0]] for node in graph.node if node.op_type == "Where" and node.output[0] in kinds]
+    assert chosen and onnx.TensorProto.INT8 not in chosen
+
+
+@pytest.mark.parametrize("options", [{"steps": 6}, {"steps": 5, "blocks": 7, "sequence_first": True}])
+def test_what_inputs_of_gives_is_all_but_observation_and_noise(tmp_path: Path, options: dict[str, Any]) -> None:
+    """Calls of an episode; the later ones read residuals of the first."""
+    program, policy, model = make_toy(tmp_path, **options)
+    folder = calibrated(tmp_path / "artifact", program, corrected=False)
+    session, rng, reads = opened(model), np.random.default_rng(0), 0
+    policy = ttscompile.load(folder, "reference")
+    given, kept = inputs_of(folder, "pruner", streams=2), ("rollout_rows", "rollout_index")
+    for _ in range(4):
+        obs, noise = inputs(policy, rng, 2)
+        noises = {"initial_noise": noise.initial, "step_noise": noise.steps}
+        names = ["action", "executed_plan", *(f"{name}_next" for name in kept)]
+        action, executed, *following = session.run(names, {**obs, **noises, **given})
+        expected = policy.predict_action(obs, noise=noise, plan="pruner")["action"]
+        assert_equal_but_for_rounding(action, expected, 4 * call_terms(load_artifact(folder)))
+        given |= dict(zip(kept, following, strict=True))
+        reads += int((executed == Source.ROLLOUT).sum())
+    assert reads > 0
 
 
 def test_streams_of_one_plan_go_together_and_others_do_not_see_it(tmp_path: Path) -> None:

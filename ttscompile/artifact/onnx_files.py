@@ -24,7 +24,7 @@ MAX_DEPTH = 32
 LOOPS = frozenset({"Loop", "SequenceMap"})
 SCAN = "Scan"
 """In each other they would have as many turns as their numbers multiplied."""
-INTEGER = frozenset({"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "MatMulNBits"})
+INTEGER = frozenset({"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "MatMulNBits", "QuantizeLinear"})
 """What an artifact has of onnxruntime's own operators."""
 
 _SPARSE = "sparse"

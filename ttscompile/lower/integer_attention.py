@@ -15,10 +15,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from onnx import GraphProto, NodeProto, TensorProto
+from onnx import GraphProto, NodeProto
+from onnx.numpy_helper import from_array
 
 from .graph_writer import GraphWriter, tensor
-from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT
+from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, NO_ZERO
 
 FEWEST = 256
 """Queries, and keys, from which on integers are faster than fp32."""
@@ -97,15 +98,20 @@ def _head(w: GraphWriter, sizes: Sequence[tuple[int, int]], scale: float) -> Gra
         rest = w.op("Sub", x, mean)
         step = w.op("Mul", w.op("ReduceMax", w.op("Abs", rest), *axes, keepdims=0), number(1 / LARGEST_FACTOR))
         own = w.op("Max", step, number(float(np.finfo(np.float32).tiny)))
-        return w.op("QuantizeLinear", rest, own, output_dtype=TensorProto.INT8, **attributes), own, mean
+        return integers_of(rest, own, np.int8, **attributes), own, mean
+
+    def integers_of(x: str, scale: str, kind: type[np.generic], **attributes: Any) -> str:
+        # ONNX's own operation of this opset is not in onnxruntime 1.23.
+        zeros = w.op("ConstantOfShape", w.op("Shape", scale), value=from_array(np.zeros(1, kind)))
+        return w.op("QuantizeLinear", x, scale, zeros, domain=DOMAIN, **attributes)
 
     keys, scales, _ = centred(key, last, axis=0)
     values, one, mean = centred(value)
     turned, factor = w.op("Transpose", keys, perm=[1, 0]), w.op("Mul", scales, number(scale))
-    shares = w.op("Softmax", w.op(DYNAMIC_PRODUCT, query, turned, factor, domain=DOMAIN), axis=-1)
+    shares = w.op("Softmax", w.op(DYNAMIC_PRODUCT, query, turned, factor, NO_ZERO, domain=DOMAIN), axis=-1)
     step = w.op("Mul", w.op("ReduceMax", shares, last, keepdims=0), number(1 / 255))
-    integers = w.op("QuantizeLinear", shares, step, axis=0, output_dtype=TensorProto.UINT8)
-    made = w.op(INTEGER_PRODUCT, integers, values, number(1), one, domain=DOMAIN)
+    integers = integers_of(shares, step, np.uint8, axis=0)
+    made = w.op(INTEGER_PRODUCT, integers, values, number(1), one, NO_ZERO, NO_ZERO, domain=DOMAIN)
     result = w.op("Add", w.op("Mul", made, w.op("Unsqueeze", step, last)), mean)
     shapes = [[count if count > 0 else "T", width] for count, width in (*sizes, (sizes[0][0], sizes[2][1]))]
     inputs = [tensor(name, np.float32, shape) for name, shape in zip((query, key, value), shapes, strict=False)]

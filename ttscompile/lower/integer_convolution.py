@@ -23,6 +23,9 @@ INTEGER_PRODUCT = "MatMulIntegerToFloat"
 DYNAMIC_PRODUCT = "DynamicQuantizeMatMul"
 """Reads float32, quantises it to uint8 with one scale and zero point for the whole tensor, multiplies with int8 weights
 into int32, scales by column and adds the bias. Fastest of what onnxruntime 1.31 has; see ``docs/decisions.md``."""
+NO_ZERO = ""
+"""In the place of the weights' zero point, which is 0. It has to be named as absent: onnxruntime 1.25 to 1.29 read this
+place whether there is one or not, and end the process, where they are told to sum integers exactly."""
 
 _STREAMS = re.compile(r"([1-9][0-9]*\*)?B")
 """A size that depends on the number of streams, as ``onnx_model.value_info`` writes it."""
@@ -90,7 +93,7 @@ def integer_convolution(
         pixels = w.op("Reshape", pixels, w.constant([0, -1, channels]))
         pixels = w.op("Gather", pixels, w.constant(seen, np.int32), axis=1)
     rows = w.op("Reshape", pixels, w.constant([0, places, len(matrix)]))
-    made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, *(["", bias] if bias else []), domain=DOMAIN)
+    made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, NO_ZERO, *([bias] if bias else []), domain=DOMAIN)
     turned = w.op("Transpose", made, perm=[0, 2, 1])
     w.ops("Reshape", [turned, w.constant([0, out, *result])], node.output)
     return True

@@ -198,7 +198,8 @@ def write_executed_plans(
         branches = _of_pruner(head, logits(head)), _as_given(given, plan, shape)
         wanted, broken = w.ops("If", [used], 2, then_branch=branches[0], else_branch=branches[1])
 
-    wanted = w.op("Where", w.op("Reshape", far, w.constant([-1, 1, 1])), PLAIN, wanted)
+    plain, own = (w.op("Cast", one, to=INT64) for one in (PLAIN, wanted))  # Where has int8 from onnxruntime 1.31 on
+    wanted = w.op("Cast", w.op("Where", w.op("Reshape", far, w.constant([-1, 1, 1])), plain, own), to=INT8)
     after_first = np.ones((lattice[0], 1), np.int64)
     after_first[0] = Source.COMPUTE.value
     source = w.op("Mul", w.op("Cast", wanted, to=INT64), w.constant(after_first))

@@ -26,7 +26,7 @@ from ..ir.flops import graph_flops
 from ..ir.pieces import BLOCKS, CONDITION, NOT_KEPT, OF_ALL_BLOCKS, STEP, frame_name, is_tokens, part_of
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
-from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, integer_convolution, shapes_of
+from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, NO_ZERO, integer_convolution, shapes_of
 from .onnx_model import live_nodes, replaced
 
 if TYPE_CHECKING:
@@ -276,7 +276,7 @@ def _integer_product(
         sizes = dict(zip("KN", value.shape, strict=True))
         w.ops(BLOCK_PRODUCT, inputs, node.output, domain=DOMAIN, **sizes, **ATTRIBUTES)
         return True
-    w.ops(DYNAMIC_PRODUCT, [x, *store(constant, value), *(["", bias] if bias else [])], node.output, domain=DOMAIN)
+    w.ops(DYNAMIC_PRODUCT, [x, *store(constant, value), NO_ZERO, *([bias] if bias else [])], node.output, domain=DOMAIN)
     return True
 
 
