@@ -11,6 +11,7 @@ PACKAGES = {
     "ttscompile": "ttscompile",
     "passes": "ttscompile.passes",
     "runtimes": "ttscompile.runtimes",
+    "plugins/hub": "ttscompile.hub",
     "plugins/policies": "ttscompile.policies",
     "plugins/rivals": "ttscompile.rivals",
     "plugins/serving": "ttscompile.serving",
