@@ -207,7 +207,9 @@ class Runtime:
         if plan.cells is None and PRUNER not in manifest.pieces:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
-        settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
+        # Of a plan of the artifact what was not kept is repaired; of another one it is refused, repaired or not.
+        gone = dropped if told is None else np.zeros_like(dropped)
+        settled = None if plan.cells is None else self._settle(opened, plan.cells, written, gone, plan.repair)
         self._given |= name is None and (told is None or self._reading)
         keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
         self._used = opened
@@ -217,10 +219,10 @@ class Runtime:
         start = time.perf_counter()
         made = self._denoised(opened, plan, Call(obs, noise, plan.correction, known, keep, written), settled)
         stop, settled = time.perf_counter(), made.settled
-        if made.mixed:
-            keep, written = np.zeros_like(keep), np.zeros_like(written)
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
+        if made.mixed:  # no cell has residuals of all streams: as if none had been computed
+            self._written, self._dropped = np.zeros_like(computed), np.zeros_like(computed)
         self.streams, self._chunk, self._reference = streams, made.sample, reference
         executed = settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
@@ -310,7 +312,7 @@ class Runtime:
         wanted = check_plan(plan, steps, blocks, streams)
         plans = without_illegal_reads(wanted, written) if repair else wanted
         rollout = wanted == Source.ROLLOUT.value
-        if (rollout & dropped).any():  # nor are they repaired: there was a residual, and nobody kept it
+        if (rollout & dropped).any():
             _, k, b = np.argwhere(rollout & dropped)[0].tolist()
             raise IllegalPlanError(
                 f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"

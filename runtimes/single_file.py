@@ -17,15 +17,15 @@ from ttscompile.ir.pieces import USE_PRUNER
 from .liveness import readable_rollout
 
 
-def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArray[Any]]:
-    """The inputs of a single ONNX file that are the same in every call with a plan.
+def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> dict[str, npt.NDArray[Any]]:
+    """The inputs of a single ONNX file for the first call of an episode with a plan, without observation and noise.
 
-    Beside these it wants the observation, the noise, and of the rollout cache what the call before gave
-    (``ttscompile.lower.single_file``).
+    Later calls of the episode are given ``rollout_rows`` and ``rollout_index`` as the call before left them.
 
     Args:
         path: the artifact that was written beside the file, or the same zipped; it may have been calibrated since.
         plan: the name of a plan of the artifact, in the loop that the file was written for; None for its default plan.
+        streams: B, of the observation and the noise.
 
     Raises:
         ArtifactError: the artifact is missing, damaged or of another version.
@@ -47,12 +47,15 @@ def inputs_of(path: str | Path, plan: str | None = None) -> dict[str, npt.NDArra
         remedy = f"Give {name.partition('@')[0] + '@' + bits!r}, or use ttscompile.load."
         raise IllegalPlanError(f"{problem}. {remedy}")
     view = view_of(artifact, own)
-    cells = dense_plan(view.manifest.steps, len(view.manifest.blocks)) if own.cells is None else own.cells
+    blocks, steps = view.manifest.blocks, view.manifest.steps
+    cells = dense_plan(steps, len(blocks)) if own.cells is None else own.cells
     inputs: dict[str, npt.NDArray[Any]] = {"plan": cells[None], "rollout_keep": readable_rollout(view)}
+    inputs["rollout_rows"] = np.zeros((0, *blocks[0].type.at(1)), np.float32)
+    inputs["rollout_index"] = np.full((streams, steps, len(blocks)), -1, np.int64)
     if own.pruned:
         inputs |= {USE_PRUNER: np.array(True), **view.pruner}
     if own.correction is None:
         return inputs
     if artifact.envelope is not None:
-        inputs |= artifact.envelope.inputs(plain_cells(own.correction, len(view.manifest.blocks)))
+        inputs |= artifact.envelope.inputs(plain_cells(own.correction, len(blocks)))
     return inputs | own.correction.inputs()

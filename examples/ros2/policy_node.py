@@ -11,6 +11,7 @@ topic or service             type                                        what
 ``~/observation/KEY``        ``std_msgs/Float64MultiArray``              one frame of an observation, flat
 the same, for pictures       ``sensor_msgs/Image``, ``rgb8``             one frame ``[3, H, W]``, scaled to 0..1
 the same, for ``joint_key``  ``sensor_msgs/JointState``                  positions, in the order of ``joints``
+the same, for a goal         ``std_msgs/Float64MultiArray``              published once, with durability TRANSIENT_LOCAL
 ``~/commands``               ``std_msgs/Float64MultiArray``              the action for now; none where there is none
 ``/diagnostics``             ``diagnostic_msgs/DiagnosticArray``         once a second, what the executor counts
 ``~/reset``                  ``std_srvs/Trigger``                        a new episode
@@ -22,6 +23,7 @@ by a timeout of its own: nothing is repeated here beyond ``ExecutorSettings.max_
 
 from __future__ import annotations
 
+import math
 import sys
 from array import array
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +35,7 @@ import numpy.typing as npt
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.time import Time
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray
@@ -42,6 +44,7 @@ from std_srvs.srv import Trigger
 import ttscompile
 from ttscompile.errors import DeadlineMissedError, ExecutorError, ObservationError, TtscompileError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
+from ttscompile.runtimes.executor.window import FrameSpec
 
 Array = npt.NDArray[Any]
 PARAMETERS = {
@@ -49,11 +52,24 @@ PARAMETERS = {
     "control_hz": 50.0,
     "policy_hz": 10.0,
     "threads": 1,
+    "plan": "",
+    "interpolation": "hold",
     "frame_key": "",
     "joint_key": "",
     "joints": [""],
+    "goal_keys": [""],
 }
-"""Name -> default; ``frame_key``: the observation that completes a frame, the first one if it is empty."""
+"""Name -> default.
+
+``plan``: empty for the default plan. ``frame_key``: the observation that completes a frame; empty for the first that is
+no goal. ``goal_keys``: observations that stay as they are until they are published again, over a reset, too; empty for
+the numbers that have no window, where other observations have one.
+"""
+
+PUBLISHED_ONCE = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+)
+"""Of goals: a node that starts later is given the last one, too. A publisher without this durability is not heard."""
 
 LATE = ("deadlines_missed", "reserve", "holds", "starved", "chunks_refused", "chunks_overdue")
 """What the executor counts when something came too late, or was refused; ``starved``: there was no action."""
@@ -74,12 +90,18 @@ class PolicyNode(Node):
             self.declare_parameter(name, default)
         given = {name: self.get_parameter(name).value for name in PARAMETERS}
         self._executor = open_executor(given)
-        specs = self._executor.frames.specs
+        specs, self._goals = self._executor.frames.specs, goals(given, self._executor.frames)
         self._joints = [name for name in given["joints"] if name]
-        self._frame_key = given["frame_key"] or next(iter(specs))
-        for option in ("frame_key", "joint_key"):
-            if given[option] and given[option] not in specs:
-                raise ObservationError(f"{option} is {given[option]!r}; the policy observes {sorted(specs)}.")
+        self._frame_key = given["frame_key"] or next((key for key in specs if key not in self._goals), "")
+        for option, names in (
+            ("frame_key", [self._frame_key]),
+            ("joint_key", [given["joint_key"]]),
+            ("goal_keys", self._goals),
+        ):
+            if unknown := sorted(set(filter(None, names)) - specs.keys()):
+                raise ObservationError(f"{option} is {unknown[0]!r}; the policy observes {sorted(specs)}.")
+        if self._frame_key in {"", *self._goals}:
+            raise ObservationError(f"frame_key must come with every frame, and goal_keys are {sorted(self._goals)}.")
         self._latest: dict[str, tuple[Array, float]] = {}
         self._told = self._executor.statistics()
         self._refused, self._why = 0, ""
@@ -90,7 +112,8 @@ class PolicyNode(Node):
             elif len(spec.shape) == 3:
                 kind, read = Image, partial(from_picture, dtype=spec.dtype)
             topic = f"~/observation/{key.replace('.', '/')}"
-            self.create_subscription(kind, topic, partial(self.on_message, key, read), qos_profile_sensor_data)
+            quality = PUBLISHED_ONCE if key in self._goals else qos_profile_sensor_data
+            self.create_subscription(kind, topic, partial(self.on_message, key, read), quality)
         self._commands = self.create_publisher(Float64MultiArray, "~/commands", 1)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/reset", self.on_reset)
@@ -98,10 +121,13 @@ class PolicyNode(Node):
         self.create_timer(1.0, self.on_diagnostics)
 
     def on_message(self, key: str, read: Callable[[Any], Array], message: Any) -> None:
-        """Keep what was observed last; with ``frame_key`` give the executor a frame, as old as its oldest part."""
+        """Keep what was observed last; with ``frame_key`` give the executor a frame, as old as its oldest part.
+
+        A goal has no age.
+        """
         try:
-            self._latest[key] = read(message), self._taken(message)
-            if key == self._frame_key and len(self._latest) == len(self._executor.frames.specs):
+            self._latest[key] = read(message), math.inf if key in self._goals else self._taken(message)
+            if key == self._frame_key and not self._missing:
                 frame = {name: value for name, (value, _) in self._latest.items()}
                 self._executor.observe(frame, min(taken for _, taken in self._latest.values()))
         except ObservationError as error:
@@ -124,9 +150,10 @@ class PolicyNode(Node):
         """Tell what happened since the last time: ERROR if an action was missing, WARN if anything was late."""
         now, before = self._executor.statistics(), self._told
         late = {name: getattr(now, name) - getattr(before, name) for name in LATE} | {"refused": self._refused}
-        level, message = DiagnosticStatus.OK, "on time" if self._executor.ready else "waiting for observations"
+        waiting = f"waiting for {', '.join(self._missing) or 'observations'}"
+        level, message = DiagnosticStatus.OK, "on time" if self._executor.ready else waiting
         if trouble := self._executor.trouble:
-            level, message = DiagnosticStatus.WARN, trouble
+            level, message = DiagnosticStatus.WARN, f"{trouble}; {waiting}" if self._missing else trouble
         if any(late.values()):
             level, message = DiagnosticStatus.WARN, self._why or now.last_refusal or "chunks come late"
         if late["starved"]:
@@ -143,11 +170,16 @@ class PolicyNode(Node):
         self._told, self._refused, self._why = now, 0, ""
 
     def on_reset(self, request: Any, response: Any) -> Any:
-        """A new episode: nothing that was observed or computed before is played after it."""
+        """A new episode: nothing that was observed or computed before is played after it, but goals stay."""
         self._executor.reset()
-        self._latest.clear()
+        self._latest = {key: seen for key, seen in self._latest.items() if key in self._goals}
         response.success, response.message = True, "a new episode"
         return response
+
+    @property
+    def _missing(self) -> list[str]:
+        """Observations that have not come in this episode."""
+        return [key for key in self._executor.frames.specs if key not in self._latest]
 
     def destroy_node(self) -> None:
         """End the policy's thread too."""
@@ -164,6 +196,15 @@ class PolicyNode(Node):
         clock = self.get_clock()
         age = (clock.now() - Time.from_msg(stamp, clock_type=clock.clock_type)).nanoseconds
         return self._executor.now() - max(age, 0) / 1e9
+
+
+def goals(given: Mapping[str, Any], frames: FrameSpec) -> frozenset[str]:
+    """Observations that stay as they are until they are published again: see ``PARAMETERS``."""
+    if told := frozenset(filter(None, given["goal_keys"])):
+        return told
+    sensors = {*frames.history, given["frame_key"], given["joint_key"]}
+    numbers = {key for key, spec in frames.specs.items() if len(spec.shape) < 3}
+    return frozenset(numbers - sensors if frames.history else ())
 
 
 def from_numbers(message: Any, shape: Sequence[int], dtype: str) -> Array:
@@ -199,8 +240,9 @@ def from_picture(message: Any, dtype: str) -> Array:
 
 def open_executor(given: Mapping[str, Any]) -> AsyncExecutor:
     """The executor that the parameters ask for."""
-    policy = ttscompile.load(given["artifact"], threads=given["threads"])
-    return AsyncExecutor(policy, given["control_hz"], ExecutorSettings(policy_hz=given["policy_hz"]))
+    policy = ttscompile.load(given["artifact"], plan=given["plan"] or None, threads=given["threads"])
+    settings = ExecutorSettings(policy_hz=given["policy_hz"], interpolation=given["interpolation"])
+    return AsyncExecutor(policy, given["control_hz"], settings)
 
 
 def main() -> int:

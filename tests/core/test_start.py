@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,17 +34,14 @@ def predicts_velocity(a: float, s: float, action: torch.Tensor, noise: torch.Ten
 
 
 def ddim(**settings: str) -> SamplerTable:
-    return sampler_table(DDIMScheduler(**BETAS, **settings), 8, name="ddim")
+    return sampler_table(DDIMScheduler(**BETAS, **settings), 8)
 
 
 CASES: dict[str, tuple[Callable[[], SamplerTable], Networks]] = {
     "ddim": (ddim, predicts_noise),
     "velocity": (lambda: ddim(prediction_type="v_prediction"), predicts_velocity),
-    "dpmsolver++": (lambda: sampler_table(DPMSolverMultistepScheduler(**BETAS), 8, name="dpmsolver++"), predicts_noise),
-    "third order": (
-        lambda: sampler_table(DPMSolverMultistepScheduler(**BETAS, solver_order=3), 8, name="dpmsolver++"),
-        predicts_noise,
-    ),
+    "dpmsolver++": (lambda: sampler_table(DPMSolverMultistepScheduler(**BETAS), 8), predicts_noise),
+    "third order": (lambda: sampler_table(DPMSolverMultistepScheduler(**BETAS, solver_order=3), 8), predicts_noise),
     "to 1": (lambda: flow_matching_table(8), lambda a, s, action, noise: action - noise),
     "to 0": (lambda: flow_matching_table(8, start=1.0, end=0.0), lambda a, s, action, noise: noise - action),
 }
@@ -82,7 +80,7 @@ def test_with_a_network_that_is_never_wrong_the_rest_meets_the_whole_loop(name: 
 
 
 def test_noise_of_the_steps_stays_with_them() -> None:
-    table = sampler_table(DDPMScheduler(**BETAS), 10, name="ddpm")
+    table = sampler_table(DDPMScheduler(**BETAS), 10)
     rest, start = rest_of(table, 4)
     assert (rest.stochastic, start.skipped) == (True, 6)
     np.testing.assert_array_equal(rest.noise_to_next, table.noise_to_next[6:])
@@ -94,12 +92,20 @@ def test_there_is_no_rest_of_so_many_steps(last_steps: int, found: str) -> None:
         rest_of(flow_matching_table(8), last_steps)
 
 
+def without_plus(prediction_type: str) -> SamplerTable:
+    """DPM-Solver, whose outputs mean the noise: its columns are those of DPM-Solver++ for another kind of network."""
+    settings = {"algorithm_type": "dpmsolver", "final_sigmas_type": "sigma_min", "prediction_type": prediction_type}
+    with pytest.warns(FutureWarning, match="deprecated"):
+        return sampler_table(DPMSolverMultistepScheduler(**BETAS, **settings), 2)
+
+
 @pytest.mark.parametrize(
     "make",
     [
         lambda: flow_matching_table(2, "rk4"),
         lambda: ddim(prediction_type="sample"),
         lambda: flow_matching_table([0, 5.0, 9.0]),
+        *(partial(without_plus, kind) for kind in ("epsilon", "sample", "v_prediction")),
     ],
 )
 def test_where_the_table_does_not_tell_the_noise_there_is_none(make: Callable[[], SamplerTable]) -> None:

@@ -150,6 +150,24 @@ class Publisher:
         self.published.append(message)
 
 
+@dataclass(frozen=True)
+class QoSProfile:
+    depth: int
+    durability: str
+    reliability: str
+
+
+class DurabilityPolicy:
+    TRANSIENT_LOCAL = "transient local"
+
+
+class ReliabilityPolicy:
+    RELIABLE = "reliable"
+
+
+SENSOR_DATA = QoSProfile(5, "volatile", "best effort")
+
+
 class Node:
     """Tests reach what it made by name: ``publishers``, ``subscriptions``, ``services``, ``timers``."""
 
@@ -161,6 +179,7 @@ class Node:
         self._parameters: dict[str, Parameter] = {}
         self.made_publishers: dict[str, Publisher] = {}
         self.made_subscriptions: dict[str, tuple[type, Callable[[Any], None]]] = {}
+        self.made_qualities: dict[str, QoSProfile] = {}
         self.made_services: dict[str, Callable[[Any, Any], Any]] = {}
         self.made_timers: list[tuple[float, Callable[[], None]]] = []
         self.destroyed = False
@@ -177,7 +196,7 @@ class Node:
         return self.made_publishers.setdefault(topic, Publisher(kind))
 
     def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
-        self.made_subscriptions[topic] = (kind, callback)
+        self.made_subscriptions[topic], self.made_qualities[topic] = (kind, callback), qos
 
     def create_service(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
         self.made_services[name] = callback
@@ -209,7 +228,12 @@ def modules(spin: Callable[[Node], None]) -> dict[str, ModuleType]:
     contents: dict[str, dict[str, Any]] = {
         "rclpy": {"init": lambda args: None, "spin": spin, "try_shutdown": lambda: None},
         "rclpy.node": {"Node": Node},
-        "rclpy.qos": {"qos_profile_sensor_data": object()},
+        "rclpy.qos": {
+            "DurabilityPolicy": DurabilityPolicy,
+            "QoSProfile": QoSProfile,
+            "ReliabilityPolicy": ReliabilityPolicy,
+            "qos_profile_sensor_data": SENSOR_DATA,
+        },
         "rclpy.time": {"Time": Time},
         "std_msgs": {},
         "std_msgs.msg": {"Float64MultiArray": Float64MultiArray},

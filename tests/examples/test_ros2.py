@@ -4,6 +4,7 @@ import sys
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from tests.once import Once
 from tests.runtimes.executor.simulation import TO, FakeClock, ScriptedPolicy, workers
 from tests.runtimes.toys import toy_program, written_artifact
+from ttscompile import ObservationSpec
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 
@@ -34,11 +36,14 @@ def node_module() -> Iterator[ModuleType]:
 class Robot:
     """A node over a scripted policy, in a world without real time."""
 
-    def __init__(self, module: ModuleType, fault: dict[int, str | float]) -> None:
+    def __init__(self, module: ModuleType, fault: dict[int, str | float], goal: bool, **overrides: Any) -> None:
         self.clock = FakeClock()
         self.policy = ScriptedPolicy(self.clock, fault=fault)
+        if goal:
+            observed = {"goal": ObservationSpec((2,)), **self.policy.info.observation}
+            self.policy.info = replace(self.policy.info, observation=observed)
         ros.Node.seconds = staticmethod(self.clock.now)
-        ros.Node.overrides = {"control_hz": HZ}
+        ros.Node.overrides = {"control_hz": HZ, **overrides}
 
         def opened(given: dict[str, Any]) -> AsyncExecutor:
             settings = ExecutorSettings(max_hold=0, reserve=0, refuse_infeasible=False)
@@ -74,8 +79,10 @@ class Robot:
 
 
 @contextmanager
-def robot(module: ModuleType, fault: dict[int, str | float] | None = None) -> Iterator[Robot]:
-    made = Robot(module, fault or {})
+def robot(
+    module: ModuleType, fault: dict[int, str | float] | None = None, goal: bool = False, **overrides: Any
+) -> Iterator[Robot]:
+    made = Robot(module, fault or {}, goal, **overrides)
     try:
         yield made
     finally:
@@ -129,7 +136,7 @@ def test_a_late_chunk_is_a_warning(node_module: ModuleType) -> None:
 
 def test_frames_that_make_no_window_are_a_warning(node_module: ModuleType) -> None:
     with robot(node_module) as one:
-        assert one.diagnosis()[1]["message"] == "waiting for observations"
+        assert one.diagnosis()[1]["message"] == "waiting for obs"
         for _ in range(5):  # half as many a second as the policy wants
             one.tick()
             one.tick(observed=False)
@@ -162,6 +169,43 @@ def test_a_reset_begins_an_episode(node_module: ModuleType) -> None:
             one.tick()
         assert len(one.commands) > sent
         assert one.policy.resets
+
+
+def test_a_goal_that_is_published_once_lasts(node_module: ModuleType) -> None:
+    """Also if it was published before the node started, a minute ago, or before a reset."""
+    with robot(node_module, goal=True) as one:
+        assert one.node.made_qualities == {
+            "~/observation/goal": ros.QoSProfile(1, "transient local", "reliable"),
+            TOPIC: ros.SENSOR_DATA,
+        }
+        assert one.diagnosis()[1]["message"] == "waiting for goal, obs"
+        for _ in range(5):
+            one.tick()
+        assert "waiting for goal" in one.diagnosis()[1]["message"]
+        one.node.deliver("~/observation/goal", ros.Float64MultiArray(array("d", [1.0, 2.0])))
+        one.clock.advance(60.0)
+        for _ in range(2):
+            for _ in range(TO + 4):
+                one.tick()
+            assert one.diagnosis()[1]["message"] == "on time"
+            one.node.made_services["~/reset"](ros.Trigger.Request(), ros.Trigger.Response())
+            assert one.diagnosis()[1]["message"] == "waiting for obs"
+        assert one.commands
+
+
+def test_which_observations_last_can_be_said(node_module: ModuleType) -> None:
+    """A number without a window may be measured anew for every frame, and complete it."""
+    for said in ({"goal_keys": ["obs"]}, {"frame_key": "goal"}):
+        with robot(node_module, goal=True, **said) as one:
+            assert one.node._frame_key == "goal"
+            assert one.node.made_qualities["~/observation/goal"] == ros.SENSOR_DATA
+            assert (one.node.made_qualities[TOPIC] == ros.SENSOR_DATA) == ("frame_key" in said)
+    for goals, why in (
+        (["aim"], r"goal_keys is 'aim'; the policy observes \['goal', 'obs'\]"),
+        (["goal", "obs"], "frame_key"),
+    ):
+        with pytest.raises(ObservationError, match=why):
+            Robot(node_module, {}, goal=True, goal_keys=goals)
 
 
 def test_a_stamp_of_ros_is_the_same_moment_on_the_executors_clock(node_module: ModuleType) -> None:
@@ -212,7 +256,8 @@ def test_the_program_drives_an_artifact_and_says_what_is_wrong(
     monkeypatch.setattr(sys, "argv", ["policy_node.py"])
     with ros.installed(spin):
         module = script(FOLDER, "policy_node")
-        ros.Node.overrides = {"artifact": str(artifact), "control_hz": 10.0, "policy_hz": 1.0}
+        more = {"plan": "dense", "interpolation": "linear"}
+        ros.Node.overrides = {"artifact": str(artifact), "control_hz": 10.0, "policy_hz": 1.0, **more}
         assert module.main() == 0
         ros.Node.overrides = {"artifact": str(tmp_path / "none")}
         assert module.main() == 1

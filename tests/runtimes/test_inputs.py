@@ -113,7 +113,8 @@ def test_of_the_noise_of_a_longer_loop_the_first_steps_are_taken_whatever_holds_
     noise, expected = some_noise(), actions(policy)
     assert noise.steps is not None
     longer = np.concatenate([noise.steps, noise.steps])
-    for steps in (longer, torch.from_numpy(longer)):
+    held: list[Any] = [longer, torch.from_numpy(longer)]
+    for steps in held:
         np.testing.assert_array_equal(actions(policy, noise=Noise(noise.initial, steps)), expected)
 
 

@@ -154,7 +154,7 @@ def test_an_unknown_plan_is_refused(artifact: Artifact) -> None:
         (lambda obs, initial, steps: (obs, initial), "steps must be .* found none"),
         (lambda obs, initial, steps: (obs, initial, steps[1:]), "steps must be"),
         (lambda obs, initial, steps: ({}, initial, steps), r"'obs' must be a Tensor, float32 \[1, 2\]; found none"),
-        (lambda obs, initial, steps: ({"obs": obs["obs"][:, :1]}, initial, steps), r"found a Tensor, torch.float32 \[1, 1\]"),
+        (lambda obs, initial, steps: ({"obs": obs["obs"][:, :1]}, initial, steps), r"a Tensor, torch.float32 \[1, 1\]"),
         (lambda obs, initial, steps: ({"obs": obs["obs"].numpy()}, initial, steps), "found a ndarray, float32"),
         (lambda obs, initial, steps: ({"obs": obs["obs"].long()}, initial, steps), "found a Tensor, torch.int64"),
     ],

@@ -10,6 +10,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+from diffusers.schedulers.scheduling_flow_match_euler_discrete import FlowMatchEulerDiscreteScheduler
 from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from diffusers.schedulers.scheduling_pndm import PNDMScheduler
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
@@ -17,6 +18,7 @@ from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepSchedu
 from tests.rounding import amplified, assert_equal_but_for_rounding, bound
 from ttscompile.core.spec import SamplerTable
 from ttscompile.errors import SpecError
+from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table, set_timesteps
 
 BETAS: dict[str, Any] = {"num_train_timesteps": 50, "beta_schedule": "squaredcos_cap_v2"}
@@ -80,7 +82,7 @@ def test_table_gives_what_the_scheduler_gives(
 def test_columns_of_ddpm_are_the_formula() -> None:
     """One row against the closed form of Ho et al., equation (7), by hand."""
     scheduler = DDPMScheduler(**BETAS)
-    table = sampler_table(scheduler, 50, name="ddpm")
+    table = sampler_table(scheduler, 50)
     assert (table.name, table.clip, table.steps) == ("ddpm", 1.0, 50)
     k = 20
     now, before = (float(scheduler.alphas_cumprod[t]) for t in (49 - k, 48 - k))
@@ -101,7 +103,8 @@ def test_columns_of_ddpm_are_the_formula() -> None:
 
 def test_paths_are_told_apart() -> None:
     """DDIM's output reaches the next sample past the clip; DDPM's does not, its sample does."""
-    ddim, ddpm = sampler_table(DDIMScheduler(**BETAS), 10), sampler_table(DDPMScheduler(**BETAS), 10)
+    ddim, ddpm = sampler_table(DDIMScheduler(**BETAS), 10), sampler_table(DDPMScheduler(**BETAS), 10, name="mine")
+    assert (ddim.name, ddpm.name) == ("ddim", "mine")
     assert np.all(ddim.out_to_next[:-1] > 0.01)
     assert np.all(ddim.sample_to_next == 0)
     assert np.all(ddpm.out_to_next == 0)
@@ -192,17 +195,39 @@ def test_bounds_that_differ_are_refused() -> None:
         (DPMSolverMultistepScheduler, {"thresholding": True, "sample_max_value": 1.5}, "makes it a clip"),
         (DPMSolverMultistepScheduler, {"variance_type": "learned"}, "variance_type='learned'"),
         (DPMSolverMultistepScheduler, {"timestep_spacing": "leading", "num_train_timesteps": 10}, "1 different noise"),
-        (UniPCMultistepScheduler, {}, "UniPCMultistepScheduler: its step at timestep"),
+        (
+            UniPCMultistepScheduler,
+            {},
+            r"UniPCMultistepScheduler: no table .* DPMSolverMultistepScheduler.from_config\(",
+        ),
         (EulerDiscreteScheduler, {}, "standard deviation"),
-        (LCMScheduler, {"original_inference_steps": 20}, "LCMScheduler: its step at timestep"),
+        (LCMScheduler, {"original_inference_steps": 20}, "LCMScheduler: no table can be measured"),
         (PNDMScheduler, {}, "19 timesteps for 10 steps"),
-        (Silent, {}, "failed: it gives no prediction of the clean sample"),
+        (Silent, {}, r"failed: it gives no prediction of the clean sample\. Use a DDPM"),
     ],
 )
 def test_other_samplers_are_refused_by_name(scheduler_class: type[Any], settings: dict[str, Any], message: str) -> None:
     """With what they are, not with a stack trace of diffusers."""
     with pytest.raises(SpecError, match=message):
         sampler_table(scheduler_class(**(BETAS | settings)), 10)
+
+
+def test_of_flow_matching_the_schedulers_own_times_make_the_loop() -> None:
+    """The message says so: one loop against the scheduler's, on outputs that are made up."""
+    scheduler = FlowMatchEulerDiscreteScheduler(shift=3.0)
+    named = (
+        r"FlowMatchEulerDiscreteScheduler is .*flow_matching_table\(scheduler.sigmas.tolist\(\), timestep_scale=1000\)"
+    )
+    with pytest.raises(SpecError, match=named):
+        sampler_table(scheduler, 10)
+    scheduler.set_timesteps(10)
+    table = flow_matching_table(scheduler.sigmas.tolist(), timestep_scale=1000)
+    np.testing.assert_allclose(table.timesteps, scheduler.timesteps.numpy(), rtol=bound(4))
+    start, *outs = torch.randn(11, 2, 4, 3, generator=torch.Generator().manual_seed(0))
+    x = start
+    for out, timestep in zip(outs, scheduler.timesteps, strict=True):
+        x = scheduler.step(out, timestep, x).prev_sample
+    assert_equal_but_for_rounding(chain_of_table(table, start, torch.stack(outs), torch.stack(outs)), x, terms=40)
 
 
 @pytest.mark.parametrize(
@@ -244,11 +269,11 @@ MULTISTEP: list[tuple[dict[str, Any], int, int]] = [
 def test_multistep_tables_give_what_the_scheduler_gives(settings: dict[str, Any], steps: int, memories: int) -> None:
     """Whole loops of DPM-Solver++ in float32; what a step remembers of the ones before is in the table's memories."""
     scheduler = DPMSolverMultistepScheduler(**(DPM | settings))
-    table = sampler_table(scheduler, steps, name="dpmsolver++")
+    table = sampler_table(scheduler, steps)
     set_timesteps(scheduler, steps)
     assert table.timesteps.tolist() == scheduler.timesteps.tolist()
     assert (table.memories, table.clip) == (memories, 1.0 if "thresholding" in settings else None)
-    assert table.stochastic == ("algorithm_type" in settings)
+    assert (table.name, table.stochastic) == ("dpmsolver++", "algorithm_type" in settings)
     generator = torch.Generator().manual_seed(4)
     start, outs = torch.randn(2, 4, 3, generator=generator), torch.randn(steps, 2, 4, 3, generator=generator)
     draws = torch.randn(outs.shape, generator=generator)

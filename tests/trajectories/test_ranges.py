@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy.typing as npt
 import pytest
 
 from ttscompile import Affine, ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.core.finding import Level
 from ttscompile.errors import TrajectoryError
 from ttscompile.trajectories import Episode
-from ttscompile.trajectories.fits import check_ranges
+from ttscompile.trajectories.fits import check_ranges, judged, placed
 
 from ..calibration import policies
 
@@ -75,6 +77,26 @@ def test_permuted_columns_are_refused_and_named() -> None:
 def test_most_outside_are_refused(values: np.ndarray, ranged: bool) -> None:
     with pytest.raises(TrajectoryError, match=r"'obs': \d+ of 400 recorded numbers .*unit.*order.*means nothing"):
         check(values, ranged)
+
+
+def test_what_is_said_is_true_of_means_and_deviations_too() -> None:
+    """Of numbers of deviation 1 a third lie beyond -1..1, and they fill several times as much."""
+    spec = PolicySpec(
+        (8, 2),
+        {"obs": ObservationSpec((1, 7), Affine(np.ones(7, np.float32), np.zeros(7, np.float32)))},
+        policies.spec().sampler,
+        ChunkSpec(2, 0, 4, ranged=False),
+    )
+    values = np.random.default_rng(0).normal(size=(200, 1, 7)).astype(np.float32)
+    (fine,), (wrong,) = (
+        [judged(one) for one in placed([Episode("calls[0]", {"obs": each})], spec)] for each in (values, values + 9)
+    )
+    expected = (
+        r"29\.\d% of the numbers lie outside of what .* maps to -1..1; half of the columns fill 2\d\d% of that, or more"
+    )
+    assert fine.level is Level.OK and re.fullmatch(expected, fine.found)
+    assert wrong.level is Level.PROBLEM
+    assert re.search(r"times; columns (\d \(100%\), ){4}\d \(100%\) and 2 more\. Look at their unit", wrong.told)
 
 
 def test_whole_numbers_and_what_is_not_normalised_say_nothing() -> None:

@@ -3,20 +3,19 @@
 It is captured with a batch size that is rare among numbers, and ``batch`` finds the batch.
 """
 
+import inspect
 import logging
 import operator
-import re
-import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+from torch._subclasses import FakeTensor
 from torch.export import _trace, exported_program as decompose
 from torch.export.graph_signature import InputKind, OutputKind
 
@@ -26,10 +25,8 @@ from ..frontends.encoded import sharing_copy
 from ..ir.evaluate import evaluator
 from ..ir.graph import GETITEM, Argument, Enum, Graph, Node, Ref, TensorType
 from .batch import BATCHES, REMEDY, with_batch
+from .causes import KEEPS, ON_VALUES, cause_of, innermost, sentence
 
-_TORCH = PurePath(torch.__file__).parent
-_ADVICE = re.compile(r"\s*\n(?:Caused by: \(|For more information, run with|The error above occurred when calling)")
-"""Where torch.export's messages turn to its own debugging."""
 _RESHAPE = "aten.reshape.default"
 _VIEWS = (torch.ops.aten.view.default, torch.ops.aten._unsafe_view.default)
 _SPLITS = (torch.ops.aten.split.Tensor, torch.ops.aten.split_with_sizes.default)
@@ -56,6 +53,7 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
             or what the module computes for a stream depends on the others, or on how many there are.
     """
     module, (first, second) = sharing_copy(module), BATCHES
+    _require_arguments(module, spec)
     traced = _Converter(*_traced(module, spec, first)).convert()  # what fails here fails with any batch
     with suppress(CaptureError):  # a number of the network may be a multiple of this batch
         return _for_any_batch(module, spec, *traced, first)
@@ -79,17 +77,22 @@ def _require_streams_alike(module: nn.Module, spec: PolicySpec, graph: Graph, we
     It is run with two streams, and with the second alone.
     """
     run, both, made = evaluator(graph, weights), _examples(spec, 2), list[torch.Tensor]()
-    for streams in (1, 2):
+
+    def problem(called: nn.Module, streams: int) -> str:
         inputs = {name: value[2 - streams :] for name, value in both.items()}
         try:
             with torch.no_grad():
-                (found,), expected = run(inputs), module(**_as_arguments(inputs, spec))
-            same = _close(found, expected)
+                (found,), expected = run(inputs), called(**_as_arguments(inputs, spec))
         except Exception as error:  # whatever the user's code raises
-            raise CaptureError(f"the module fails for a batch of {streams}: {error}{REMEDY}") from error
-        if not same:
-            raise CaptureError(f"the module computes for a batch of {streams} something else than for more.{REMEDY}")
+            return f"fails for a batch of {streams}: {sentence(error)}"
         made.append(expected)
+        return "" if _close(found, expected) else f"computes for a batch of {streams} something else than for more."
+
+    called = sharing_copy(module)
+    for streams in (1, 2):
+        if told := problem(called, streams):
+            remedy = REMEDY if problem(sharing_copy(module), streams) else KEEPS  # one that was never called
+            raise CaptureError(f"the module {told}{remedy}")
     if not _close(made[1][1:], made[0]):
         raise CaptureError(f"the module computes for a stream beside another something else than alone.{REMEDY}")
 
@@ -114,17 +117,17 @@ def _traced(
             warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
             # and about recurrent layers, which list their weights anew when they are copied
             warnings.filterwarnings("ignore", message=".*_flat_weights.*", category=UserWarning)
+            # and about what a module keeps of its call, which does harm only where the next call reads it
+            warnings.filterwarnings("ignore", message=".*was assigned during export", category=UserWarning)
             # what torch.export.export and then run_decompositions give, which trace the module and trace it again
             table, _ = decompose._split_decomp_table_to_cia_and_python_decomp(dict(AS_CAT))
             with decompose._override_composite_implicit_decomp(table):
-                return _trace._export(module, (), given, strict=False), examples
+                # of a copy, since the module may keep something of its call
+                return _trace._export(sharing_copy(module), (), given, strict=False), examples
     except Exception as error:  # torch.export raises whatever the user's code or its own machinery raises
-        place = _innermost("".join(traceback.format_tb(error.__traceback__)))
         called = ", ".join(f"{name} {tuple(value.shape)} {value.dtype}" for name, value in examples.items())
         raise CaptureError(
-            f"torch.export could not capture {type(module).__name__}: {type(error).__name__} at {place}:"
-            f" {_ADVICE.split(str(error))[0].strip()}\nIt was called with {called}."
-            " A denoiser must be one step (no sampling loop), without data-dependent control flow, for any batch size."
+            f"torch.export could not capture {type(module).__name__} {cause_of(error, called)}"
         ) from error
     finally:
         torch.backends.mha.set_fastpath_enabled(fastpath)
@@ -154,6 +157,20 @@ def _masks_as_given() -> Iterator[None]:
         yield
     finally:
         layers._detect_is_causal_mask = detect
+
+
+def _require_arguments(module: nn.Module, spec: PolicySpec) -> None:
+    """Raise unless the module has the arguments that it will be called with."""
+    given = [spec.sample_argument, spec.timestep_argument, *spec.arguments.values()]
+    with suppress(ValueError):  # of a forward without a signature; torch.export says what it makes of it
+        try:
+            inspect.signature(module.forward).bind(**dict.fromkeys(given))
+        except TypeError as error:
+            raise CaptureError(
+                f"{type(module).__name__} is called with the arguments {', '.join(given)}: {sentence(error)} The keys"
+                " of PolicySpec.observations are names of arguments, with underscores for dots. Name the other two:"
+                " PolicySpec(sample_argument=..., timestep_argument=...)."
+            ) from error
 
 
 def _as_arguments(inputs: Mapping[str, torch.Tensor], spec: PolicySpec) -> dict[str, torch.Tensor]:
@@ -200,6 +217,8 @@ class _Converter:
                 )
             self.names[fx_node] = target
             constants[target] = self._type(fx_node, fx_node.meta["val"])
+            if isinstance(state[target], FakeTensor):  # which has no values
+                raise CaptureError(f"the module reads what it computed when it was called before.{KEEPS}")
             weights[target] = state[target].detach().cpu().contiguous().numpy()
         self.taken = {*inputs, *constants}
         for fx_node in self.exported.graph.nodes:
@@ -220,6 +239,8 @@ class _Converter:
         value, target = fx_node.meta.get("val"), fx_node.target
         if value is None or isinstance(value, torch.SymInt | torch.SymBool | int | bool):
             return None  # sizes are solved by _size; assertions on them hold by construction
+        if isinstance(value, torch.SymFloat):
+            raise CaptureError(f"%{fx_node.name} ({_source(fx_node)}): {ON_VALUES}")
         source: Any = next(iter(fx_node.args), None)
         whole = source if target is operator.getitem else fx_node
         if whole.target in _SPLITS and len(whole.meta["val"]) == 1:  # one part is what was split
@@ -291,17 +312,7 @@ class _Converter:
 
 
 def _source(fx_node: torch.fx.Node) -> str:
-    return _innermost(fx_node.meta.get("stack_trace") or "")
-
-
-def _innermost(trace: str) -> str:
-    """``file:line in function`` of the innermost frame outside torch; the file's name only, no path of this machine."""
-    frames = re.findall(r'File "([^"]+)", line (\d+), in (\S+)', trace)
-    own = [frame for frame in frames if frame[0] != __file__ and not PurePath(frame[0]).is_relative_to(_TORCH)]
-    if not frames:
-        return "source unknown"
-    path, line, function = (own or frames)[-1]
-    return f"{PurePath(path).name}:{line} in {function}"
+    return innermost(fx_node.meta.get("stack_trace") or "")
 
 
 AS_CAT: Mapping[Any, Callable[[Sequence[Tensor]], Tensor]] = {

@@ -81,7 +81,8 @@ def _shares(table: SamplerTable, step: int) -> tuple[float, float]:
     sample, out = float(table.sample_to_x0[step]), float(table.out_to_x0[step])
     if table.name == "euler" and sample == 1 and 0 < abs(out) <= 1:  # x0 = x + left v; x = (1 - left) x0 + left noise
         return 1 - abs(out), abs(out)
-    if table.name in ("ddpm", "ddim", "dpmsolver++") and sample > 0:
+    # What the output means is added to the sample; DPM-Solver without ++ takes it off, for it means the noise.
+    if table.name in ("ddpm", "ddim", "dpmsolver++") and sample > 0 and table.x0_to_next[step] >= 0:
         if abs(1 + out**2 - sample**2) < TOLERANCE * sample**2:  # the network predicts the noise: x0 = (x - s out) / a
             return 1 / sample, -out / sample
         if abs(sample**2 + out**2 - 1) < TOLERANCE:  # it predicts the velocity: x0 = a x - s out

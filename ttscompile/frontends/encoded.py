@@ -56,6 +56,11 @@ def sharing_copy(module: nn.Module) -> nn.Module:
 
 def own_copy(module: nn.Module, shared: Mapping[int, nn.Parameter] = MappingProxyType({})) -> nn.Module:
     """A copy that shares nothing with a module whose owner may go on to train it, but what ``shared`` has by id."""
+    if not isinstance(module, nn.Module):
+        remedy = "Write a class of it, with the network as an attribute and the call in its forward."
+        raise CaptureError(f"expected an nn.Module; found {type(module).__name__}. {remedy}")
+    if isinstance(module, nn.DataParallel | nn.parallel.DistributedDataParallel):
+        raise CaptureError(f"expected the network itself; found {type(module).__name__} around it. Pass module.module.")
     try:
         return copy.deepcopy(module, dict[int, object](shared))
     except RuntimeError as error:

@@ -22,7 +22,7 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 from ..core.spec import SamplerTable
 from ..errors import CheckpointError, SpecError, TtscompileError
 from ..samplers.flow import METHODS
-from ..samplers.table import sampler_table
+from ..samplers.table import NAMES, sampler_table
 from .families import DIFFUSION_SAMPLERS, SPACINGS, LoadOptions
 from .loops import Loops, loops_of
 from .settings import Settings
@@ -33,10 +33,9 @@ MOST_STEPS = 1000
 """Of a call; in use are 4 to 100. Each is evaluated with diffusers to make the table, which takes some milliseconds."""
 DPM = "dpmsolver++"
 
-_CLASSES: Mapping[str, type[Any]] = dict(
-    zip(DIFFUSION_SAMPLERS, (DDPMScheduler, DDIMScheduler, DPMSolverMultistepScheduler), strict=True)
-)
-_NAMES = {each.__name__: name for name, each in _CLASSES.items()}
+_CLASSES: Mapping[str, type[Any]] = {
+    NAMES[each.__name__]: each for each in (DDPMScheduler, DDIMScheduler, DPMSolverMultistepScheduler)
+}
 _SETTINGS = {name: frozenset(inspect.signature(each).parameters) for name, each in _CLASSES.items()}
 
 
@@ -68,7 +67,7 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     sampler, spacing = options.sampler, options.spacing
     steps = own_steps if options.steps is None else options.steps
     own = _own_class(settings)
-    own_name = _NAMES.get(own)
+    own_name = NAMES.get(own)
     if sampler is not None and sampler not in DIFFUSION_SAMPLERS:
         raise SpecError(
             f"sampler {sampler!r} is none of a policy that was trained with diffusion; expected one of"
@@ -83,7 +82,7 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     name = sampler or own_name
     if name is None:
         raise CheckpointError(
-            f"{where} is {own or 'of no class'}; expected one of {', '.join(_NAMES)}. To run on"
+            f"{where} is {own or 'of no class'}; expected one of {', '.join(NAMES)}. To run on"
             f" its betas with another sampler, ask for sampler={' or '.join(map(repr, DIFFUSION_SAMPLERS))}."
         )
     given = {key: value for key, value in settings.items() if not key.startswith("_")}  # as diffusers does
@@ -116,7 +115,6 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
         return sampler_table(
             scheduler,
             trained if steps is None else steps,
-            name=name,
             step_arguments=_step_arguments(step_arguments or {}, given, own_name, name),
         )
     except TtscompileError:

@@ -29,6 +29,9 @@ from ..core.spec import SamplerTable
 from ..errors import SpecError
 from .flow import deterministic_table
 
+NAMES = {"DDPMScheduler": "ddpm", "DDIMScheduler": "ddim", "DPMSolverMultistepScheduler": "dpmsolver++"}
+"""What a table is called, by the class of its scheduler; any other is called by that."""
+_UNREAD = ("UniPC", "DEIS", "SASolver", "Singlestep", "IPNDM", "LCM", "TCD")
 _SHAPE = (2, 3, 4)  # of a probe; small, with no two sizes equal, so that a broadcast along the wrong axis shows
 _SMALL, _FAR = 2.0**-30, 2.0**30  # inside any clip that is there, and outside of it
 _PERIOD = 4  # steps between pulses; answers to a pulse must have died out by then
@@ -87,13 +90,14 @@ class _Chains:
                 result = self._scheduler.step(outs[k], timestep, given[-1], **own, **self._step_arguments)
                 x0 = self._scheduler.model_outputs[-1] if self.multistep else result.pred_original_sample
                 if x0 is None:
-                    raise TypeError("it gives no prediction of the clean sample.")
+                    raise TypeError("it gives no prediction of the clean sample")
                 meant.append(x0.double())
                 made.append(result.prev_sample.double())
             except Exception as error:
                 raise SpecError(
-                    f"sampler {self.name}: its step at timestep {int(timestep)} failed: {error} Use a DDPM, DDIM or"
-                    f" DPMSolverMultistep scheduler; arguments given to step: {sorted(self._step_arguments)}."
+                    f"sampler {self.name}: its step at timestep {int(timestep)} failed: {str(error).rstrip('.')}. Use a"
+                    " DDPM, DDIM or DPMSolverMultistep scheduler; arguments given to step:"
+                    f" {sorted(self._step_arguments)}."
                 ) from error
             if not (torch.isfinite(meant[-1]).all() and torch.isfinite(made[-1]).all()):
                 raise SpecError(
@@ -218,6 +222,12 @@ def _verify(chains: _Chains, rows: _Rows) -> None:
 def _refuse_known(scheduler: Any) -> None:
     """Refuse by name what probing would refuse by number."""
     name, config = type(scheduler).__name__, scheduler.config
+    if name.startswith("FlowMatch"):
+        loop = "ttscompile.flow_matching_table(scheduler.sigmas.tolist(), timestep_scale=1000)"
+        raise SpecError(f"sampler {name} is of flow matching, whose loop is {loop} after set_timesteps.")
+    if any(part in name for part in _UNREAD):
+        remedy = "Use DPMSolverMultistepScheduler.from_config(scheduler.config), which has the same betas."
+        raise SpecError(f"sampler {name}: no table can be measured of its steps. {remedy}")
     # With a largest value of 1, dynamic thresholding is a plain clip to -1..1.
     if config.get("thresholding") and not (_is_multistep(scheduler) and config.get("sample_max_value") == 1):
         raise SpecError(
@@ -247,7 +257,7 @@ def sampler_table(
     Args:
         scheduler: a diffusers scheduler, configured; ``set_timesteps`` is called on it.
         steps: K, number of denoising steps.
-        name: of the table, for people; the scheduler's class otherwise.
+        name: of the table; that of ``NAMES``, or else the scheduler's class, where it is not given.
         step_arguments: further keyword arguments of ``step`` (``eta`` of DDIM).
 
     Returns:
@@ -290,7 +300,7 @@ def sampler_table(
     shift[0:1, 0] = 1  # the newest memory is what the output meant
     shift[range(1, count), range(3, 2 + count)] = 1
     return SamplerTable(
-        name=name or name_of,
+        name=name or NAMES.get(name_of, name_of),
         timesteps=timesteps.numpy(),
         clip=rows.clip,
         **{column: getattr(rows, column).astype(np.float32) for column in SamplerTable.COLUMNS},

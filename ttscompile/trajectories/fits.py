@@ -85,10 +85,12 @@ def judged(one: Placed) -> Finding:
     usual = float(np.median(filled[filled > 0])) if filled.any() else 1.0
     level = Level.PROBLEM if share > MOST else Level.WARNING if share > one.some or usual < LITTLE else Level.OK
     worst = np.argsort(-outside.mean(0), kind="stable")[: int(outside.any(0).sum())].tolist()
-    columns = ", ".join(f"{n} ({outside[:, n].mean():.0%})" for n in worst[:5]) + ", .." * (len(worst) > 5)
+    columns = ", ".join(f"{n} ({outside[:, n].mean():.0%})" for n in worst[:5])
+    columns += f" and {len(worst) - 5} more" * (len(worst) > 5)
+    beyond = "outside of what the policy's normaliser maps to -1..1"
     told = (
-        f"{outside.sum()} of {outside.size} recorded numbers ({share:.0%}) lie outside of what the policy's normaliser"
-        f" maps to -1..1, by up to {np.abs(one.seen.normalize(one.values)).max():.3g} times; columns {columns}"
+        f"{outside.sum()} of {outside.size} recorded numbers ({share:.0%}) lie {beyond}, by up to"
+        f" {np.abs(one.seen.normalize(one.values)).max():.3g} times; columns {columns}"
     )
     remedy = "Look at their unit (degrees, radians), the order of the columns, and --observation. If these are right,"
     remedy += " the statistics are of another data set, and what the policy answers means nothing."
@@ -96,7 +98,7 @@ def judged(one: Placed) -> Finding:
         told += "; " + ", ".join(f"column {a} is as {b} was" for a, b in exchanged.items())
         level, remedy = Level.PROBLEM, "The columns look permuted: give them in the order of the training data."
     elif share <= one.some:
-        told = f"{share:.1%} of the numbers are outside of the training data's; they fill {usual:.0%} of its range"
+        told = f"{share:.1%} of the numbers lie {beyond}; half of the columns fill {usual:.0%} of that, or more"
     return Finding(PART, f"range of {one.key!r}", told, level, "" if level is Level.OK else remedy)
 
 
