@@ -13,13 +13,22 @@ import pytest
 from click.testing import CliRunner
 
 import ttscompile
+from tests.artifact.folders import contents
 from tests.calibration import policies
 from tests.once import Once
+from tests.plans import store_schedules
 from ttscompile import builder
+from ttscompile.artifact.files import aside
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.calibration.state import FILE as STATE
 from ttscompile.cli import main
-from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.core.lattice import uniform_plan
+from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, TtscompileError
+
+
+def building(target: Path) -> Path:
+    """Where a build of it works."""
+    return aside(target, "building")
 
 
 @pytest.fixture
@@ -29,12 +38,14 @@ def directory(once: Once, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch, directory: Path) -> dict[str, Any]:
-    """What ``convert`` and ``calibrate`` are called with; neither does anything, and an artifact is there."""
+def asked(monkeypatch: pytest.MonkeyPatch, once: Once) -> dict[str, Any]:
+    """What ``convert`` and ``calibrate`` are called with: the one writes an artifact, and the other does nothing."""
     found: dict[str, Any] = {}
 
-    def convert(checkpoint: object, directory: object, **how: Any) -> None:
+    def convert(checkpoint: object, directory: Path, read: Any, **how: Any) -> None:
         found["convert"] = {"checkpoint": checkpoint, "directory": directory, **how}
+        read(policies.spec())
+        shutil.copytree(policies.compiled(once), directory, dirs_exist_ok=True)
 
     def calibrate(directory: object, trajectories: object, **how: Any) -> None:
         found["calibrate"] = {"directory": directory, "trajectories": trajectories, **how}
@@ -45,7 +56,8 @@ def asked(monkeypatch: pytest.MonkeyPatch, directory: Path) -> dict[str, Any]:
 
 
 def test_what_applies_is_learned_and_a_control_loop_is_a_deadline(asked: dict[str, Any], directory: Path) -> None:
-    ttscompile.build("policy.ckpt", directory, ["calls.npz"], control_hz=50, task="push", progress=False)
+    recording = policies.record(directory.parent / "calls.npz")
+    ttscompile.build("policy.ckpt", directory, [recording], control_hz=50, task="push", progress=False)
     assert asked["convert"]["task"] == "push" and asked["convert"]["precision"] == "int8"
     assert asked["convert"]["prediction_horizon"] == "needed"
     assert ("dpmsolver++", 16) in asked["convert"]["loops"]
@@ -59,9 +71,19 @@ def test_what_applies_is_learned_and_a_control_loop_is_a_deadline(asked: dict[st
     assert asked["calibrate"]["latency_ms"] == pytest.approx(expected)
 
 
-def test_two_deadlines_are_refused_before_anything_is_done(asked: dict[str, Any], directory: Path) -> None:
-    with pytest.raises(CalibrationError, match="found latency_ms and control_hz"):
-        ttscompile.build("policy.ckpt", directory, ["calls.npz"], control_hz=50, latency_ms=3)
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"control_hz": 50, "latency_ms": 3}, "found latency_ms and control_hz"),
+        ({"policy_hz": 10}, "policy_hz is of a control loop; found no control_hz"),
+        ({"policy_hz": 10, "latency_ms": 3}, "policy_hz is of a control loop; found no control_hz"),
+    ],
+)
+def test_what_is_no_deadline_is_refused_before_anything_is_done(
+    given: dict[str, Any], told: str, asked: dict[str, Any], directory: Path
+) -> None:
+    with pytest.raises(CalibrationError, match=told):
+        ttscompile.build("policy.ckpt", directory, ["calls.npz"], **given)
     assert not asked
 
 
@@ -70,9 +92,108 @@ def test_a_loop_that_no_call_keeps_up_with_says_what_to_give(
 ) -> None:
     none = SimpleNamespace(feasibility=lambda latency: SimpleNamespace(max_latency=0.0))
     monkeypatch.setattr(builder, "resolve", lambda settings, info, control_hz: none)
-    with pytest.raises(CalibrationFailedError, match="control loop of 50 Hz: .* --policy-hz"):
-        ttscompile.build("policy.ckpt", directory, ["calls.npz"], control_hz=50)
-    assert "calibrate" not in asked
+    recording, before = policies.record(directory.parent / "calls.npz"), contents(directory)
+    with pytest.raises(CalibrationFailedError, match="control loop of 50 Hz: .* --policy-hz.$"):
+        ttscompile.build("policy.ckpt", directory, [recording], control_hz=50)
+    assert "calibrate" not in asked and contents(directory) == before
+
+
+@pytest.fixture
+def calibrated(directory: Path) -> Path:
+    """The artifact with a plan."""
+    store_schedules(directory, None, {"schedule": uniform_plan(10, 6, 2)}, "schedule", {"seed": 1})
+    return directory
+
+
+@pytest.mark.parametrize("episodes", [0, 1])
+def test_recordings_that_do_not_fit_end_a_build_before_it_compiles(
+    episodes: int, asked: dict[str, Any], calibrated: Path
+) -> None:
+    """They are of another size, or of one episode."""
+    recording, before = policies.record(calibrated.parent / "calls.npz", episodes or 6), contents(calibrated)
+    if not episodes:
+        np.savez(recording, obs=np.zeros((4, 2, 9), np.float32), episode_ends=[2, 4])
+    with pytest.raises(TtscompileError, match="expected at least two" if episodes else "has shape"):
+        ttscompile.build("policy.ckpt", calibrated, [recording])
+    assert not asked["convert"]["directory"].exists() and "calibrate" not in asked
+    assert contents(calibrated) == before
+    assert sorted(path.name for path in calibrated.parent.iterdir()) == ["calls.npz", "compiled"]
+
+
+def test_what_was_built_is_not_lost_where_it_cannot_be_put(
+    asked: dict[str, Any], calibrated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody leaves notes in the artifact meanwhile."""
+    recording = policies.record(calibrated.parent / "calls.npz")
+
+    def calibrate(made: Path, *_: Any, **__: Any) -> None:
+        store_schedules(made, None, {"fast": uniform_plan(10, 6, 2)}, "fast", {"seed": 2})
+        (calibrated / "notes.txt").write_text("mine")
+
+    monkeypatch.setattr(builder, "calibrate", calibrate)
+    with pytest.raises(ArtifactError, match=r"notes\.txt.* What was done is in"):
+        ttscompile.build("policy.ckpt", calibrated, [recording])
+    assert (calibrated / "notes.txt").read_text() == "mine"
+    assert "schedule" in read_manifest(calibrated).plans
+    assert load_artifact(building(calibrated) / "artifact").manifest.default_plan == "fast"
+
+
+@pytest.mark.parametrize(
+    ("error", "exists", "saved"),
+    [
+        (KeyboardInterrupt, True, True),
+        (KeyboardInterrupt, False, False),
+        (CalibrationFailedError, True, False),
+        (CalibrationFailedError, False, True),
+    ],
+)
+def test_a_build_that_does_not_succeed_changes_nothing_and_can_be_resumed(
+    error: type[BaseException],
+    exists: bool,
+    saved: bool,
+    asked: dict[str, Any],
+    calibrated: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    target = calibrated if exists else calibrated.parent / "new"
+    recording, before = policies.record(calibrated.parent / "calls.npz"), contents(calibrated)
+    found: list[bool] = []
+
+    def calibrate(made: Path, *_: Any, **__: Any) -> None:
+        found.append((made / STATE).exists())
+        if len(found) == 1:
+            if saved:
+                (made / STATE).touch()
+            raise error("nothing is near enough.")
+        (made / STATE).unlink(missing_ok=True)
+        store_schedules(made, None, {"fast": uniform_plan(10, 6, 2)}, "fast", {"seed": 2})
+
+    monkeypatch.setattr(builder, "calibrate", calibrate)
+    with pytest.raises(error) as caught:
+        ttscompile.build("policy.ckpt", target, [recording])
+    assert contents(calibrated) == before and (exists or not target.exists())
+    assert building(target).exists() == saved
+    if error is CalibrationFailedError:
+        assert (str(building(target)) in str(caught.value)) == saved
+    ttscompile.build("policy.ckpt", target, [recording], resume=True)
+    assert found == [False, saved]
+    assert set(load_artifact(target).plans) == {"dense", "fast"}
+    assert not building(target).exists()
+
+
+def test_two_builds_in_one_place_are_one_too_many(
+    asked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = policies.record(tmp_path / "calls.npz")
+
+    def calibrate(made: Path, *_: Any, **__: Any) -> None:
+        with pytest.raises(ArtifactError, match="another process is changing the artifact"):
+            ttscompile.build("policy.ckpt", tmp_path / "new", [recording])
+        assert made.exists()
+
+    monkeypatch.setattr(builder, "calibrate", calibrate)
+    ttscompile.build("policy.ckpt", tmp_path / "new", [recording])
+    assert (tmp_path / "new").exists()
 
 
 def test_every_option_of_the_command_reaches_the_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -96,6 +217,12 @@ def test_every_option_of_the_command_reaches_the_call(monkeypatch: pytest.Monkey
     options = {one.name for one in main.commands["build"].params if isinstance(one, click.Option)}
     taken = {"trajectories", "directory", "sources", "error", "minutes", "as_json"}
     assert options - taken <= set(found)
+
+
+def test_a_rate_of_training_without_a_control_loop_is_bad_usage(tmp_path: Path) -> None:
+    words = ["build", str(tmp_path), "-o", str(tmp_path / "out"), "--policy-hz", "10", "--latency-ms", "8"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2 and "--policy-hz is for --control-hz: give it too." in result.stderr
 
 
 @pytest.mark.slow
@@ -122,19 +249,15 @@ def test_a_checkpoint_becomes_a_policy(one_layer_checkpoint: Path, tmp_path: Pat
 def test_a_build_of_another_checkpoint_is_not_resumed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, directory: Path
 ) -> None:
-    def converting(seed: int) -> None:
-        def convert(_: object, path: Path, **how: Any) -> None:
-            ttscompile.compile_denoiser(policies.Mixer(seed).eval(), policies.spec(), path)
+    def convert(_: object, path: Path, **how: Any) -> None:
+        ttscompile.compile_denoiser(policies.Mixer(1).eval(), policies.spec(), path)
 
-        monkeypatch.setattr(builder, "convert", convert)
-
+    kept = building(tmp_path / "new") / "artifact"
+    shutil.copytree(directory, kept)
     before = read_manifest(directory).model_identity
-    (directory / STATE).touch()
-    monkeypatch.setattr(builder, "calibrate", lambda *_, **__: None)
-    converting(seed=0)
-    ttscompile.build("policy.ckpt", directory, ["calls.npz"], resume=True)
-    converting(seed=1)
+    (kept / STATE).touch()
+    monkeypatch.setattr(builder, "convert", convert)
     with pytest.raises(CalibrationError, match="found another model. Leave --resume out"):
-        ttscompile.build("other.ckpt", directory, ["calls.npz"], resume=True)
-    assert read_manifest(directory).model_identity == before
-    assert [path.name for path in tmp_path.iterdir()] == ["compiled"], "nothing is left beside it"
+        ttscompile.build("other.ckpt", tmp_path / "new", ["calls.npz"], resume=True)
+    assert read_manifest(kept).model_identity == before
+    assert [path.name for path in kept.parent.iterdir()] == ["artifact"], "nothing is left beside it"

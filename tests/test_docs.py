@@ -135,6 +135,7 @@ def elsewhere(command: Any) -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*learned plan:UserWarning")  # pages convert into the artifact that is there
 @pytest.mark.parametrize("page", FOLLOWED, ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_page_can_be_followed(page: Path, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: Any) -> None:
     if page == TUTORIAL:  # makes everything itself, from the policy of the example

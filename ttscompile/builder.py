@@ -1,19 +1,23 @@
 """From a checkpoint to the fastest policy that is safe, as one call: convert, learn, choose."""
 
 import os
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
+from .artifact.files import aside, writing
 from .artifact.load import load_artifact, read_manifest
+from .artifact.write import learned_plans, locked, replacing
 from .calibration.budget import SPARSITY, Goal
+from .calibration.calls import load_episodes
 from .calibration.pipeline import CalibrationResult, calibrate
 from .calibration.proposer import LOOPS, Request, rows_of
 from .calibration.state import FILE as STATE
-from .core.spec import INT8
+from .core.spec import INT8, PolicySpec
 from .driver import Explain, convert
-from .errors import CalibrationError, CalibrationFailedError
+from .errors import ArtifactError, CalibrationError, CalibrationFailedError
 from .frontends.data_set import recordings_of
 from .runtimes.executor import ExecutorSettings
 from .runtimes.executor.settings import resolve
@@ -54,6 +58,8 @@ def build(
     image encoders. All are judged on held-out episodes against the original, and timed on this machine. If
     other plans take at most a fifth longer than the fastest, the nearest of them is chosen.
 
+    All is done in a folder beside ``directory``. It stays until the next build where there is a state to go on from.
+
     Args:
         checkpoint, directory, explain: see ``convert``.
         trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on,
@@ -75,36 +81,68 @@ def build(
         What was tried and chosen.
 
     Raises:
-        CalibrationFailedError: no plan is near enough, or none of these keeps up; says how far the nearest is. The
-            artifact computes everything.
-        TtscompileError: as ``convert`` and ``calibrate``.
+        CalibrationFailedError: no plan is near enough, or none of these keeps up; says how far the nearest is.
+        TtscompileError: as ``convert`` and ``calibrate``. After any error ``directory`` is as it was.
     """
     if latency_ms is not None and control_hz is not None:
         raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
+    if policy_hz is not None and control_hz is None:
+        raise CalibrationError("policy_hz is of a control loop; found no control_hz. Give it too.")
+
+    def read(spec: PolicySpec) -> None:
+        if given and spec.instruction is None:  # else the artifact's tokenizer is needed
+            load_episodes(spec, given, observation)
+
+    given = tuple(trajectories)
     if not trajectories:
         trajectories = (recordings_of(checkpoint),)
         explain("recordings", (f"no recordings were given: {trajectories[0]}, which the policy was trained on",))
-    how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, **of_checkpoint}
-    _converted(checkpoint, Path(directory), resume, explain, how)
-    if control_hz is not None:
-        latency_ms = _deadline(Path(directory), control_hz, policy_hz)
-    artifact = load_artifact(Path(directory))
-    request = Request(Goal(SPARSITY, 0.5))
-    learn = [row.name for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]
-    return calibrate(
-        directory,
-        trajectories,
-        learn=learn,
-        latency_ms=latency_ms,
-        max_distance=max_distance,
-        threads=threads,
-        max_minutes=max_minutes,
-        seed=seed,
-        resume=resume,
-        observation=observation,
-        progress=progress,
-        ray=ray,
-    )
+    how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, "read": read}
+    how |= of_checkpoint
+    target = Path(os.path.realpath(directory))
+    with replacing(target) as put, _beside(target) as made:
+        _converted(checkpoint, made, resume, explain, how)
+        if control_hz is not None:
+            latency_ms = _deadline(made, control_hz, policy_hz)
+        artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))
+        rows = [row for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]
+        result = calibrate(
+            made,
+            trajectories,
+            learn=[row.name for row in rows],
+            latency_ms=latency_ms,
+            max_distance=max_distance,
+            threads=threads,
+            max_minutes=max_minutes,
+            seed=seed,
+            resume=resume,
+            observation=observation,
+            progress=progress,
+            ray=ray,
+        )
+        put(made)
+    return result
+
+
+@contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    """Where one process alone makes an artifact; gone afterwards, unless that is unfinished, or cannot be moved."""
+    made = (folder := aside(target, "building")) / "artifact"
+    with writing(target):
+        folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        try:
+            yield made
+        except (ArtifactError, CalibrationFailedError) as error:
+            kept = f" What was done is in {made}, for --resume or as it is." if _of_worth(made) else ""
+            raise type(error)(f"{error}{kept}") from error
+        finally:
+            if not _of_worth(made):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _of_worth(made: Path) -> bool:
+    return (made / STATE).is_file() or bool(learned_plans(made))
 
 
 def _converted(
@@ -114,10 +152,10 @@ def _converted(
     if not (resume and (directory / STATE).is_file()):
         convert(checkpoint, directory, explain=explain, **how)
         return
-    with TemporaryDirectory(dir=directory.parent, prefix=f".{directory.name}.") as folder:
-        again = Path(folder) / "again"
-        convert(checkpoint, again, explain=explain, **how)
-        found, expected = (read_manifest(each).model_identity for each in (directory, again))
+    again = directory.with_name("again")
+    convert(checkpoint, again, explain=explain, **how)
+    found, expected = (read_manifest(each).model_identity for each in (directory, again))
+    shutil.rmtree(again, ignore_errors=True)
     if found != expected:
         raise CalibrationError(
             f"{directory}: expected the interrupted build of {os.fspath(checkpoint)}; found another model. Leave"

@@ -80,6 +80,7 @@ def convert(
     keep_fp32: Collection[str] = (),
     single_file: str | os.PathLike[str] | None = None,
     explain: Explain = lambda stage, notes: None,
+    read: Callable[[PolicySpec], None] = lambda spec: None,
 ) -> Program:
     """Compile a trained policy and write the artifact; its plan is dense until it is calibrated.
 
@@ -112,6 +113,7 @@ def convert(
             is of the loop that is asked for, or else of the policy's own. ``ttscompile.lower.single_file`` describes
             its inputs and outputs.
         explain: told what each stage did.
+        read: told what was read, before minutes of work; an error of it ends them.
 
     Raises:
         TtscompileError: the checkpoint is refused, its network cannot be compiled, or the artifact cannot be written.
@@ -131,6 +133,7 @@ def convert(
             origin["base_licence"] = fetched.licence
     options = LoadOptions(sampler, steps, spacing, task, encoders, without_cameras, tuple(loops) or None, base)
     module, spec = load_checkpoint_policy(checkpoint, format, options)
+    read(spec)
     for one in examine(Path(checkpoint), spec, encoders):
         if one.remedy:
             warnings.warn(one.told, stacklevel=2)

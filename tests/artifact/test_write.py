@@ -1,5 +1,7 @@
 import os
+import shutil
 import tomllib
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +12,11 @@ import pytest
 
 from tests.artifact.folders import contents, failing
 from tests.artifact.tiny import STEPS, tiny_models, tiny_program, write_tiny
-from ttscompile.artifact import Artifact, load_artifact
-from ttscompile.artifact.write import write_artifact
+from tests.plans import store_schedules
+from ttscompile.artifact import Artifact, load_artifact, write
+from ttscompile.artifact.write import locked, write_artifact
 from ttscompile.core.correction import condition_flops
+from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError, PassError
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node, TensorType
@@ -222,6 +226,49 @@ def test_an_empty_directory_is_taken(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     write_tiny(tmp_path / "empty")
     load_artifact(tmp_path / "empty")
+
+
+def test_who_works_in_the_folder_works_in_the_new_one(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(written)
+    manifest = write_tiny(Path(), tiny_program(seed=1))
+    assert load_artifact(Path()).manifest.identity == manifest.identity
+    assert Path.cwd() == written and contents(Path()) == contents(written)
+
+
+def test_plans_that_are_lost_are_told_of(written: Path) -> None:
+    kept = {"schedule": uniform_plan(3, 2, 1), "uniform": uniform_plan(3, 2, 1)}
+    store_schedules(written, None, kept, "schedule", {"seed": 1})
+    with pytest.warns(UserWarning, match=r"had 2 learned plans \(schedule, uniform\); the new one has none"):
+        write_tiny(written)
+    write_tiny(written)  # of what was not calibrated there is nothing to tell
+
+
+@pytest.mark.parametrize("case", ["an artifact that is changed", "an artifact", "notes", "notes in the artifact"])
+def test_what_comes_while_an_artifact_is_written(written: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    """Nobody had locked the place, since there was nothing; and who has an artifact locked may put more into it."""
+    target = written if case == "notes in the artifact" else written.parent / "new"
+
+    def fill(*arguments: Any) -> Any:
+        if case.startswith("an artifact"):
+            shutil.copytree(written, target)
+        else:
+            target.mkdir(exist_ok=True)
+            (target / "notes.txt").write_text("mine")
+        if case == "an artifact that is changed":
+            held.enter_context(locked(target))
+        return own(*arguments)
+
+    own, program = write._fill, tiny_program(seed=1)
+    monkeypatch.setattr(write, "_fill", fill)
+    with ExitStack() as held:
+        if case == "an artifact":
+            write_artifact(program, tiny_models(program), target)
+            assert contents(target) != contents(written)
+            return
+        with pytest.raises(ArtifactError, match="is changing the artifact" if "changed" in case else r"notes\.txt"):
+            write_artifact(program, tiny_models(program), target)
+    assert contents(target).keys() - contents(written).keys() <= {"notes.txt"}
+    assert [path.name for path in written.parent.iterdir() if path.name.startswith(".")] == []
 
 
 @pytest.mark.parametrize("case", ["file", "notes", "notes in an artifact", "subfolder", "other manifest"])

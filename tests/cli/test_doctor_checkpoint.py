@@ -13,7 +13,9 @@ from click.testing import CliRunner
 import ttscompile
 from tests.policies.lerobot_tiny import DS, save_policy
 from ttscompile import driver
+from ttscompile.artifact.load import load_artifact
 from ttscompile.cli import main
+from ttscompile.core.finding import Level
 from ttscompile.doctor.target import target_findings
 
 
@@ -33,7 +35,7 @@ def recorded(path: Path, state: np.ndarray) -> Path:
 
 
 def test_a_checkpoint_and_its_recordings_as_json_and_as_text(checkpoint: Path, tmp_path: Path) -> None:
-    bad = recorded(tmp_path / "bad.npz", np.full((20, DS), 1e4, np.float32))
+    bad = recorded(tmp_path / "bad.npz", np.linspace(1e4, 2e4, 20 * DS, dtype=np.float32).reshape(20, DS))
     words = ["doctor", str(checkpoint), "-t", str(bad)]
     result = CliRunner().invoke(main, [*words, "--json"], catch_exceptions=False)
     told = json.loads(result.stdout)
@@ -49,6 +51,17 @@ def test_recordings_are_held_against_an_artifact_too(toy_compiled: Path, tmp_pat
     np.savez(tmp_path / "other.npz", pose=np.zeros((4, 2), np.float32), episode_ends=np.array([2, 4]))
     found = {one.what: one for one in target_findings(toy_compiled, [tmp_path / "other.npz"])}
     assert "call" in found and "lacks " in found["other.npz"].found
+
+
+def test_one_episode_is_too_few_to_calibrate_with(toy_compiled: Path, tmp_path: Path) -> None:
+    shape = load_artifact(toy_compiled).manifest.spec.observations["obs"].shape
+    for episodes in (1, 2):
+        ends = 3 * np.arange(1, episodes + 1)
+        obs = np.arange(ends[-1] * np.prod(shape)).reshape(-1, *shape)
+        np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=ends)
+        found = {one.what: one for one in target_findings(toy_compiled, [tmp_path / "calls.npz"])}
+        assert found["calls"].found == f"{3 * episodes} in {episodes} episodes"
+        assert (found["calls"].level is Level.PROBLEM) == (episodes == 1)
 
 
 def test_what_is_no_policy_is_a_problem_with_the_message_of_convert(tmp_path: Path) -> None:

@@ -45,7 +45,10 @@ NEEDED: dict[str, list[tuple[str, ...]]] = {
         ("A", "--calls", "1", "--trajectories", "calls.npz"),
         ("A", "--calls", "1", "--checkpoint", "policy.ckpt"),
     ],
-    "build": [("policy.ckpt", "-t", "calls.npz", "-o", "out")],
+    "build": [
+        ("policy.ckpt", "-t", "calls.npz", "-o", "out"),
+        ("policy.ckpt", "-t", "calls.npz", "-o", "out", "--control-hz", "1"),
+    ],
     "calibrate": [("A", "-t", "calls.npz", "--max-minutes", "0.001")],
     "convert": [("policy.ckpt", "-o", "out")],
     "doctor": [("A",)],

@@ -8,10 +8,17 @@ import pytest
 import ttscompile
 from ttscompile.artifact.golden import load_golden
 from ttscompile.artifact.load import load_artifact
+from ttscompile.verification import reuse
 from ttscompile.verification.reuse import ROUNDING, allowed, check_engaged
-from ttscompile.verification.rung import FAILED, PASSED, Rung
+from ttscompile.verification.rung import FAILED, PASSED, SKIPPED, Rung
 
 from .timed import Timed
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever else this machine does."""
+    monkeypatch.setattr(reuse, "busy", lambda: None)
 
 
 def judged(
@@ -52,6 +59,16 @@ def test_a_plan_as_slow_as_a_dense_call_is_inert(sound: Path, schedule: float) -
 def test_so_is_one_on_a_machine_that_is_busy_now_and_then(sound: Path) -> None:
     """Rounds do not go on until the plan was once the faster."""
     assert judged(sound, 0.001, dense=0.001, busy=0.3)[0].status == FAILED
+
+
+def test_where_other_programs_run_time_alone_is_no_fault(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = "other programs keep this machine busy (load 4.5 on 2 cores)"
+    monkeypatch.setattr(reuse, "busy", lambda: f"{told}. Measure again.")
+    rung, _ = judged(sound, 1.0)
+    assert (rung.status, rung.remedy) == (SKIPPED, "Measure again.")
+    assert "saves no time" in rung.told and rung.told.endswith(f"; but {told}")
+    assert judged(sound, 1.0, name="uniform", default="uniform")[0].status == FAILED, "another fault"
+    assert judged(sound, 0.25)[0].status == PASSED
 
 
 def test_a_faster_plan_passes_and_every_figure_is_of_the_same_medians(sound: Path) -> None:

@@ -11,7 +11,7 @@ import shutil
 import stat
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
@@ -131,26 +131,38 @@ def sync_directory(path: Path) -> None:
         os.close(descriptor)
 
 
+@contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Within the block an error of the system is one of writing an artifact, whose place nothing has taken."""
+    try:
+        yield
+    except OSError as error:
+        raise ArtifactError(
+            f"{target}: the artifact cannot be written: {error}. What was there is unharmed."
+        ) from error
+
+
 def replace_folder(partial: Path, target: Path) -> None:
     """Put a finished folder in the place of another, which is removed: at every moment one of the two stands there.
 
     Linux exchanges two names at once. Where the file system cannot (NFS and some others), the old folder is renamed
     first; a crash between the two renames then leaves it beside ``target`` under a name that ends with ``.replaced``,
-    from where ``new_folder`` puts it back.
+    from where ``recover`` puts it back. A process that works in the old folder works in the new one afterwards.
     """
+    old, inside = partial, target.exists() and target.samefile(os.curdir)
     if not target.exists():
         partial.replace(target)
-    elif exchange(partial, target):
-        shutil.rmtree(partial, ignore_errors=True)
-    else:
-        old = _replaced(target)
+    elif not exchange(partial, target):
+        old = aside(target, "replaced")
         target.replace(old)
         try:
             partial.replace(target)
         except BaseException:
             old.replace(target)
             raise
-        shutil.rmtree(old, ignore_errors=True)
+    if inside:
+        os.chdir(target)
+    shutil.rmtree(old, ignore_errors=True)
     sync_directory(target.parent)
 
 
@@ -185,6 +197,22 @@ def lock_folder(path: Path) -> Iterator[None]:
 
 
 @contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too."""
+    with ExitStack() as held:
+        try:
+            held.enter_context(lock_folder(directory))
+        except BlockingIOError:
+            raise ArtifactError(
+                f"{directory}: another process is changing the artifact: it calibrates it, or converts a checkpoint to"
+                " this directory. Try again when it is done."
+            ) from None
+        except OSError as error:  # no permission; a file system without locks
+            raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error
+        yield
+
+
+@contextmanager
 def new_folder(target: Path) -> Iterator[Path]:
     """An empty folder beside ``target`` for what will take its place; gone after the block, if it is still there.
 
@@ -205,14 +233,15 @@ def new_folder(target: Path) -> Iterator[Path]:
 
 def recover(target: Path) -> None:
     """Put a folder back that a crash left renamed and not replaced; see ``replace_folder``."""
-    old = _replaced(target)
+    old = aside(target, "replaced")
     if old.is_dir() and not target.exists():
         old.replace(target)
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _replaced(target: Path) -> Path:
-    return target.with_name(f".{_short(target.name)}.replaced")
+def aside(target: Path, ending: str) -> Path:
+    """A hidden name in the same folder, always the same."""
+    return target.with_name(f".{_short(target.name)}.{ending}")
 
 
 HELD = "/proc/self/fd"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -23,6 +24,7 @@ from ..measure.versions import VERSION
 from . import files, records, stores, tensors
 from .bind import LoweredPieces, Place, bind, places_of, read_in_fp32, store_pieces
 from .codec import decode, encode, identities
+from .files import locked as locked
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import Artifact, load_artifact, read_manifest, require_artifact_path, table_prefix
@@ -63,12 +65,11 @@ def write_artifact(
     Its default plan is ``dense``, or where another loop or precision is asked for ``full``, which computes every cell
     of that loop in that precision; until it is calibrated.
 
-    Everything is written to a folder beside ``directory``, which then takes its place.
-
     Args:
         program: after all passes.
         models: from ``lower_program``.
-        directory: where it goes; its parents are made. An artifact that is there is replaced.
+        directory: where it goes; its parents are made. Everything is written to a folder beside it, which then takes
+            the place of an artifact that is there.
         lowered: pieces of another precision, which plan ``full`` takes; None for fp32 alone.
         golden: what the original network answered; None leaves the artifact without, which then cannot be verified.
         beside: files for other programs, by name, one of ``BESIDE``.
@@ -81,22 +82,46 @@ def write_artifact(
         PassError: the program's parts do not fit each other (``ir.verify``).
     """
     target = Path(os.path.realpath(directory))
-    require_replaceable(target)
-    try:
+    with replacing(target) as put, files.writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        files.recover(target)
-        with locked(target) if target.is_dir() else nullcontext(), files.new_folder(target) as partial:
+        with files.new_folder(target) as partial:
             manifest = _fill(partial, program, models, lowered, golden, loop, tokenizer)
             for name, content in (beside or {}).items():
                 assert name in BESIDE
                 files.write_synced(partial / name, content)
             files.sync_directory(partial)
-            files.replace_folder(partial, target)
-    except OSError as error:
-        raise ArtifactError(
-            f"{target}: the artifact cannot be written: {error}. What was there is unharmed."
-        ) from error
+            learned = learned_plans(target)
+            put(partial)
+    if learned:
+        told = f"had {len(learned)} learned plan{'s' * (len(learned) > 1)} ({', '.join(learned)}); the new one has none"
+        warnings.warn(f"{target}: the artifact there {told}: calibrate it again.", stacklevel=2)
     return manifest
+
+
+@contextmanager
+def replacing(target: Path) -> Iterator[Callable[[Path], None]]:
+    """Keep others from an artifact, if there is one, until it is replaced by the folder that is given."""
+    require_replaceable(target)
+    with files.writing(target):
+        files.recover(target)
+    with ExitStack() as held:
+        held.enter_context(locked(target) if target.is_dir() else nullcontext())
+
+        def put(folder: Path) -> None:
+            held.close()  # what is there by now may be another folder, and somebody's
+            require_replaceable(target)
+            with files.writing(target), locked(target) if target.is_dir() else nullcontext():
+                files.replace_folder(folder, target)
+
+        yield put
+
+
+def learned_plans(directory: Path) -> list[str]:
+    """Names of the plans of an artifact that a calibration made; none where nothing can be read."""
+    with suppress(OSError, ArtifactError):
+        found = read_manifest(directory)
+        return [name for name in found.plans if found.calibration is not None and name != FULL]
+    return []
 
 
 def update_plans(
@@ -359,26 +384,6 @@ def require_replaceable(directory: str | os.PathLike[str]) -> None:
         )
     with locked(target):  # told now, not after minutes of work
         pass
-
-
-@contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
-
-    Raises:
-        ArtifactError: somebody else is at it; or it cannot be locked.
-    """
-    with ExitStack() as held:
-        try:
-            held.enter_context(files.lock_folder(directory))
-        except BlockingIOError:
-            raise ArtifactError(
-                f"{directory}: another process is changing the artifact: it calibrates it, or converts a checkpoint to"
-                " this directory. Try again when it is done."
-            ) from None
-        except OSError as error:  # no permission; a file system without locks
-            raise ArtifactError(f"{directory}: cannot be locked, and was not changed: {error}.") from error
-        yield
 
 
 def _remove_stale(directory: Path) -> None:

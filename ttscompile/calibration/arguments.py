@@ -13,6 +13,7 @@ from ..artifact.manifest import Manifest
 from ..core.correction import FEATURES, may_jump
 from ..errors import CalibrationError
 from ..ir.program import Binding
+from .strategies import DEFAULT
 
 EVALUATIONS_A_MINUTE = 6400
 """Of the network, to make the calls to learn from, for each minute of the time limit; ``Trials`` may have more."""
@@ -56,10 +57,12 @@ def require_limits(validation_fraction: float, max_minutes: float) -> None:
         )
 
 
-def require_alone(learn: Sequence[str], *budgets: float | None) -> None:
+def require_alone(learn: Sequence[str], strategy: str, *budgets: float | None) -> None:
     """Raise where loops are learned, and something that they cannot keep is asked for."""
     if "schedule" in learn:
         raise CalibrationError("learn: expected a schedule or loops; found both. Leave one of them out.")
+    if strategy != DEFAULT:
+        raise CalibrationError(f"learn: loops need the strategy {DEFAULT!r}; found {strategy!r}. Leave it out.")
     if any(one is not None for one in budgets):
         raise CalibrationError(
             "learn: loops are chosen by their distance from the original and by their time; found a budget in cells."

@@ -13,6 +13,7 @@ from ttscompile.cli.output import only_results_on_stdout, print_json, progress, 
 from ttscompile.cli.sections import (
     LEROBOT,
     Recordings,
+    Section,
     SectionedCommand,
     Sources,
     require_recordings,
@@ -25,8 +26,10 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import GIVE
 from ttscompile.report.summary import document
 
+SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz"), ("control_hz",)), LEROBOT)
 
-@click.command(cls=SectionedCommand, sections=(LEROBOT,))
+
+@click.command(cls=SectionedCommand, sections=SECTIONS)
 @click.argument("checkpoint", type=PATH_OR_HUB)
 @trajectories_options(
     required=False,

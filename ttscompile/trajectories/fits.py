@@ -147,7 +147,9 @@ def examine_recordings(
         except TrajectoryError as error:
             return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
     found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in warned]
-    found.append(Finding(PART, "calls", f"{sum(each.calls for each in episodes)} in {len(episodes)} episodes"))
+    alone, told = len(episodes) < 2, f"{sum(each.calls for each in episodes)} in {len(episodes)} episodes"
+    remedy = "'calibrate' needs two: plans are judged on others than those that it learns from. Record sixteen."
+    found.append(Finding.judged(PART, "calls", told, alone, remedy, Level.PROBLEM))
     return [*found, *map(judged, placed(episodes, spec))]
 
 

@@ -19,6 +19,7 @@ from ..artifact.manifest import PlanRecord
 from ..core.lattice import sparsity
 from ..core.plan import DENSE, FULL, UNIFORM
 from ..core.spec import Noise, PolicySpec
+from ..measure.machine import busy
 from ..measure.points import pairs, rooted
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
@@ -187,7 +188,7 @@ def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> flo
     return None if found is None else float(found)
 
 
-ENGAGED = "engaged"
+ENGAGED, NO_TIME = "engaged", "saves no time"
 
 FEWEST_ROUNDS, MOST_ROUNDS = 3, 15
 """Rounds in which each plan, and a dense call, is timed once. How many there are is settled before the first of them:
@@ -238,7 +239,10 @@ class Engagement:
 def check_engaged(
     artifact: Artifact, golden: Golden, policy: CompiledPolicy, clock: Callable[[], float] = perf_counter
 ) -> Rung:
-    """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails."""
+    """Planned against executed cells, FLOPs and time of every plan; one that saves nothing fails.
+
+    Where time alone is at fault, and other programs keep the machine busy, it is skipped.
+    """
     manifest = artifact.manifest
     if manifest.plans.keys() <= {FULL} or manifest.steps == 1:
         return Rung(ENGAGED, SKIPPED, uncalibrated(manifest))
@@ -253,6 +257,9 @@ def check_engaged(
     faults = [f"plan {name!r} {fault}" for name, fault in judged.items() if fault]
     name = manifest.default_plan if manifest.default_plan in found else next(iter(found))
     figure = (found[name].executed, None, "of the cells")
+    if faults and all(NO_TIME in fault for fault in faults) and (warning := busy()) is not None:
+        told, _, remedy = warning.rpartition(". ")
+        return Rung(ENGAGED, SKIPPED, f"{'; '.join(faults)}; but {told}", *figure, remedy, details=details)
     if faults:
         remedy = "The plan is inert on this machine: calibrate again, and look at 'ttscompile inspect DIR -o plan.png'."
         return Rung(ENGAGED, FAILED, "; ".join(faults), *figure, remedy, details=details)
@@ -325,7 +332,7 @@ def _fault(plan: PlanRecord, one: Engagement, cells: int) -> str:
         return f"reuses {shown} and saves no FLOPs"
     if not one.time_saved >= LEAST_SAVED:
         return (
-            f"reuses {shown} and saves no time: {one.ms:.4g} ms a call, dense {one.dense_ms:.4g} ms, which is"
+            f"reuses {shown} and {NO_TIME}: {one.ms:.4g} ms a call, dense {one.dense_ms:.4g} ms, which is"
             f" {one.time_saved:.1%} saved and has to be {LEAST_SAVED:.0%}"
         )
     return ""
