@@ -21,6 +21,7 @@ from ttscompile import SamplerTable
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.compare import _require_same_policy, compare
+from ttscompile.calibration.pipeline import calibrate
 from ttscompile.cli import main
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import TokenReuse
@@ -76,6 +77,20 @@ def test_it_says_where_plans_may_have_been_learned_from_these_episodes(planned: 
     assert frontier.warnings[0].startswith(
         "this artifact: its calibration held out the episodes [0, 1], and this comparison"
     )
+
+
+def test_episodes_of_the_same_numbers_are_not_the_same_episodes(
+    compiled: Path, recording: Path, tmp_path: Path
+) -> None:
+    with np.load(recording) as given:
+        arrays = dict(given)
+    turned = {key: array if key == "episode_ends" else array[::-1] for key, array in arrays.items()}
+    np.savez(tmp_path / "turned.npz", **turned)
+    directory = Path(shutil.copytree(compiled, tmp_path / "own"))
+    calibrate(directory, [recording], 0.5, "interval", max_intervals=1, progress=False)
+    assert compare(directory, [recording], calls=1).warnings == ()
+    (warning,) = compare(directory, [tmp_path / "turned.npz"], calls=1).warnings
+    assert warning.startswith("this artifact: its calibration held out others of these numbers, and this comparison [")
 
 
 def test_nothing_is_written(planned: Path, recording: Path) -> None:

@@ -16,7 +16,7 @@ from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.judge import Score, _Answers, further, judge, timed
+from ttscompile.calibration.judge import Gaps, Score, _Answers, further, judge, timed
 from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
@@ -141,10 +141,13 @@ def test_a_plan_that_reads_earlier_calls_makes_them_all_in_order(trials: Trials)
     assert alternating[1].plans == 1
 
 
-def test_limits_of_a_difference_are_over_episodes() -> None:
-    def score(*gaps: float) -> Score:
-        return Score(rooted(float(np.mean(gaps)), 1.0), (0, 0), None, None, 0, 0, 0, 1, gaps=(gaps, 1.0))
+def score(*h: float) -> Score:
+    """Of calls that are an episode each."""
+    gaps = Gaps(np.array(h), np.arange(len(h)))
+    return Score(rooted(gaps.mean, 1.0), (0, 0), None, None, 0, 0, 0, 1, gaps=gaps)
 
+
+def test_limits_of_a_difference() -> None:
     near, far = score(0.04, 0.04, 0.04), score(0.09, 0.09, 0.09)
     assert further(far, near) == pytest.approx((0.1, 0.1))
     assert further(near, far) == pytest.approx((-0.1, -0.1))
@@ -152,6 +155,30 @@ def test_limits_of_a_difference_are_over_episodes() -> None:
     difference, limit = further(mixed, near)
     assert difference == pytest.approx(0.1**0.5 - 0.2)
     assert limit > difference
+    assert further(score(0.09), score(0.04))[1] > 100, "one call tells nothing"
+
+
+@pytest.mark.parametrize(
+    ("episodes", "calls", "share"),
+    [(4, 4, 0.0), (2, 8, 0.0), (16, 1, 0.0), (4, 4, 0.5), (8, 4, 0.5), (4, 1, 0.0), (4, 8, 0.3)],
+)
+def test_ninety_five_of_a_hundred_limits_hold(episodes: int, calls: int, share: float) -> None:
+    """Whether calls differ, or episodes: the latter have this share of the variance. Of a bootstrap of four 81 do."""
+    rng, numbers = np.random.default_rng(0), np.repeat(np.arange(episodes), calls)
+    held = []
+    for _ in range(2000):
+        apart = share**0.5 * rng.standard_normal(episodes)[numbers]
+        gaps = Gaps(1 + apart + (1 - share) ** 0.5 * rng.standard_normal(len(numbers)), numbers)
+        low, high = np.quantile(gaps.resampled(gaps.clustered), (0.025, 0.975))
+        held.append(low <= 1 <= high)
+    assert 0.925 < np.mean(held) < 0.98
+
+
+def test_episodes_of_other_lengths_count_alike() -> None:
+    gaps = Gaps(np.array([1.0, 2.0, 3.0, 8.0]), np.array([0, 0, 0, 1]))
+    assert gaps.mean == 5.0
+    for clustered in (False, True):
+        assert np.mean(gaps.resampled(clustered)) == pytest.approx(5.0, abs=2.0)
 
 
 def test_one_split_and_every_answered_call_has_one_before_it(trials: Trials) -> None:

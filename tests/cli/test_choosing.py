@@ -109,6 +109,20 @@ def test_a_plan_of_this_name_in_another_artifact_or_with_more_threads_is_not_thi
     assert after.manifest.default_plan == "safe"
 
 
+def test_the_bound_of_the_build_holds(toy_compiled: Path, tmp_path: Path) -> None:
+    scores = {"schedule": score(0.18), "safe": score(0.05), "fast": score(0.6)}
+    directory = made(toy_compiled, tmp_path, scores, budget={"max_distance": 0.2})
+    assert list(choosable(load_artifact(directory))) == ["schedule", "safe"]
+    assert again(directory, timed(schedule=1.0, safe=2.0))[1].manifest.default_plan == "schedule"
+
+
+def test_of_plans_in_time_one_that_is_near_for_sure_comes_first(toy_compiled: Path, tmp_path: Path) -> None:
+    directory = made(toy_compiled, tmp_path, {"schedule": score(0.08, 0.25), "safe": score(0.095), "fast": score(0.2)})
+    times = timed(schedule=2.0, safe=2.0, fast=1.0)
+    assert again(directory, times, 3.0)[1].manifest.default_plan == "safe"
+    assert again(directory, times, 1.5)[1].manifest.default_plan == "fast"
+
+
 def test_a_plan_that_becomes_fp32_is_no_longer_told_to_be_in_eight_bits(tmp_path: Path) -> None:
     directory, spec = tmp_path / "mixer", policies.spec()
     ttscompile.compile_denoiser(policies.Mixer(0).eval(), spec, directory, precision="int8")
@@ -123,6 +137,12 @@ def test_a_plan_that_becomes_fp32_is_no_longer_told_to_be_in_eight_bits(tmp_path
     rows = {row["name"]: row["told"] for row in (after.manifest.calibration or {})["frontier"]}
     assert rows == {"schedule": after.default.in_words(), "safe": "int8 in blocks"}
     assert "int8" not in rows["schedule"]
+    eight = "schedule@int8+blocks"
+    assert list(choosable(after)) == ["schedule", eight], "another machine may be faster in eight bits"
+    told, after = again(directory, [*timed(schedule=2.0), Measurement("int8", eight, (1.0,))])
+    assert told == f"The default is 'schedule', in int8. schedule 2 ms, {eight} 1 ms."
+    assert dict(after.default.precision) == {"blocks": "int8"}
+    assert list(choosable(after)) == ["schedule", "schedule@fp32"]
 
 
 def test_a_plan_whose_limit_is_far_is_not_near(toy_compiled: Path, tmp_path: Path) -> None:

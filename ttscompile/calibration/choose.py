@@ -70,9 +70,9 @@ def choose(kept: Kept, request: Request) -> Frontier:
     allowed, close = up_to(request.farthest), up_to(request.bound)
     chosen = _chosen(close, allowed, scores, times, request)
     named = {chosen: SCHEDULE}
-    others = [name for name in best if name not in (DENSE, chosen)]
-    wanted = SAFER * scores[chosen].distance
-    if nearer := [name for name in others if name in allowed and scores[name].distance <= wanted]:
+    wanted, took = SAFER * scores[chosen].distance, times[chosen].median
+    slower = [name for name in close or allowed if times[name].median > took]
+    if nearer := [name for name in slower if scores[name].distance <= wanted]:
         named[min(nearer, key=lambda name: times[name].median)] = SAFE
     faster = {name: times[name].median for name in allowed if ALIKE * times[name].median < times[chosen].median}
     if faster:
@@ -96,7 +96,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     if chosen not in close:
         in_time = "" if request.deadline_ms is None else f" that keeps {request.deadline_ms:.3g} ms"
         kept.trials.bar.warn(
-            f"no plan{in_time} is within {request.bound:g} of the original: the default is"
+            f"no plan{in_time} is surely within {request.bound:g} of the original: the default is"
             f" {scores[chosen].distance:.2g} away, and {scores[chosen].interval[1]:.2g} at worst. Such plans lost"
             " several points of success where they were driven. Evaluate it, record more episodes, or allow more time."
         )

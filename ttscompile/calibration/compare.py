@@ -19,7 +19,7 @@ from ..core.plan import DENSE, Plan
 from ..errors import CalibrationError
 from ..measure.points import Comparison, FarCall, MeasuredPoint, pairs, rooted
 from ..runtimes.open import require_able
-from .calls import Split, load_episodes
+from .calls import digest_of, load_episodes
 from .judge import Score, judge, other_noise, timed
 from .progress import Progress
 from .state import StateFile
@@ -102,7 +102,7 @@ def compare(
         own = replace(trials, artifact=other_artifact)
         entrants += [Entrant(name, plan, own, one) for plan, one in named_plans(other_artifact, plans).items()]
     points = _measured(entrants, threads, progress)
-    warnings = (*_warnings(artifact, trials.split, compared), *joined.warnings)
+    warnings = (*_warnings(trials, compared), *joined.warnings)
     count, held_out = len(trials.held_out.calls), trials.split.validation
     return Comparison(points, count, held_out, threads, other_noise(trials), joined.skipped, warnings)
 
@@ -183,14 +183,18 @@ def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None
         )
 
 
-def _warnings(artifact: Artifact, split: Split, others: Mapping[str, Artifact]) -> list[str]:
+def _warnings(trials: Trials, others: Mapping[str, Artifact]) -> list[str]:
     """Plans that may have been learned from the episodes that they are judged on here."""
-    found = []
-    for name, one in {"this artifact": artifact, **others}.items():
-        held_out = (one.manifest.calibration or {}).get("episodes", {}).get("validation")
-        if one.manifest.plans and (held_out is None or tuple(held_out) != split.validation):
+    found, judged = [], trials.split.validation
+    digest = digest_of([trials.episodes[n] for n in judged])
+    for name, one in {"this artifact": trials.artifact, **others}.items():
+        record = one.manifest.calibration or {}
+        held_out = record.get("episodes", {}).get("validation")
+        same = held_out is not None and tuple(held_out) == judged
+        if one.manifest.plans and not (same and record.get("held_out", digest) == digest):
+            what = "others of these numbers" if same else f"the episodes {held_out}"
             found.append(
-                f"{name}: its calibration held out the episodes {held_out}, and this comparison"
-                f" {list(split.validation)}: its plans may have been learned from them. Give the same files and seed."
+                f"{name}: its calibration held out {what}, and this comparison {list(judged)}: its plans may have been"
+                " learned from them. Give the same files, in the same order, and the same seed."
             )
     return found

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from ..artifact.ceiling import FARTHEST
 from ..artifact.manifest import StartRecord, WeightsRecord
 from ..artifact.stores import BlockWeights
 from ..core.plan import DENSE, FULL, Plan
@@ -22,6 +23,7 @@ class Kept:
 
     Args:
         anew: whether to begin with the base of the calibration. Else with the artifact's plans, to which others come.
+        farthest: how far from the original a plan may be that takes the place of a nearer default.
 
     Attributes:
         trials: of the artifact with all that is kept.
@@ -33,11 +35,11 @@ class Kept:
         learned: whether any proposal but those ``beside`` was kept.
     """
 
-    def __init__(self, trials: Trials, anew: bool) -> None:
+    def __init__(self, trials: Trials, anew: bool, farthest: float = FARTHEST) -> None:
         artifact = trials.artifact
         self.plans: dict[str, Plan] = {n: p for n, p in artifact.plans.items() if not anew or n in (DENSE, FULL)}
         first = next(n for n in (FULL, DENSE) if n in self.plans) if anew else artifact.manifest.default_plan
-        self.default, self.trials = first, replace(trials, name=first)
+        self.default, self.trials, self._farthest = first, replace(trials, name=first), farthest
         self.scores: dict[str, Score] = {}
         self.judged: dict[str, Plan] = {}
         self.notes: dict[str, Mapping[str, Any]] = {}
@@ -116,11 +118,27 @@ class Kept:
         if proposal.shared:
             self._share(proposal)
         if not proposal.beside:
-            self.default, self.learned = proposal.name, True
+            self.learned = True
+            if not self._demotes(proposal, score):
+                self.default = proposal.name
         if self.plan.loop in trials.artifact.manifest.spec.all_loops:
             trials = trials.of_loop(self.plan.loop)  # so that who trains weights learns from its calls
         self.trials = replace(trials, name=self.default)
         return None
+
+    def _demotes(self, proposal: Proposal, score: Score) -> bool:
+        """Whether scores may fall with a plan, and not with the default: then that stays what it is.
+
+        A plan that was asked for whatever it costs (a margin without end) becomes the default, with a warning.
+        """
+        if proposal.margin == float("inf") or not score.distance > self._farthest >= self.scores[self.default].distance:
+            return False
+        self.trials.bar.warn(
+            f"plan {proposal.name!r} is kept, and {self.default!r} stays the default: {proposal.name!r} is"
+            f" {score.distance:.2f} of what other noise changes from the original, and above {self._farthest:g} scores"
+            " may fall. Drive your task with it before you load it by its name."
+        )
+        return True
 
     def _no_better(self, trials: Trials, score: Score, margin: float | None) -> str | None:
         """Why a plan does not take the place of the best one so far."""

@@ -61,6 +61,7 @@ class CalibrationResult:
         budget: what was asked for, the cells that it comes to, and what was measured for it; JSON.
         skipped: why there is no plan of a name that there might be.
         told: by proposer, what became of it.
+        held_out: what tells the episodes of the validation from others.
         frontier: where the default was chosen among many plans, all of them, fastest first; JSON.
     """
 
@@ -79,6 +80,7 @@ class CalibrationResult:
     budget: Mapping[str, Any] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
     told: Mapping[str, str] = field(default_factory=dict)
+    held_out: str = ""
     frontier: tuple[Mapping[str, Any], ...] = ()
 
     @property
@@ -209,7 +211,7 @@ def calibrate(
     rows, chosen = rows_of(tuple(learn)), strategy_of(strategy)
     chooses, anew = LOOPS in learn, any(row.anew for row in rows)
     if chooses:
-        require_alone(learn, target_sparsity, target_flops, max_action_error)
+        require_alone(learn, strategy, target_sparsity, target_flops, max_action_error)
     require_limits(validation_fraction, max_minutes)
     require_directory(Path(path))
     # All the while: a second calibration would undo the first.
@@ -260,7 +262,7 @@ def calibrate(
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
             _warn(trials, rows, chosen, corrects)
-            kept = Kept(trials, anew)
+            kept = Kept(trials, anew, FARTHEST if max_distance is None else np.inf)
             takes = np.cumsum([row.takes for row in rows])
             for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
                 kept.hear(row.name, proposer, clock.until(float(share)))
@@ -292,6 +294,7 @@ def calibrate(
             seconds=clock.elapsed(),
             budget=chosen_within if chooses else schedule.budget.record(),
             told=kept.told,
+            held_out=digest_of([episodes[n] for n in trials.split.validation]),
             frontier=() if frontier is None else frontier.tried,
         )
         if result.stopped == TIME_LIMIT:
@@ -332,7 +335,7 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
 def heeds(trials: Trials) -> None:
     """Warn where the original's answers depend on the noise about as much as on the observation."""
     noise, observed = other_noise(trials), other_observations(trials)
-    if not noise < UNHEARD * observed:
+    if len(trials.held_out.answers) > 1 and not noise < UNHEARD * observed:  # of one there is no other
         trials.bar.warn(
             f"the original hardly heeds what was recorded: with other noise its actions change by {noise:.4g}, and with"
             f" another observation by {observed:.4g}. Look at the units of the recordings, and at the order of their"

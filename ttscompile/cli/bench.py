@@ -270,22 +270,29 @@ def print_verdicts(verdicts: Mapping[str, Feasibility], control_hz: float | None
 
 IN_FP32 = f"@{FP32}"
 
+JUDGED = "judged_in"
+"""In the record of a calibration: by plan that is in fp32 here what it was judged in, as in ``NAME@int8+PART``."""
 
-def choosable(artifact: Artifact, bound: float = FARTHEST) -> dict[str, float]:
+
+def choosable(artifact: Artifact, usual: float = FARTHEST) -> dict[str, float]:
     """How far plans are from the original that were judged to be within a bound, by name.
 
-    Plans of fewer bits are among them in fp32, too, in which they are no further away. Raises ArtifactError: none is
-    within ``FARTHEST``.
+    The bound of a build (``--error``) takes the place of the usual ones. Plans of fewer bits are among them in fp32,
+    too, in which they are no further away; and those that were made fp32 here, in what they were judged in. Raises
+    ArtifactError: none is within the bound.
     """
-    found: dict[str, float] = {}
-    for name, score in scores(artifact.manifest.calibration, ("distance", "interval")).items():
+    found, record = dict[str, float](), artifact.manifest.calibration or {}
+    bound = record.get("budget", {}).get("max_distance", usual)
+    for name, score in scores(record, ("distance", "interval")).items():
         within = name in artifact.plans and near(score["distance"], score["interval"], bound)
         if within and name not in (DENSE, UNIFORM):
             found[name] = score["distance"]
             if artifact.plans[name].precision and artifact.plans[name].tokens is None:
                 found[name + IN_FP32] = score["distance"]
-    if bound == FARTHEST and not found:
-        problem = f"{artifact.path}: there is nothing to choose among: no plan was judged to be within {FARTHEST:g}"
+            elif (judged := record.get(JUDGED, {}).get(name)) is not None:
+                found[f"{name}@{judged}"] = score["distance"]
+    if usual == FARTHEST and not found:
+        problem = f"{artifact.path}: there is nothing to choose among: no plan was judged to be within {bound:g}"
         raise ArtifactError(f"{problem}. Run 'ttscompile build', or 'ttscompile calibrate', first.")
     return found
 
@@ -312,15 +319,20 @@ def choose_again(
     chosen = best_plan(times, far, close.keys() & times.keys(), deadline)
     if chosen is None:
         return None
-    name, before = chosen.removesuffix(IN_FP32), artifact.manifest.default_plan
+    (name, _, wanted), before = chosen.partition("@"), artifact.manifest.default_plan
     told = ", ".join(f"{each} {ms(one.median)} ms" for each, one in times.items())
     here = f"{fingerprint()['processor']}, {threads} thread{'s' * (threads > 1)}: {told}"
     record |= {"default_plan": name, "chosen_on": here}
     precision: dict[str, str] | None = None
-    if chosen != name:
-        precision, words = {}, replace(artifact.plans[name], precision={}).in_words()
+    if wanted:
+        own, precision = artifact.plans[name].precision, dict(artifact.plan(chosen).precision)
+        words = replace(artifact.plans[name], precision=precision).in_words()
+        if own:  # so that another machine may have it back
+            judged = "+".join((next(iter(own.values())), *own))
+            record[JUDGED] = {**record.get(JUDGED, {}), name: judged}
         tried = record.get("frontier", ())
         record["frontier"] = [{**row, "told": words} if row["name"] == name else row for row in tried]
     choose_default(directory, name, record, precision, artifact)
     changed = "is" if name == before else f"was {before!r}, and is"
-    return f"The default {changed} {name!r}{', in fp32' * (chosen != name)}. {told}."
+    in_ = f", in {wanted.partition('+')[0]}" if wanted else ""
+    return f"The default {changed} {name!r}{in_}. {told}."

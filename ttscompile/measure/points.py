@@ -152,7 +152,8 @@ def best_plan(
     """The rule by which one of several plans is the default: its name.
 
     Without a deadline it is the ``fastest`` of those that are near enough, or the nearest of all if none is. With one
-    it is the nearest of those whose longest call keeps it; None if none does.
+    it is the nearest of those whose longest call keeps it, of those that are near enough where one of them keeps it;
+    None if none at all does.
 
     Args:
         times: of the plans that may be taken.
@@ -162,7 +163,8 @@ def best_plan(
     if near and deadline_ms is None:
         return fastest({name: times[name].median for name in times if name in near}, distances)
     in_time = [name for name, one in times.items() if deadline_ms is None or max(one.ms) <= deadline_ms]
-    return min(in_time, key=lambda name: (distances[name], times[name].median), default=None)
+    of = [name for name in in_time if name in near] or in_time
+    return min(of, key=lambda name: (distances[name], times[name].median), default=None)
 
 
 @dataclass(frozen=True)

@@ -273,6 +273,8 @@ def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> 
         calibrate(directory, [recording], learn=("schedule", "loops"), progress=False)
     with pytest.raises(CalibrationError, match="found a budget in cells"):
         calibrate(directory, [recording], 0.8, learn=("loops",), progress=False)
+    with pytest.raises(CalibrationError, match="loops need the strategy 'tts'; found 'bac'"):
+        calibrate(directory, [recording], strategy="bac", learn=("loops",), progress=False)
 
 
 def chosen(
@@ -343,6 +345,10 @@ def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(
     surely = figures | {"a": (0.20, 0.60, 1.0)}
     assert chosen(monkeypatch, trials, surely, **bounds)["fast"] == "b"
     assert chosen(monkeypatch, trials, figures | {"e": (0.15, 0.2, 1.1)}, **bounds)["fast"] == "e"
+    # By a deadline, too, what is surely near enough comes before what may be nearer; and so does what is safe.
+    unsure = {"a": (0.09, 0.25, 5.0), "b": (0.095, 0.11, 5.0), "c": (0.06, 0.30, 10.0), "d": (0.06, 0.12, 12.0)}
+    assert chosen(monkeypatch, trials, unsure, deadline_ms=8.0, **bounds) == {"schedule": "b", "safe": "d"}
+    assert chosen(monkeypatch, trials, unsure, **bounds) == {"schedule": "b", "safe": "d"}
     # One that may be a half further than the bound is as far as some that have lost successes.
     doubtful = figures | {"c": (0.08, 0.15, 4.0)}
     assert chosen(monkeypatch, trials, doubtful, **bounds) == {"schedule": "d", "fast": "a"}

@@ -14,8 +14,8 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.judge import Score, judge
-from ttscompile.calibration.kept import holding
+from ttscompile.calibration.judge import Gaps, Score, judge
+from ttscompile.calibration.kept import Kept, holding
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import start
@@ -144,6 +144,27 @@ def test_what_is_learned_is_written_and_loaded(folder: Path, tmp_path: Path) -> 
         assert policy.last_report is not None
         loops.append(policy.last_report.loop)
     assert loops == [LOOP, f"{LOOP}-last-1"]
+
+
+@pytest.mark.parametrize(
+    ("distance", "asked", "default"), [(0.2, {}, NAME), (0.9, {}, FULL), (0.9, {"farthest": 1.0}, NAME)]
+)
+def test_a_plan_with_which_scores_may_fall_is_kept_and_is_no_default(
+    trials: Trials, monkeypatch: pytest.MonkeyPatch, distance: float, asked: dict[str, float], default: str
+) -> None:
+    def scored(_: Trials, plan: Plan, part: str = "held out") -> Score:
+        far, calls = distance if plan.otherwise is not None else 0.0, np.arange(4)
+        return Score(far, (far, far), None, None, 0, 0, 0, 1, gaps=Gaps(np.full(4, far**2), calls))
+
+    warned: list[str] = []
+    monkeypatch.setattr("ttscompile.calibration.kept.judge", scored)
+    monkeypatch.setattr(trials.bar, "warn", warned.append)
+    kept, found = Kept(trials, False, **asked), candidates(trials.artifact, trials.base)[0]
+    assert kept.default == FULL
+    assert kept.consider(replace(found, margin=1.2)) is None
+    assert kept.learned and NAME in kept.plans and kept.default == default
+    told = ["plan 'warm' is kept, and 'full' stays the default: 'warm' is 0.90 of what other noise changes"]
+    assert [one.partition(" from ")[0] for one in warned] == told * (default == FULL)
 
 
 def test_what_is_far_off_changes_nothing(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
