@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 SURE = 1.25
-"""The upper limit of the distance, with 95 % confidence over episodes, may be so many times as far. A plan 0.099 away,
+"""The upper limit of the distance, with 95 % confidence, may be so many times as far. A plan 0.099 away,
 and 0.142 at worst, lost 9 points of success. Where it is near 0 the root of an energy distance has wide limits."""
 
 SAFER = 0.7

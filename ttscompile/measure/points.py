@@ -96,7 +96,7 @@ class MeasuredPoint(Point):
     """One plan on the held-out calls of a comparison.
 
     Attributes:
-        interval: 95 % interval of the distance, over episodes.
+        interval: 95 % interval of the distance.
         error: mean absolute difference of the executed actions from the original's with the same noise, in their units;
             None of another sampler or start, which takes other noise.
         error_p90: 90th percentile of that over the calls.
