@@ -130,6 +130,7 @@ def test_a_plan_in_another_precision_is_captured(calibrated: Artifact) -> None:
         assert len(lines) == 1 + (number > 0), "the prologue, and the second call"
 
 
+@pytest.mark.filterwarnings("ignore:.*learned plans:UserWarning")  # one artifact takes the other's place
 def test_a_plan_in_another_precision_keeps_what_others_read(calibrated: Artifact, make_artifact: MakeArtifact) -> None:
     runtime, rng = open_runtime(calibrated, "torch"), np.random.default_rng(0)
     for name in ("dense@bf16", "mixed@bf16"):

@@ -223,7 +223,8 @@ def test_what_is_feasible_never_misses_and_what_clearly_is_not_does(  # noqa: PL
     """Clearly: by more than a frame, which a call need not wait for if the phase is lucky, and a margin."""
     hz = rate * ticks_per_step
     own = Feasibility(1.0, hz, rate, horizon, margin, beyond if reserve is None else 0)
-    ahead = min(ahead, max(own.predicted - own.frame_period - own.margin, 0.0) / 2)
+    spare = own.predicted - own.frame_period - own.margin - 1 / hz  # else a late frame costs a call
+    ahead = min(ahead, max(spare, 0.0) / 2)
     longest = min(own.play, own.max_latency, (own.predicted - own.frame_period - own.margin - ahead) / 2)
     latency = (
         share * longest if feasible else max(longest, 0.0) + 1.3 / rate + (margin + 1.6) / hz + share * horizon / rate
