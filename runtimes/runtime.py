@@ -207,9 +207,7 @@ class Runtime:
         if plan.cells is None and PRUNER not in manifest.pieces:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"
             raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
-        # Of a plan of the artifact what was not kept is repaired; of another one it is refused, repaired or not.
-        gone = dropped if told is None else np.zeros_like(dropped)
-        settled = None if plan.cells is None else self._settle(opened, plan.cells, written, gone, plan.repair)
+        settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
         self._given |= name is None and (told is None or self._reading)
         keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
         self._used = opened

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .artifact.files import aside, writing
+from .artifact.files import aside, locked, writing
 from .artifact.load import load_artifact, read_manifest
-from .artifact.write import learned_plans, locked, replacing
+from .artifact.write import learned_plans, replacing
 from .calibration.budget import SPARSITY, Goal
 from .calibration.calls import load_episodes
 from .calibration.pipeline import CalibrationResult, calibrate
@@ -88,12 +88,12 @@ def build(
         raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
     if policy_hz is not None and control_hz is None:
         raise CalibrationError("policy_hz is of a control loop; found no control_hz. Give it too.")
+    given = tuple(trajectories)
 
     def read(spec: PolicySpec) -> None:
         if given and spec.instruction is None:  # else the artifact's tokenizer is needed
             load_episodes(spec, given, observation)
 
-    given = tuple(trajectories)
     if not trajectories:
         trajectories = (recordings_of(checkpoint),)
         explain("recordings", (f"no recordings were given: {trajectories[0]}, which the policy was trained on",))

@@ -242,7 +242,7 @@ class Workspace:
             updates = matrices(self._sampler, used) if masked is None else masked.updates
             steps = [self._bind_advance(k, updates[k]) for k in range(self._steps)]
             made = _Advances(used, used.anchors.tolist(), updates, steps, masked)
-            while len(self._advances) > KEPT_CORRECTIONS:  # who makes one for each call must not fill the memory
+            if len(self._advances) > KEPT_CORRECTIONS:  # who makes one for each call must not fill the memory
                 del self._advances[next(iter(self._advances))]
             self._advances[id(correction), known is not None] = made
         if made.masked is not None and known is not None:

@@ -14,7 +14,8 @@ from tests.artifact.folders import contents, failing
 from tests.artifact.tiny import STEPS, tiny_models, tiny_program, write_tiny
 from tests.plans import store_schedules
 from ttscompile.artifact import Artifact, load_artifact, write
-from ttscompile.artifact.write import locked, write_artifact
+from ttscompile.artifact.files import locked
+from ttscompile.artifact.write import write_artifact
 from ttscompile.core.correction import condition_flops
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError, PassError

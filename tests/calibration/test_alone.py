@@ -13,9 +13,8 @@ import pytest
 import ttscompile
 from tests.artifact.folders import contents
 from tests.plans import store_schedules
-from ttscompile.artifact.files import exchange, lock_folder
+from ttscompile.artifact.files import exchange, lock_folder, locked
 from ttscompile.artifact.load import load_artifact
-from ttscompile.artifact.write import locked
 from ttscompile.calibration import pipeline
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.pipeline import CalibrationResult
@@ -62,7 +61,7 @@ def test_a_calibration_refuses_all_others_from_its_beginning(
 
 def test_a_kill_leaves_nothing_locked(artifact: Path) -> None:
     script = (
-        "import sys, time; from pathlib import Path; from ttscompile.artifact.write import locked\n"
+        "import sys, time; from pathlib import Path; from ttscompile.artifact.files import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script, artifact], stdout=subprocess.PIPE, text=True) as holder:

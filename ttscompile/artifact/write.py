@@ -24,7 +24,7 @@ from ..measure.versions import VERSION
 from . import files, records, stores, tensors
 from .bind import LoweredPieces, Place, bind, places_of, read_in_fp32, store_pieces
 from .codec import decode, encode, identities
-from .files import locked as locked
+from .files import locked
 from .golden import Golden, GoldenPlan, plan_arrays
 from .graph_json import graph_to_json
 from .load import Artifact, load_artifact, read_manifest, require_artifact_path, table_prefix

@@ -192,9 +192,9 @@ def _warnings(trials: Trials, others: Mapping[str, Artifact]) -> list[str]:
         held_out = record.get("episodes", {}).get("validation")
         same = held_out is not None and tuple(held_out) == judged
         if one.manifest.plans and not (same and record.get("held_out", digest) == digest):
-            what = "others of these numbers" if same else f"the episodes {held_out}"
+            what = "other ones of these numbers" if same else f"the episodes {held_out}"
             found.append(
-                f"{name}: its calibration held out {what}, and this comparison {list(judged)}: its plans may have been"
-                " learned from them. Give the same files, in the same order, and the same seed."
+                f"{name}: this comparison judges on the episodes {list(judged)}, and its calibration held out {what}."
+                " So plans may have been learned from them. Give the same files, in the same order, and the same seed."
             )
     return found

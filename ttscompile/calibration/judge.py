@@ -26,7 +26,7 @@ from ..core.lattice import Source, plan_flops, sparsity
 from ..core.plan import Plan
 from ..core.spec import FloatArray
 from ..errors import CalibrationError
-from ..measure.points import SAME, Numbers, pairs, rooted
+from ..measure.points import SAME, Numbers, pairs, rooted, signed_root
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport
@@ -168,7 +168,7 @@ def further(score: Score, other: Score) -> tuple[float, float]:
     clustered = replace(own, h=own.h - theirs.h).clustered
     if len(own.h) == 1:
         return difference, float("inf")
-    apart = _signed_root(own.resampled(clustered)) - _signed_root(theirs.resampled(clustered))
+    apart = signed_root(own.resampled(clustered)) - signed_root(theirs.resampled(clustered))
     return difference, float(np.quantile(apart, 0.975))
 
 
@@ -325,7 +325,7 @@ def _scored(
     x = np.nan_to_num(x, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST).clip(-LARGEST, LARGEST)
     h, apart = pairs(x, y)
     gaps = Gaps(h / max(float(apart.mean()), 1e-12), sample.episodes)
-    low, high = np.quantile(_signed_root(gaps.resampled(gaps.clustered)), (0.025, 0.975))
+    low, high = np.quantile(signed_root(gaps.resampled(gaps.clustered)), (0.025, 0.975))
     error = error_p90 = None
     original = trials.executor.view.artifact.manifest.spec.sampler
     if plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original):
@@ -352,7 +352,3 @@ def _scored(
         gaps=gaps,
         answers=x.reshape(*x.shape[:2], -1, spec.chunk.action_dim),
     )
-
-
-def _signed_root(share: Numbers) -> Numbers:
-    return np.asarray(np.sign(share) * np.sqrt(np.abs(share)))

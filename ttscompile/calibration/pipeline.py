@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..artifact.ceiling import FARTHEST, few_steps, usual_sparsity
+from ..artifact.files import locked
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
-from ..artifact.write import locked, update_plans
+from ..artifact.write import update_plans
 from ..core.coercion import integer
 from ..core.plan import ORIGINAL
 from ..errors import CalibrationError, CalibrationFailedError

@@ -51,9 +51,13 @@ def _far(one: Numbers, other: Numbers) -> Numbers:
 
 
 def rooted(gap: float, apart: float) -> float:
-    """The root of a mean h in units of how far answers of the original are apart; of less than 0 that of its size."""
-    share = gap / max(apart, 1e-12)
-    return float(np.sign(share) * np.sqrt(abs(share)))
+    """The root of a mean h in units of how far answers of the original are apart; see ``signed_root``."""
+    return float(signed_root(np.array(gap / max(apart, 1e-12))))
+
+
+def signed_root(shares: Numbers) -> Numbers:
+    """The roots of numbers; of one below 0 the negative root of its size, so that nothing is cut off."""
+    return np.asarray(np.sign(shares) * np.sqrt(np.abs(shares)))
 
 
 @dataclass(frozen=True)
