@@ -47,6 +47,8 @@ class PolicyInfo:
         noise: what a loop begins with: numbers of the ``normal`` distribution, or ``uniform`` ones of -1..1.
         follows: whether that plan begins with the chunk of the call before, so that each call has to be one chunk later
             than the one before (``CompiledPolicy.follow`` tells it of one that is not).
+        policy_hz: rate of the frames and actions that the policy was trained with, if the recordings or ``build`` said
+            it.
         other_noise: mean difference of two answers of the original to one observation, if the calibration found one.
     """
 
@@ -72,3 +74,4 @@ class PolicyInfo:
     noise: str = "normal"
     other_noise: float | None = None
     trained_prefix: int = 0
+    policy_hz: float | None = None

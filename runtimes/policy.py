@@ -86,7 +86,7 @@ class CompiledPolicy:
         view, default = self._runtime.view(self._default), self._default
         manifest, begun = view.manifest, self._runtime.noise_spec(default).sampler
         shapes = [tuple(n for i, n in enumerate(b.type.at(1)) if i != b.type.batch_axis) for b in manifest.blocks]
-        blocks = zip(manifest.blocks, shapes, strict=True)
+        blocks, record = zip(manifest.blocks, shapes, strict=True), manifest.calibration or {}
         return PolicyInfo(
             K=manifest.steps,
             blocks=tuple(BlockInfo(block.kind, shape, block.flops) for block, shape in blocks),
@@ -108,7 +108,8 @@ class CompiledPolicy:
             reuses_tokens=self._runtime.frames.reuses_tokens,
             follows=default.otherwise is not None,
             noise=manifest.spec.noise,
-            other_noise=(self._artifact.manifest.calibration or {}).get("other_noise") or None,
+            other_noise=record.get("other_noise") or None,
+            policy_hz=record.get("policy_hz"),
             trained_prefix=manifest.spec.trained_prefix,
         )
 

@@ -24,6 +24,7 @@ from ttscompile.calibration.state import FILE as STATE
 from ttscompile.cli import main
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, TtscompileError
+from ttscompile.runtimes.executor import settings
 
 
 def building(target: Path) -> Path:
@@ -75,11 +76,10 @@ def test_what_applies_is_learned_and_a_control_loop_is_a_deadline(asked: dict[st
     ("given", "told"),
     [
         ({"control_hz": 50, "latency_ms": 3}, "found latency_ms and control_hz"),
-        ({"policy_hz": 10}, "policy_hz is of a control loop; found no control_hz"),
-        ({"policy_hz": 10, "latency_ms": 3}, "policy_hz is of a control loop; found no control_hz"),
+        ({"policy_hz": 0}, "policy_hz: expected a positive number; found 0"),
     ],
 )
-def test_what_is_no_deadline_is_refused_before_anything_is_done(
+def test_what_is_no_deadline_or_no_rate_is_refused_before_anything_is_done(
     given: dict[str, Any], told: str, asked: dict[str, Any], directory: Path
 ) -> None:
     with pytest.raises(CalibrationError, match=told):
@@ -219,10 +219,21 @@ def test_every_option_of_the_command_reaches_the_call(monkeypatch: pytest.Monkey
     assert options - taken <= set(found)
 
 
-def test_a_rate_of_training_without_a_control_loop_is_bad_usage(tmp_path: Path) -> None:
-    words = ["build", str(tmp_path), "-o", str(tmp_path / "out"), "--policy-hz", "10", "--latency-ms", "8"]
-    result = CliRunner().invoke(main, words)
-    assert result.exit_code == 2 and "--policy-hz is for --control-hz: give it too." in result.stderr
+@pytest.mark.parametrize("said", ["by who builds", "by the recording", "by nobody"])
+def test_the_rate_of_training_is_kept_and_decides_the_deadline(
+    said: str, asked: dict[str, Any], directory: Path
+) -> None:
+    """A control loop of 50 Hz leaves a policy of 10 Hz five times as long as one of 50 Hz."""
+    given = {"policy_hz": 10} if said == "by who builds" else {}
+    path = policies.record(directory.parent / "calls.npz")
+    if said == "by the recording":
+        np.savez(path, **np.load(path), meta=np.array('{"policy_hz": 10}'))
+    ttscompile.build("policy.ckpt", directory, path, control_hz=50, progress=False, **given)
+    info = ttscompile.load(directory).info
+    hz = 50 if said == "by nobody" else 10
+    assert asked["calibrate"]["policy_hz"] == (None if said == "by nobody" else 10)
+    longest = settings.resolve(settings.ExecutorSettings(policy_hz=hz), info, 50).feasibility(1e-3).max_latency
+    assert asked["calibrate"]["latency_ms"] == pytest.approx(1e3 * longest)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from typing import Any
 from .artifact.files import aside, locked, writing
 from .artifact.load import load_artifact, read_manifest
 from .artifact.write import learned_plans, replacing
+from .calibration.arguments import require_rate
 from .calibration.budget import SPARSITY, Goal
 from .calibration.calls import load_episodes
 from .calibration.pipeline import CalibrationResult, calibrate
@@ -22,6 +23,7 @@ from .frontends.data_set import recordings_of
 from .runtimes.executor import ExecutorSettings
 from .runtimes.executor.settings import resolve
 from .runtimes.load import open_policy
+from .trajectories import recorded_rate
 
 FURTHER_LOOPS = (("dpmsolver++", 16), ("ddim", 16))
 """Beside the policy's own. Of a flow-matching policy its own is all: of its ten Euler steps two or three are computed,
@@ -66,7 +68,8 @@ def build(
             of a data set on the hub (``frontends.data_set``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
             plan is then the nearest of those whose longest call keeps up.
-        policy_hz: rate of the frames and actions that the policy was trained with; None for ``control_hz``.
+        policy_hz: rate of the frames and actions that the policy was trained with; see ``calibrate``. If nobody says
+            it, the deadline is that of ``control_hz``.
         latency_ms: that the longest call may take, in place of ``control_hz``.
         max_distance: from the original, that a plan may have (``calibration.proposer.near``), in units of what other
             noise changes; None for a tenth for the default, and a quarter for faster plans (``artifact.ceiling``).
@@ -86,8 +89,9 @@ def build(
     """
     if latency_ms is not None and control_hz is not None:
         raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
-    if policy_hz is not None and control_hz is None:
-        raise CalibrationError("policy_hz is of a control loop; found no control_hz. Give it too.")
+    require_rate(policy_hz)
+    if isinstance(trajectories, str | os.PathLike):
+        trajectories = (trajectories,)
     given = tuple(trajectories)
 
     def read(spec: PolicySpec) -> None:
@@ -102,6 +106,7 @@ def build(
     target = Path(os.path.realpath(directory))
     with replacing(target) as put, _beside(target) as made:
         _converted(checkpoint, made, resume, explain, how)
+        policy_hz = policy_hz or recorded_rate(trajectories)
         if control_hz is not None:
             latency_ms = _deadline(made, control_hz, policy_hz)
         artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))
@@ -112,6 +117,7 @@ def build(
             learn=[row.name for row in rows],
             latency_ms=latency_ms,
             max_distance=max_distance,
+            policy_hz=policy_hz,
             threads=threads,
             max_minutes=max_minutes,
             seed=seed,

@@ -50,7 +50,7 @@ Array = npt.NDArray[Any]
 PARAMETERS = {
     "artifact": "",
     "control_hz": 50.0,
-    "policy_hz": 10.0,
+    "policy_hz": 0.0,
     "threads": 1,
     "plan": "",
     "interpolation": "hold",
@@ -61,9 +61,9 @@ PARAMETERS = {
 }
 """Name -> default.
 
-``plan``: empty for the default plan. ``frame_key``: the observation that completes a frame; empty for the first that is
-no goal. ``goal_keys``: observations that stay as they are until they are published again, over a reset, too; empty for
-the numbers that have no window, where other observations have one.
+``policy_hz``: 0 for what the artifact says. ``plan``: empty for the default plan. ``frame_key``: the observation that
+completes a frame; empty for the first that is no goal. ``goal_keys``: observations that stay as they are until they are
+published again, over a reset, too; empty for the numbers that have no window, where other observations have one.
 """
 
 PUBLISHED_ONCE = QoSProfile(
@@ -241,7 +241,9 @@ def from_picture(message: Any, dtype: str) -> Array:
 def open_executor(given: Mapping[str, Any]) -> AsyncExecutor:
     """The executor that the parameters ask for."""
     policy = ttscompile.load(given["artifact"], plan=given["plan"] or None, threads=given["threads"])
-    settings = ExecutorSettings(policy_hz=given["policy_hz"], interpolation=given["interpolation"])
+    if not (rate := given["policy_hz"] or policy.info.policy_hz):
+        raise ExecutorError(f"{given['artifact']} does not say the rate of its training. Give the parameter policy_hz.")
+    settings = ExecutorSettings(policy_hz=rate, interpolation=given["interpolation"])
     return AsyncExecutor(policy, given["control_hz"], settings)
 
 

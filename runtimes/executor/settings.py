@@ -52,7 +52,7 @@ class Policy(Protocol):
 
     @property
     def info(self) -> Any:
-        """Of ``PolicyInfo`` what is read here: ``observation, action, sample, plans, default_plan``."""
+        """Of ``PolicyInfo`` what is read here: ``observation, action, sample, plans, default_plan, policy_hz``."""
 
     def reset(self, seed: int | None = None) -> None:
         """A new episode; or, without a seed, within one, where a call shall go on from nothing (``stall_after``)."""
@@ -78,8 +78,8 @@ class ExecutorSettings:
     """Settings of an ``AsyncExecutor``; times in seconds, rates in Hz.
 
     Attributes:
-        policy_hz: rate of frames and actions that the policy was trained with; None: the control rate. The control rate
-            has to be a multiple of it.
+        policy_hz: rate of frames and actions that the policy was trained with; None: what the artifact says
+            (``PolicyInfo.policy_hz``), or the control rate. The control rate has to be a multiple of it.
         interpolation: between actions, if the control loop is faster than the policy: ``hold`` or ``linear``.
         n_obs_steps: To; None: of the observations' windows; of several, what the chunking implies, ``start + 1``.
         horizon: actions from one call to the next; None: as many as the policy executes of a chunk.
@@ -253,11 +253,12 @@ class Resolved(ExecutorSettings):
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy. Raises ExecutorError: they do not fit."""
     control_hz = require_number(control_hz, "control_hz")
-    policy_hz = settings.policy_hz or control_hz
+    policy_hz = settings.policy_hz or info.policy_hz or control_hz
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0
     if ticks_per_step < 1 or abs(ticks_per_step * policy_hz - control_hz) > 1e-6 * control_hz:
-        what = f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}"
+        told = "" if settings.policy_hz else ", at which its recordings were made"
+        what = f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}{told}"
         lasts = f"an action would last {control_hz / policy_hz:.4g} ticks"
         raise ExecutorError(f"{what}: {lasts}. Run the loop at a multiple of the policy's rate.")
     chunk, tiers = info.action, settings.tiers or (info.default_plan,)

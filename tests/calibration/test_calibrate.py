@@ -62,6 +62,19 @@ def test_the_plan_reaches_the_target_and_beats_the_uniform_schedule(calibrated: 
     assert artifact.manifest.default_plan == result.default_plan
 
 
+def test_the_rate_of_training_is_kept_until_another_one_is_said(artifact: Path, tmp_path: Path) -> None:
+    silent, said = policies.record(tmp_path / "silent.npz"), policies.record(tmp_path / "said.npz")
+    np.savez(said, **np.load(said), meta=np.array('{"policy_hz": 12.5}'))
+
+    def learned(path: Path, **given: Any) -> float | None:
+        quick(artifact, path, strategy="interval", **given)
+        return ttscompile.load(artifact).info.policy_hz
+
+    assert learned(silent) is None
+    assert learned(said) == learned(silent) == 12.5
+    assert learned(silent, policy_hz=20.0) == 20.0
+
+
 @pytest.mark.slow
 def test_what_it_measured_is_what_the_artifact_does(
     calibrated: tuple[Path, CalibrationResult], recording: Path

@@ -150,7 +150,7 @@ NAN = np.where(np.arange(30).reshape(5, 2, 3) == 13, np.nan, 0).astype(np.float3
         (changed(episode_ends=np.array([-1, 5])), r"episode_ends is \[-1, 5\]"),
         (changed(episode_ends=np.array([2.0, 5.0])), r"episode_ends is float64\[2\]; expected integers"),
         (changed(meta=np.array("frames")), "expected 'meta' to be a JSON object"),
-        (changed(meta=np.array('{"frames": 1}')), "expected 'meta' to be a JSON object"),
+        (changed(meta=np.array('{"frames": 1}')), "frames of 'meta' is 1; expected true or false"),
         (changed(meta=np.array(3)), "expected 'meta' to be a JSON object"),
         (changed(meta=np.array("[" * 100_000)), "expected 'meta' to be a JSON object"),
         (changed(meta=np.array('{"frames": true}')), r"expected \[F, \*frame\] = \[.., 3\]"),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..core.plan import DENSE, ORIGINAL
+from ..core.rules import Hertz
 from ..errors import ArtifactError
 from ..ir import pieces as names
 from . import typed_json
@@ -298,6 +299,7 @@ _RECORD: Mapping[str, Any] = {
     "plans": Mapping[str, Mapping[str, Any]],
     "budget": Mapping[str, Any],
     "other_noise": float | None,
+    "policy_hz": Hertz | None,
     "episodes": Mapping[str, tuple[int, ...]],
     "calls": Mapping[str, int],
     "skipped": Mapping[str, str],

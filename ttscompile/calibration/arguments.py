@@ -57,6 +57,12 @@ def require_limits(validation_fraction: float, max_minutes: float) -> None:
         )
 
 
+def require_rate(policy_hz: float | None) -> None:
+    """Raise CalibrationError unless it is a rate, or none."""
+    if policy_hz is not None and not 0 < policy_hz < math.inf:
+        raise CalibrationError(f"policy_hz: expected a positive number; found {policy_hz}.")
+
+
 def require_alone(learn: Sequence[str], strategy: str, *budgets: float | None) -> None:
     """Raise where loops are learned, and something that they cannot keep is asked for."""
     if "schedule" in learn:

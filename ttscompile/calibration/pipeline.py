@@ -18,8 +18,9 @@ from ..core.plan import ORIGINAL
 from ..errors import CalibrationError, CalibrationFailedError
 from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
+from ..trajectories import recorded_rate
 from ..verification.record_golden import record_plans
-from .arguments import calls_to_learn_from, require_alone, require_directory, require_limits
+from .arguments import calls_to_learn_from, require_alone, require_directory, require_limits, require_rate
 from .budget import DISTANCE, ERROR, LATENCY, goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
 from .choose import choose
@@ -59,6 +60,7 @@ class CalibrationResult:
         seconds: of work, the parts before an interruption included.
         other_noise: mean absolute difference of the executed actions of two dense calls on one observation with
             different noise, in the units of the actions; None if it was not measured.
+        policy_hz: rate of the frames and actions that the policy was trained with; None if nobody said it.
         budget: what was asked for, the cells that it comes to, and what was measured for it; JSON.
         skipped: why there is no plan of a name that there might be.
         told: by proposer, what became of it.
@@ -78,6 +80,7 @@ class CalibrationResult:
     stopped: str
     seconds: float
     other_noise: float | None = None
+    policy_hz: float | None = None
     budget: Mapping[str, Any] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
     told: Mapping[str, str] = field(default_factory=dict)
@@ -102,7 +105,7 @@ class CalibrationResult:
     def record(self) -> dict[str, Any]:
         """As JSON, for the artifact. Without the time it took: the same calibration gives the same bytes."""
         left_out = ("seconds",) if self.frontier else ("seconds", "frontier")
-        record = {name: value for name, value in asdict(self).items() if name not in left_out}
+        record = {name: one for name, one in asdict(self).items() if one is not None and name not in left_out}
         return record | {"plans": {name: score.record() for name, score in self.plans.items()}}
 
 
@@ -119,6 +122,7 @@ def calibrate(
     latency_ms: float | None = None,
     max_action_error: float | None = None,
     max_distance: float | None = None,
+    policy_hz: float | None = None,
     threads: int = 1,
     max_minutes: float = 15.0,
     validation_fraction: float = FRACTION,
@@ -162,6 +166,8 @@ def calibrate(
         max_distance: by how much further from the original a plan may be that costs less than the one it was made from;
             None for what its proposer allows. Where loops are learned: the distance from the original that the
             default may have, see ``proposer.near``.
+        policy_hz: rate in Hz of the frames and actions that the policy was trained with, which an executor plays its
+            actions at; None for what the recordings say, or the artifact.
         threads: how many threads the calls have that are timed for ``latency_ms``.
         max_minutes: of work: those in which all of torch's threads compute. The best plan so far is taken in time to be
             finished by then, as far as what was done before lets it be known; what has to be done at least is done.
@@ -201,6 +207,7 @@ def calibrate(
         max_intervals = integer(max_intervals, "max_intervals", CalibrationError, 1)
     if max_distance is not None and not max_distance > 0:
         raise CalibrationError(f"max_distance: expected a positive number; found {max_distance}.")
+    require_rate(policy_hz)
     if ray is not None and device is not None:
         raise CalibrationError(
             f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
@@ -234,6 +241,7 @@ def calibrate(
         episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
         corrects = correct or any(row.corrects for row in rows if row.name != SCHEDULE)
         corrects |= chosen.fits_correction and SCHEDULE in learn
+        rate = policy_hz or recorded_rate(trajectories) or (artifact.manifest.calibration or {}).get("policy_hz")
         limits = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
         settings = {
             # Of what replaces no plans, these too: what is learned is learned for one of them.
@@ -287,6 +295,7 @@ def calibrate(
             default_plan=kept.default,
             plans=kept.scores,
             other_noise=other_noise(trials),
+            policy_hz=rate,
             skipped={**schedule.skipped, **kept.refused},
             episodes={"calibration": trials.split.calibration, "validation": trials.split.validation},
             calls={"calibration": trials.used, "validation": len(trials.held_out.calls)},
@@ -353,7 +362,7 @@ def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept
     steps = {name: notes[name]["steps"] for name in (SAFE, FAST) if name in notes}
     own["learned"] = list(dict.fromkeys([*record.get("learned", []), *own["learned"]]))
     own["told"] = {**record.get("told", {}), **own["told"]}
-    more = {key: own[key] for key in ("plans", "learned", "told")}
+    more = {key: own[key] for key in ("plans", "learned", "told", "policy_hz") if key in own}
     record |= {**notes.pop(SCHEDULE, {}), **own, "named_steps": steps} if anew else more
     pruner, loop = (None, ORIGINAL) if kept.pruner is None else kept.pruner
     update_plans(

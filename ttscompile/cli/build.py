@@ -26,7 +26,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import GIVE
 from ttscompile.report.summary import document
 
-SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz"), ("control_hz",)), LEROBOT)
+SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)

@@ -125,8 +125,8 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
 policy_hz_option = number_option(
     "--policy-hz",
     RATE,
-    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is that of"
-    " --control-hz.",
+    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is what the"
+    " recordings say, or that of --control-hz.",
 )
 loop_options = together(
     policy_hz_option,

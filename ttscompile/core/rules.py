@@ -34,6 +34,7 @@ DType = Annotated[str, Rule(f"one of {', '.join(_DTYPES)}", _DTYPES.__contains__
 LOOP_NAME = Rule("a name of lower-case letters, digits and + . -", re.compile(r"[a-z0-9][a-z0-9+.-]{0,63}").fullmatch)
 LoopName = Annotated[str, LOOP_NAME]
 NotNegative = Annotated[float, Rule("a number that is not negative", lambda x: x >= 0)]
+Hertz = Annotated[float, Rule("a positive number", lambda x: x > 0)]
 Positive = Annotated[int, Rule("a 64-bit integer of at least 1", lambda n: n >= 1)]
 Shape = Annotated[tuple[Positive, ...], Rule(f"at most {MAX_RANK} sizes", lambda sizes: len(sizes) <= MAX_RANK)]
 Sha256 = Annotated[str, Rule("64 hexadecimal digits", re.compile(r"[0-9a-f]{64}").fullmatch)]

@@ -4,5 +4,6 @@ Whatever is wrong with a recording is a ``TrajectoryError`` of any function of t
 """
 
 from .episodes import Episode, episodes_of, load_trajectories, read_npz
+from .rate import recorded_rate
 
-__all__ = ["Episode", "episodes_of", "load_trajectories", "read_npz"]
+__all__ = ["Episode", "episodes_of", "load_trajectories", "read_npz", "recorded_rate"]

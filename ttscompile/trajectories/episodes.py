@@ -203,7 +203,9 @@ def _opened(path: Path, limits: Mapping[str, int], wanted: Sequence[str]) -> tup
 
 def _npz(path: Path) -> tuple[Frames, bool]:
     arrays = read_npz(path)
-    frames = _meta(path, arrays.pop(META, None))
+    frames = meta_of(path, arrays.pop(META, None)).get("frames", False)
+    if not isinstance(frames, bool):
+        raise TrajectoryError(f"{path}: frames of {META!r} is {frames!r:.80}; expected true or false.")
     if ENDS not in arrays:
         told = f"{path}: has no array {ENDS!r}; it has {few(sorted(arrays)) or 'no arrays at all'}"
         raise TrajectoryError(f"{told}. Add {ENDS} [E]: {_ENDS_ARE}.")
@@ -215,8 +217,8 @@ _ENDS_ARE = "for each episode the row after its last, increasing"
 _SAVEZ = "Use np.savez with plain arrays"
 
 
-def read_npz(path: Path) -> dict[str, Array]:
-    """All arrays of an ``.npz``, without unpickling anything.
+def read_npz(path: Path, only: str = "") -> dict[str, Array]:
+    """All arrays of an ``.npz``, or the one of a name if it is there, without unpickling anything.
 
     Raises:
         TrajectoryError: it is missing, truncated, of another format, or holds Python objects.
@@ -245,7 +247,7 @@ def read_npz(path: Path) -> dict[str, Array]:
             archive: Any = file.zip  # nothing has been decompressed yet
             total = sum(entry.file_size for entry in archive.infolist())
             require_proportion(path, total, path.stat().st_size)
-            return {name: np.asarray(file[name]) for name in file.files}
+            return {name: np.asarray(file[name]) for name in file.files if only in ("", name)}
 
 
 def _other_format(path: Path) -> str | None:
@@ -259,19 +261,17 @@ def _other_format(path: Path) -> str | None:
     return "lerobot" if (path / "meta" / "info.json").exists() else None
 
 
-def _meta(path: Path, value: Array | None) -> bool:
-    if value is None:
-        return False
-    meta = None
-    if value.ndim == 0 and value.dtype.kind in "SU":
+def meta_of(path: Path, value: Array | None) -> dict[str, Any]:
+    """What the array ``meta`` of an ``.npz`` says of it; nothing where there is none."""
+    meta = {} if value is None else None
+    if value is not None and value.ndim == 0 and value.dtype.kind in "SU":
         text = value.item()
         with suppress(ValueError):
             meta = parse_json(text if isinstance(text, bytes) else text.encode(), MAX_META)
-    frames = meta.get("frames", False) if isinstance(meta, dict) else None
-    if not isinstance(frames, bool):
+    if not isinstance(meta, dict):
         told = f"{path}: expected {META!r} to be a JSON object in a string array, such as '{{\"frames\": true}}'"
         raise TrajectoryError(f"{told}; found {str(value)[:80]!r}.")
-    return frames
+    return meta
 
 
 def _ends(path: Path, ends: Array) -> list[int]:

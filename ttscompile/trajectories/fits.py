@@ -13,11 +13,10 @@ import numpy.typing as npt
 from ..core.finding import Finding, Level
 from ..core.spec import Affine, PolicySpec
 from ..core.tokenizer import TASK, ReadTokenizer
-from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
 from .episodes import Episode, array_names, episodes_of, local_path, recorded_names
-from .frames import few, one_error
-from .lerobot_dataset import MAX_INFO
+from .frames import few
+from .rate import rate_of
 
 PART = "recordings"
 
@@ -188,11 +187,8 @@ def _pairs(missing: Sequence[str], free: Sequence[str]) -> dict[str, str]:
 
 
 def _rate(path: Path, spec: PolicySpec) -> list[Finding]:
-    info, executed = path / "meta" / "info.json", spec.chunk.stop - spec.chunk.start
-    if not info.is_file():
+    executed = spec.chunk.stop - spec.chunk.start
+    if (rate := rate_of(path)) is None:
         return []
-    with one_error(f"{path}: meta/info.json cannot be read"):
-        rate = float(parse_json(info.read_bytes(), MAX_INFO)["fps"])
-        told = f"{rate:g} Hz: {executed} steps are executed in {executed / rate:.2g} s, before the next look"
-    remedy = f"Lower n_action_steps, and run it with --policy-hz {rate:g}."
-    return [Finding.judged(PART, "rate", told, executed / rate > _BLIND_SECONDS, remedy)]
+    told = f"{rate:g} Hz: {executed} steps are executed in {executed / rate:.2g} s, before the next look"
+    return [Finding.judged(PART, "rate", told, executed / rate > _BLIND_SECONDS, "Lower n_action_steps.")]

@@ -127,6 +127,7 @@ class Facts:
     plans: tuple[str, ...]
     default_plan: str
     trained_prefix: int = 0
+    policy_hz: float | None = None
 
 
 @dataclass

@@ -126,9 +126,20 @@ def test_the_window_is_that_of_the_observations_wherever_the_chunk_begins() -> N
             sample=(8, 2),
             plans=("dense",),
             default_plan="dense",
+            policy_hz=None,
         )
         return settings.resolve(ExecutorSettings(), info, 10.0).frames.steps  # type: ignore[arg-type]
 
     assert steps(0, obs=2) == steps(0, obs=2, goal=None) == steps(1, obs=2) == 2
     assert steps(1, obs=3) == 3
     assert steps(1, obs=2, depth=4) == 2, "of two windows the one that the chunk implies"
+
+
+def test_the_artifact_says_at_which_rate_its_actions_are_played() -> None:
+    """Unless the settings do; and a loop that cannot play them at it is refused, not played faster."""
+    info = replace(ScriptedPolicy(FakeClock()).info, policy_hz=10.0)
+    assert settings.resolve(ExecutorSettings(), info, 50.0).ticks_per_step == 5
+    assert settings.resolve(ExecutorSettings(policy_hz=25), info, 50.0).ticks_per_step == 2
+    told = "no multiple of policy_hz = 10, at which its recordings were made: an action would last 2.5 ticks"
+    with pytest.raises(ExecutorError, match=told):
+        settings.resolve(ExecutorSettings(), info, 25.0)
