@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from environments.disturbed.pusht import GOALS, PushTLong
@@ -74,6 +75,22 @@ def test_keypoints_lie_on_the_block_of_the_simulator() -> None:
     for point in keypoints(world.block.position, world.block.angle):
         # They were picked from a drawing with a border: up to 3 px outside.
         assert min(shape.point_query(tuple(point)).distance for shape in world.block.shapes) < 3
+
+
+def test_the_quick_simulator_has_the_numbers_of_gym_pusht() -> None:
+    """States to the bit; a coverage up to the order in which areas are summed, which a set of shapes leaves open."""
+    environment, original = PushT(), gymnasium.make("gym_pusht/PushT-v0", obs_type="state")
+    environment.reset(seed=5, state=[200.0, 300.0, 260.0, 250.0, 0.7])
+    original.reset(seed=5)
+    place(original.unwrapped, [200.0, 300.0, 260.0, 250.0, 0.7])
+    draw, best = np.random.default_rng(0), 0.0
+    for target in np.repeat(draw.uniform(150, 350, (20, 2)), 5, axis=0):
+        environment.step(target)
+        state, _, _, _, info = original.step(target)
+        best = max(best, info["coverage"])
+        np.testing.assert_array_equal(environment.state, state)
+        assert environment.coverage == pytest.approx(best, abs=1e-12)
+    assert 0.2 < best < 0.95
 
 
 def replay_error(states: np.ndarray, actions: np.ndarray) -> tuple[float, float, float]:

@@ -16,10 +16,11 @@ from typing import Any
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
-import gym_pusht  # type: ignore[import-untyped]  # noqa: F401  (registers the environment)
-import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gym_pusht.envs.pusht import PushTEnv, pymunk_to_shapely  # type: ignore[import-untyped]
+from gymnasium.wrappers import TimeLimit
+from pymunk import Vec2d
 
 from . import Array, Frame
 
@@ -95,6 +96,23 @@ def place(body_world: Any, state: npt.ArrayLike) -> None:
     body_world.space.reindex_shapes_for_body(body_world.block)
 
 
+class QuickPushT(PushTEnv):  # type: ignore[misc]
+    """gym-pusht: the same numbers in half the time. Polygons are made of the goal once, and of a block that moved."""
+
+    _goal: tuple[tuple[float, ...], Any] = (), None
+    _covered: tuple[tuple[float, ...], float] = (), 0.0
+
+    def _get_coverage(self) -> float:
+        goal, block = tuple(self.goal_pose), (*self.block.position, self.block.angle)
+        if goal != self._goal[0]:
+            self._goal = goal, pymunk_to_shapely(self.get_goal_pose_body(self.goal_pose), self.block.shapes)
+            self._covered = (), 0.0
+        if block != self._covered[0]:
+            there = pymunk_to_shapely(self.block, self.block.shapes)
+            self._covered = block, self._goal[1].intersection(there).area / self._goal[1].area
+        return self._covered[1]
+
+
 class PushT:
     """See ``Environment``. The score is the original's reward: best coverage of the goal / ``SUCCESS_COVERAGE``.
 
@@ -107,15 +125,8 @@ class PushT:
     displacements: tuple[int, ...] = ()
 
     def __init__(self) -> None:
-        self._gym: Any = gymnasium.make(
-            "gym_pusht/PushT-v0",
-            obs_type="state",
-            render_mode="rgb_array",
-            visualization_width=PICTURE,
-            visualization_height=PICTURE,
-            max_episode_steps=self.max_steps,
-            disable_env_checker=True,
-        )
+        world = QuickPushT("state", "rgb_array", visualization_width=PICTURE, visualization_height=PICTURE)
+        self._gym: Any = TimeLimit(world, self.max_steps)
         self.state: Float64Array = np.zeros(5)
         self.coverage, self.done = 0.0, True
 
@@ -155,7 +166,8 @@ class PushT:
 
     def step(self, action: npt.ArrayLike) -> None:
         """Send the agent towards a position ``[2]``, pixels, for 0.1 s."""
-        self.state, _, terminated, truncated, info = self._gym.step(np.asarray(action, dtype=np.float64))
+        target = Vec2d(*np.asarray(action, dtype=np.float64).tolist())  # whose arithmetic is a tenth of an array's
+        self.state, _, terminated, truncated, info = self._gym.step(target)
         self.coverage = max(self.coverage, float(info["coverage"]))
         self.done = terminated or truncated
 
