@@ -52,7 +52,7 @@ class Policy(Protocol):
 
     @property
     def info(self) -> Any:
-        """Of ``PolicyInfo`` what is read here: ``observation, action, sample, plans, default_plan, policy_hz``."""
+        """Of ``PolicyInfo``: ``observation, action, sample, plans, default_plan``; ``policy_hz`` may be missing."""
 
     def reset(self, seed: int | None = None) -> None:
         """A new episode; or, without a seed, within one, where a call shall go on from nothing (``stall_after``)."""
@@ -253,7 +253,7 @@ class Resolved(ExecutorSettings):
 def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> Resolved:
     """Fit settings to a policy. Raises ExecutorError: they do not fit."""
     control_hz = require_number(control_hz, "control_hz")
-    policy_hz = settings.policy_hz or info.policy_hz or control_hz
+    policy_hz = settings.policy_hz or getattr(info, "policy_hz", None) or control_hz  # those of others may lack it
     ticks = control_hz / policy_hz
     ticks_per_step = round(ticks) if isfinite(ticks) else 0
     if ticks_per_step < 1 or abs(ticks_per_step * policy_hz - control_hz) > 1e-6 * control_hz:
