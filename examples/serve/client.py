@@ -24,6 +24,7 @@ import ssl
 import struct
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -101,8 +102,9 @@ class Client:
         return result
 
     def close(self) -> None:
-        """End the connection."""
-        self._send(CLOSE, struct.pack("!H", 1000))
+        """End the connection; one that has ended is closed as well."""
+        with suppress(OSError):
+            self._send(CLOSE, struct.pack("!H", 1000))
         self._stream.close()
         self._socket.close()
 
@@ -115,8 +117,9 @@ class Client:
         else:
             head = struct.pack("!BBQ", 0x80 | kind, 0x80 | 127, size)
         mask = os.urandom(4)
-        masked = bytes(byte ^ mask[i % 4] for i, byte in enumerate(payload))
-        self._socket.sendall(head + mask + masked)
+        whole = (mask * (size // 4 + 1))[:size]
+        masked = int.from_bytes(payload, "big") ^ int.from_bytes(whole, "big")  # as one number: a camera has megabytes
+        self._socket.sendall(head + mask + masked.to_bytes(size, "big"))
 
     def _receive(self) -> bytes:
         message = b""
@@ -130,6 +133,7 @@ class Client:
                 self._send(PONG, payload)
             elif kind == CLOSE:
                 code = struct.unpack("!H", payload[:2])[0] if payload else 1005
+                self.close()
                 raise ConnectionError(f"the server closed the connection: {code} {payload[2:].decode()}")
             elif kind != PONG:
                 message += payload

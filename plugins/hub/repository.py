@@ -70,7 +70,8 @@ def read_name(text: str) -> HubName:
 def require_repository(repository: str, told: str) -> None:
     """Raise HubError, with a message that begins with ``told``, unless this is ``org/name``."""
     if _REPOSITORY.fullmatch(repository) is None or "--" in repository or ".." in repository:
-        raise HubError(f"{told:.200}: this is no name of a repository; {EXPECTED}.")
+        expected = EXPECTED if told.startswith(HUB) else "expected ORGANISATION/NAME"  # to upload to
+        raise HubError(f"{told:.200}: this is no name of a repository; {expected}.")
 
 
 def plain(path: str) -> bool:

@@ -27,6 +27,8 @@ from ttscompile.errors import ExecutorError
 
 NUMBER_BYTES = 8
 """Of a message for each number of an observation: a float32 in base64 takes 5.4 bytes, a pixel in digits takes four."""
+PIXELS = 1280 * 720
+"""Of a picture that the policy resizes: a message has room for one of so many, whatever the policy makes of it."""
 VALUES = 3
 """Of a message for each number of an observation: lists of one number have a bracket and a comma beside it."""
 
@@ -71,7 +73,9 @@ class ServerLimits:
     def of(cls, observations: Mapping[str, ObservationSpec], clients: int) -> ServerLimits:
         """Limits of a server that is sent such observations; a message may have 1 MiB and 20,000 values at least."""
         numbers = sum(prod(one.shape) for one in observations.values())
-        size, values = NUMBER_BYTES * numbers + (1 << 16), VALUES * numbers + 1000
+        resized = [one.shape for one in observations.values() if one.fit is not None]
+        more = sum(prod(shape[:-2]) * max(PIXELS - prod(shape[-2:]), 0) for shape in resized)
+        size, values = NUMBER_BYTES * (numbers + more) + (1 << 16), VALUES * numbers + 1000
         return cls(clients, max(cls.message_bytes, size), max(cls.message_values, values))
 
     def __post_init__(self) -> None:

@@ -30,6 +30,7 @@ from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings
 from ttscompile.runtimes.instruct import instruct_of
 from ttscompile.runtimes.load import open_policy
+from ttscompile.runtimes.open import require_able
 
 from .admission import AUDIT, ServerLimits
 from .copies import LOCAL, FleetSettings, ray_copies
@@ -278,7 +279,8 @@ def _serve_fleet(
     plan: str | None = None,
 ) -> None:
     console, artifact = progress(), load_artifact(directory)
-    Plans.of(artifact, plan)  # before copies are started, which takes a while
+    wanted = Plans.of(artifact, plan).default  # before copies are started, which takes a while
+    require_able("onnxruntime", artifact, artifact.plan(wanted))
     instruct = instruct_of(artifact, tokenizer)
     output, identity = sys.stdout, artifact.manifest.identity
     limits = ServerLimits.of(artifact.manifest.spec.observations, FLEET_CLIENTS)

@@ -19,12 +19,16 @@ UNREAD = 2**18
 
 
 class CountedConnection(ServerConnection):
-    """Ends, as by the network, when its client sends too many pings or empty fragments, or reads no answers."""
+    """Ends, as by the network, when its client sends too many pings or empty fragments, or reads no answers.
+
+    So does one that is closed, but whose client leaves its socket open: the library would wait for it for ever.
+    """
 
     def __init__(self, admission: Admission, limits: ServerLimits, *library: Any, **more: Any) -> None:
         super().__init__(*library, **more)
         self._admission = admission
         self._pace = Pace(limits.control_per_second, self.loop.time())
+        self._closing, self._close_timeout = False, limits.send_timeout
 
     def data_received(self, data: bytes) -> None:
         """As of any connection, a slice after the other."""
@@ -34,6 +38,9 @@ class CountedConnection(ServerConnection):
             super().data_received(data[start : start + SLICE])
             if self.transport.get_write_buffer_size() > UNREAD:
                 self._cut_off()
+        if self.protocol.close_expected() and not self._closing:
+            self._closing = True
+            self.loop.call_later(self._close_timeout, self.transport.abort)
 
     def process_event(self, event: Any) -> None:
         """As of any connection."""

@@ -1,6 +1,7 @@
 """Copies of a policy on a Ray cluster, which answer requests of one plan in batches (Ray Serve)."""
 
 import asyncio
+import signal
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -135,6 +136,7 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
         from ray import serve
     name = f"ttscompile-{uuid4().hex[:12]}"  # a cluster may have several fleets
     given: dict[str, Any] = {"num_cpus": settings.copies * settings.threads} if address == LOCAL else {}
+    ended = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(
             address=address,
@@ -145,6 +147,9 @@ def ray_copies(address: str, artifact: Path, identity: str, settings: FleetSetti
         )
     except Exception as error:  # a node that does not start in time raises a bare one
         raise ClusterError(f"--ray {address}: no cluster can be reached ({first_line(error)}).") from error
+    finally:
+        if signal.getsignal(signal.SIGTERM) is not ended:  # Ray's own would end the command with status 15
+            signal.signal(signal.SIGTERM, ended)
     try:
         serve.start(proxy_location="Disabled")
         deployment = serve.deployment(

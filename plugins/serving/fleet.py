@@ -17,7 +17,9 @@ import numpy as np
 from ttscompile.artifact.load import Artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.tokenizer import TASK
+from ttscompile.core.values import fitted
 from ttscompile.errors import DeadlineMissedError, IllegalPlanError, ObservationError, OverloadedError
+from ttscompile.runtimes.arrays import image_remedy
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.instruct import Instruct
 from ttscompile.runtimes.liveness import reads_earlier_calls
@@ -48,15 +50,19 @@ class Plans(NamedTuple):
 
     @classmethod
     def of(cls, artifact: Artifact, default: str | None = None) -> Plans:
-        """Those of an artifact; None for its own default.
+        """Those of an artifact, and the default, which may be one in another precision; None for the artifact's own.
 
         Raises:
             IllegalPlanError: there is no such plan, or it reads the call before, which here is another robot's.
         """
         plans = {name: plan for name, plan in artifact.plans.items() if plan.otherwise is None}
         names = tuple(name for name, plan in plans.items() if not reads_earlier_calls(view_of(artifact, plan), plan))
-        found = cls(names, artifact.manifest.default_plan if default is None else default)
-        return found._replace(default=found.known(found.default))
+        default = artifact.manifest.default_plan if default is None else default
+        if default not in names:
+            cls(names, default).known(default.partition("@")[0])
+            artifact.plan(default)  # which knows what precisions there are
+            names = (*names, default)
+        return cls(names, default)
 
     def known(self, plan: str) -> str:
         """The name, if it is one of these. Raises IllegalPlanError: see above."""
@@ -159,11 +165,11 @@ class FleetServer(Listener):
             text = " Text needs a server with a tokenizer (serve: --tokenizer)." * (TASK in obs)
             raise ObservationError(f"expected an observation of {sorted(self._specs)}; found {sorted(obs)[:20]}.{text}")
         for key, one in self._specs.items():
-            array = obs[key]
+            array = obs[key] = fitted(obs[key], one, f"observation {key!r}")
             if (array.shape, str(array.dtype)) != (one.shape, one.dtype) or not np.isfinite(array).all():
-                found = f"{array.dtype} {list(array.shape)}"
+                found = f"{array.dtype} {list(array.shape)}.{image_remedy(array[None], one)}"
                 expected = f"{one.dtype} {list(one.shape)}, of finite numbers"
-                raise ObservationError(f"observation {key!r} must be {expected}; found {found}.")
+                raise ObservationError(f"observation {key!r} must be {expected}; found {found}")
         return obs
 
     async def trouble(self) -> str:

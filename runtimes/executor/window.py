@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ttscompile.core.spec import ChunkSpec, ObservationSpec
 from ttscompile.core.values import check_values
 from ttscompile.errors import ObservationError
-from ttscompile.runtimes.arrays import read_observation
+from ttscompile.runtimes.arrays import image_remedy, read_observation
 
 Array: TypeAlias = npt.NDArray[Any]
 Frame: TypeAlias = dict[str, Array]
@@ -72,7 +72,7 @@ class FrameSpec:
 
     def _own(self, key: str, array: Array, spec: ObservationSpec) -> Array:
         if array.shape != spec.shape or array.dtype != spec.dtype:
-            remedy = "Convert it with .astype." if array.shape == spec.shape else ""
+            remedy = image_remedy(array[None], spec).strip() or "Convert it with .astype." * (array.shape == spec.shape)
             if array.shape[1:] == spec.shape and key in self.history:
                 remedy = f"Give one frame at a time; the executor makes the window of {self.steps}."
             what = f"one frame of observation {key!r} must be {spec.dtype} {list(spec.shape)}"

@@ -109,6 +109,17 @@ def test_what_can_go_on_says_so(before: list[str], monkeypatch: pytest.MonkeyPat
     assert (result.exit_code, result.stderr) == (Status.INTERRUPTED, told)
 
 
+def test_a_signal_in_a_library_in_c_is_no_defect(failing: Callable[[BaseException], None]) -> None:
+    """Where Python finds an error that C has not handed on, as of Ray, it makes another one of it."""
+    error = SystemError("<built-in method __new__> returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    failing(error)
+    assert CliRunner().invoke(main, ["inspect", "an artifact"]).stderr == "interrupted\n"
+    error.__cause__ = None
+    failing(error)
+    assert CliRunner().invoke(main, ["inspect", "an artifact"]).exit_code == Status.DEFECT
+
+
 def test_an_artifact_that_is_called_like_a_command(failing: Callable[[BaseException], None]) -> None:
     failing(KeyboardInterrupt())
     assert CliRunner().invoke(main, ["inspect", "calibrate"]).stderr == "interrupted\n"

@@ -326,8 +326,9 @@ def test_a_repository_with_something_else_is_left_alone(hub: Hub, toy_artifact: 
     with pytest.raises(HubError, match="expected an empty repository or an artifact; it has model.safetensors"):
         ttscompile.push(toy_artifact, "org/mine", runs=1)
     assert hub.find("org/mine", "main")[0] == commit
-    with pytest.raises(HubError, match="no name of a repository"):
-        ttscompile.push(toy_artifact, "mine", runs=1)
+    for name in ("mine", "org/mine@v1", "org/mine/folder"):
+        with pytest.raises(HubError, match=r"no name of a repository; expected ORGANISATION/NAME\.$"):
+            ttscompile.push(toy_artifact, name, runs=1)
 
 
 def test_what_is_to_be_private_goes_into_no_public_repository(hub: Hub, toy_artifact: Path) -> None:

@@ -46,6 +46,15 @@ def test_a_message_has_room_for_an_observation_as_numbers_or_in_base64() -> None
     assert found > 2 * len(base64.b64encode(bytes(4 * 921_600)))
 
 
+def test_a_message_has_room_for_a_camera_s_picture_where_the_policy_resizes_it() -> None:
+    seen = ObservationSpec((1, 3, 224, 224), bounds=(0.0, 1.0), fit="start")
+    limits = ServerLimits.of({"front": seen, "wrist": seen}, 3)
+    assert limits.message_bytes > 2 * len(base64.b64encode(bytes(4 * 3 * 720 * 1280)))
+    assert limits.message_values == ServerLimits.of({"one": ObservationSpec((6, 224, 224))}, 3).message_values
+    large = ObservationSpec((1, 3, 2000, 2000), bounds=(0.0, 1.0), fit="centre")
+    assert ServerLimits.of({"front": large}, 3).message_bytes == 8 * 3 * 2000 * 2000 + 65_536
+
+
 def test_a_full_server_is_no_fault_of_the_client() -> None:
     admission = Admission(ServerLimits(clients=1, refusals_per_minute=1), lambda: 0.0)
     assert admission.comes(("10.0.0.1", 1)) and admission.refusal(("10.0.0.1", 1)) == ""

@@ -1,6 +1,7 @@
 """The server of a fleet, with copies that are scripted: what it lets through, and what it tells."""
 
 import asyncio
+import base64
 import importlib.util
 import shutil
 import threading
@@ -19,6 +20,7 @@ from tests.word_tokenizer import write_tokenizer
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.spec import Instruction, ObservationSpec
+from ttscompile.core.values import fitted
 from ttscompile.errors import ClusterError, IllegalPlanError, NonFiniteActionsError
 from ttscompile.runtimes.executor.window import Array
 from ttscompile.runtimes.instruct import instruct_of
@@ -135,6 +137,24 @@ def test_robots_send_their_instruction_as_text_where_the_fleet_has_a_tokenizer(
         call("predict", obs={**GOOD, "task": "push left"})
 
 
+def test_pictures_are_resized_as_by_the_policy_and_bytes_are_refused_with_advice(
+    planned: Path, copies: Scripted
+) -> None:
+    artifact = load_artifact(planned)
+    seen = {"obs": ObservationSpec((2,)), "front": ObservationSpec((1, 3, 8, 8), bounds=(0.0, 1.0), fit="start")}
+    spec = replace(artifact.manifest.spec, observations=seen)
+    artifact = replace(artifact, manifest=replace(artifact.manifest, spec=spec))
+    picture, limits = np.random.default_rng(0).random((1, 3, 4, 16), np.float32), replace(LIMITS, message_bytes=8192)
+    with listening(lambda: FleetServer(artifact, copies, limits=limits)) as url, connected(url) as call:
+        assert call("predict", obs={**GOOD, "front": picture.tolist()})["action"]
+        np.testing.assert_array_equal(copies.given[-1]["front"], fitted(picture, seen["front"]))
+        image = np.zeros((1, 8, 8, 3), np.uint8)
+        packed = {"dtype": "uint8", "shape": image.shape, "base64": base64.b64encode(image.tobytes()).decode()}
+        with pytest.raises(ServerError, match=r"Divide by 255, channels first.*np\.moveaxis\(image, -1, -3\)"):
+            call("predict", obs={**GOOD, "front": packed})
+    assert len(copies.given) == 1
+
+
 def test_more_requests_than_may_be_under_way_are_refused_at_once(planned: Path, copies: Scripted) -> None:
     copies.may.clear()
     with fleet(planned, copies, waiting=2) as url:
@@ -212,6 +232,19 @@ def test_the_lock_is_that_of_serve(planned: Path, copies: Scripted) -> None:
 def test_a_plan_that_cannot_run_is_refused_before_it_starts(planned: Path, plan: str, message: str) -> None:
     with pytest.raises(IllegalPlanError, match=message):
         Plans.of(load_artifact(planned), plan)
+
+
+def test_the_default_may_be_a_plan_in_another_precision(planned: Path, copies: Scripted) -> None:
+    with fleet(planned, copies, plan="evenly@fp32") as url, connected(url) as call:
+        assert call("info")["plans"] == ["dense", "evenly", "evenly@fp32"]
+        for plan in (None, "evenly", "evenly@fp32"):
+            call("predict", obs=GOOD, plan=plan)
+        with pytest.raises(ServerError, match="IllegalPlanError: plan 'dense@fp32' cannot run here"):
+            call("predict", obs=GOOD, plan="dense@fp32")  # each would be opened by every copy
+    assert copies.asked == ["evenly@fp32", "evenly", "evenly@fp32"]
+    for plan, message in (("memory@fp32", "another robot's"), ("evenly@fp31", "no plan 'evenly@fp31'")):
+        with pytest.raises(IllegalPlanError, match=message):
+            Plans.of(load_artifact(planned), plan)
 
 
 def test_a_pruner_that_may_read_the_call_before_is_left_out(toy_compiled: Path, tmp_path: Path) -> None:

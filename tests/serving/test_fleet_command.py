@@ -35,6 +35,8 @@ ray_needed = pytest.mark.skipif(
         (("--host", "0.0.0.0"), "no token and no certificate"),
         (("--plan", "memory"), "another robot's"),
         (("--plan", "nothing"), "expected one of ['dense', 'evenly']"),
+        (("--plan", "dense@bf16"), "runtime 'onnxruntime' computes in fp32"),
+        (("--plan", "dense@int8"), "the artifact has fp32 alone"),
         (("--copies", "0"), "0 is not in the range"),
         (("--control-hz", "10"), "give --control-hz HZ to drive one robot, or --copies N or --openpi to answer many"),
         (("--margin-ticks", "0"), "--margin-ticks is for --control-hz: give it too"),
@@ -69,6 +71,26 @@ def test_a_cluster_that_does_not_start_is_one_error(planned: Path, monkeypatch: 
     result = CliRunner().invoke(main, ["serve", str(planned), "--copies", "1", "--port", "0"])
     assert (result.exit_code, result.stdout) == (2, ""), result.output
     assert "no cluster can be reached (The current node timed out during startup.)" in " ".join(result.stderr.split())
+
+
+def test_ray_does_not_take_sigterm_for_itself(planned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own handler would end the command with status 15, and without a word."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def init(**options: Any) -> None:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(15))
+
+    def start(**options: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    ray = SimpleNamespace(init=init, serve=SimpleNamespace(start=start, shutdown=lambda: None), shutdown=lambda: None)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    try:
+        result = CliRunner().invoke(main, ["serve", str(planned), "--copies", "1", "--port", "0"])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert result.exit_code == 143, result.output
+    assert result.stderr.strip().endswith("ended by SIGTERM")
 
 
 @contextmanager

@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 
-from tests.serving.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves
+from tests.serving.serving import LIMITS, client, connected, handshake, raw, read_all, serving, still_serves, wait_until
+from tests.serving.watching import figures, get
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import ProtocolError
 from ttscompile.serving.admission import ServerLimits
@@ -125,6 +126,28 @@ def is_open(sock: socket.socket) -> bool:
         return True
     except OSError:
         return False
+
+
+@pytest.mark.parametrize("kind", ["too large", "close"])
+def test_a_closed_client_that_leaves_its_socket_open_is_gone_soon(kind: str) -> None:
+    """Long before its idle timeout, for which the end of the server would wait as well."""
+    last = struct.pack("!BBHI", 0x81, 0x80 | 126, 10_000, 0) if kind == "too large" else b"\x88\x80mask"
+    with serving(limits=replace(LIMITS, clients=1, idle_timeout=60.0)) as url, raw(url) as sock:
+        sock.sendall(handshake())
+        assert sock.recv(4096).startswith(b"HTTP/1.1 101")
+        sock.sendall(last)
+        assert sock.recv(4096)[0] == 0x88, "the server's close"
+        wait_until(lambda: figures(get(url, "/metrics")[1])["ttscompile_clients"] == 0)
+        still_serves(url)
+
+
+def test_the_example_s_client_ends_with_its_connection() -> None:
+    with serving() as url, connected(url) as call:
+        with pytest.raises(ConnectionError, match="1009"):
+            call("info", id="x" * 10_000)
+        assert call._socket.fileno() == -1
+        call.close()
+        still_serves(url)
 
 
 def test_an_address_that_floods_is_cut_off() -> None:

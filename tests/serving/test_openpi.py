@@ -249,6 +249,13 @@ def test_a_plan_that_reads_the_call_before_is_refused(planned: Path) -> None:
         OpenPiServer(artifact, ttscompile.load(planned, plan="memory"))
 
 
+def test_a_plan_may_be_in_another_precision(planned: Path) -> None:
+    artifact, policy = load_artifact(planned), ttscompile.load(planned, plan="evenly@fp32")
+    with listening(lambda: OpenPiServer(artifact, policy, LIMITS)) as url, client(url) as connection:
+        assert received(connection)["plan"] == "evenly@fp32"
+        assert "actions" in ask(connection, packed({"obs": GOOD}))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

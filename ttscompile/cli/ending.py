@@ -108,8 +108,8 @@ def _told_at_the_end(words: Sequence[str]) -> Iterator[None]:
 
 
 def _signal_behind(error: BaseException) -> BaseException | None:
-    """The signal during which a library was loaded: pybind11 makes every error of that an ImportError."""
-    while isinstance(error, ImportError) and error.__cause__ is not None:
+    """The signal that came in a library: pybind11 makes an ImportError of it as it loads, Python a SystemError in C."""
+    while isinstance(error, ImportError | SystemError) and error.__cause__ is not None:
         error = error.__cause__
     return error if isinstance(error, KeyboardInterrupt | _EndedError) else None
 

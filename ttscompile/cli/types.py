@@ -91,9 +91,8 @@ class PathName(click.Path):
             why = "is no text in UTF-8, and onnxruntime takes no other names. Rename it, or name it by a link."
             self.fail(f"{os.fsencode(text)!r:.300} {why}", param, ctx)
         if on_hub(text):
-            self.fail(
-                f"{text:.200} is on the hub, and this takes what is on this machine: download it first.", param, ctx
-            )
+            why = "is on the hub, and this takes what is on this machine: download it first (hf download)."
+            self.fail(f"{text:.200} {why}", param, ctx)
         try:
             Path(text).stat()
         except (FileNotFoundError, NotADirectoryError):

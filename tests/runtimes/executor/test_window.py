@@ -88,6 +88,15 @@ def test_a_wrong_frame_is_refused(obs: object, message: str) -> None:
         spec.check(obs)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("shape", [(3, 8, 9), (8, 9, 3)])
+def test_a_picture_of_bytes_is_refused_with_advice(shape: tuple[int, ...]) -> None:
+    spec = FrameSpec.of({"front": ObservationSpec((2, 3, 8, 9), bounds=(0.0, 1.0))}, 2)
+    with pytest.raises(ObservationError, match=r"must be float32 \[3, 8, 9\]; found uint8") as refused:
+        spec.check({"front": np.zeros(shape, np.uint8)})
+    assert "Divide by 255, channels first: image.astype(np.float32) / 255." in str(refused.value)
+    assert ("np.moveaxis(image, -1, -3)" in str(refused.value)) == (shape[-1] == 3)
+
+
 def test_a_window_needs_all_its_frames_and_repeats_none() -> None:
     made = window(3, times=[0.0, 0.1])
     assert made.complete is None
