@@ -44,7 +44,7 @@ MAY_IMPORT = {
     "verification": BELOW_ARTIFACT | {"frontends", "runtimes", "trajectories"},
     "pool": BASE | {"artifact"},
     "calibration": BELOW_ARTIFACT | {"lower", "pool", "runtimes", "trajectories", "verification"},
-    "builder": BELOW_ARTIFACT | {"calibration", "driver", "frontends", "runtimes"},
+    "builder": BELOW_ARTIFACT | {"calibration", "driver", "frontends", "runtimes", "trajectories"},
     "rivals": BELOW_ARTIFACT | {"calibration", "runtimes"},
     "serving": BELOW_ARTIFACT | {"cli", "runtimes"},
     "report": BELOW_ARTIFACT | {"hub", "plots", "runtimes", "trajectories", "verification"},

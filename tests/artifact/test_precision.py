@@ -230,6 +230,8 @@ def test_a_copy_without_fp32_computes_what_the_whole_does_and_refuses_the_rest(
             other.predict_action(obs, noise=noise, plan=plan)
     with pytest.raises(ArtifactError, match=r"expected weights_fp32\.safetensors"):
         ttscompile.load(copy, "reference", plan="dense")
+    with pytest.raises(ArtifactError, match=r"expected weights_fp32\.safetensors.* or copy that file too"):
+        ttscompile.verify(copy)
 
 
 def test_a_precision_of_null_is_refused(int8: Path) -> None:

@@ -166,7 +166,21 @@ def test_a_control_loop_that_no_plan_keeps_up_with_is_exit_status_1(built: Path)
     before = (built / "manifest.json").read_bytes()
     result = bench(built, "--control-hz", 20000)
     assert result.exit_code == 1
+    assert "failed: no plan keeps the deadline. The default stays 'schedule'." in result.stderr
     assert (built / "manifest.json").read_bytes() == before
+
+
+def test_a_deadline_of_the_build_that_no_plan_keeps_is_told(toy_compiled: Path, tmp_path: Path) -> None:
+    result = bench(made(toy_compiled, tmp_path, {"schedule": score(0.08)}, budget={"latency_ms": 1e-6}))
+    assert (result.exit_code, "failed: no plan keeps the deadline" in result.stderr) == (1, True)
+
+
+def test_what_cannot_be_chosen_is_told_before_anything_is_timed(built: Path) -> None:
+    result = bench(built, "--plan", "dense", "--plan", "far")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "no --plan may be the default; expected one of schedule, safe, fast." in result.stderr
+    result = bench(Path(shutil.make_archive(str(built.parent / "zipped"), "zip", built)))
+    assert (result.exit_code, result.stdout) == (2, "") and "Unzip it and give the directory" in result.stderr
 
 
 def test_without_a_calibration_there_is_nothing_to_choose(toy_compiled: Path) -> None:

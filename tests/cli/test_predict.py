@@ -18,6 +18,7 @@ from ttscompile import ObservationSpec
 from ttscompile.cli import main
 from ttscompile.cli.predict import observed
 from ttscompile.errors import ObservationError
+from ttscompile.runtimes.policy import CompiledPolicy
 
 FRONT, WRIST, STATE = "observation.images.front", "observation.images.wrist", "observation.state"
 PICTURE = ObservationSpec((2, 3, 4, 5), bounds=(0.0, 1.0))
@@ -52,6 +53,17 @@ def test_the_table_marks_what_is_executed_and_the_picture_is_drawn(toy_compiled:
     assert [int(row[0]) for row in rows if "executed" in row] == list(range(start, stop))
     assert "seed 0: 3 steps of 2 numbers" in result.stdout and "identity " in result.stdout
     assert (tmp_path / "chunk.png").read_bytes().startswith(b"\x89PNG") and "wrote " in result.stderr
+
+
+def test_numbers_of_the_table_never_touch(toy_compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = CompiledPolicy.predict_action
+
+    def tiny(self: CompiledPolicy, obs: Any) -> Any:
+        return {"action_pred": np.full_like(usual(self, obs)["action_pred"], -1.234e-4)}
+
+    monkeypatch.setattr(CompiledPolicy, "predict_action", tiny)
+    (first, *_) = [one for one in run(toy_compiled, "--state", "0.5,-1").stdout.splitlines() if one[:4].strip() == "0"]
+    assert first.split() == ["0", "-0.0001234", "-0.0001234"]
 
 
 def test_pictures_go_to_the_camera_whose_key_ends_so_and_one_frame_fills_the_window(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from ttscompile.errors import ReportError
 from ttscompile.measure.units import plain
 from ttscompile.report import Given, build, facts, pictures, render, verified
 from ttscompile.report.page import Table
+from ttscompile.report.timing import Measurement
 from ttscompile.report.usage import run_episode
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -239,6 +240,21 @@ def test_arrays_of_other_names_reach_the_episode_and_the_checks(
 def test_text_in_pictures_is_no_formula() -> None:
     assert pictures.plain("$\\frac{\x00\u202e") == "?\\frac{??"
     assert len(pictures.plain("x" * 1000)) == 60
+
+
+def test_a_bar_is_as_long_as_the_call_that_is_written_beside_it() -> None:
+    """What is no part of the prologue, the loop or the wait is grey: here half of a call."""
+    parts = {"prologue": 1.0, "frames": 0.0, "pruner": 0.0, "wait_pruner": 0.0, "decode": 4.0}
+    drawn = pictures.latency_picture([Measurement("a", "a", (10.0,), parts)])
+    pixels = np.asarray(Image.open(BytesIO(drawn)).convert("RGB"))[:150]  # without the legend
+    grey, orange = (int((pixels == of).all(-1).sum()) for of in ((0x99,) * 3, (0xD5, 0x5E, 0x00)))
+    assert grey / orange == pytest.approx(5 / 4, rel=0.05)
+
+
+def test_an_artifact_that_is_zipped_is_called_by_its_own_name(toy_compiled: Path, tmp_path: Path) -> None:
+    path = shutil.make_archive(str(tmp_path / "zipped"), "zip", toy_compiled)
+    assert json.loads(run(path, "--json").stdout)["path"] == path
+    assert "ttscompile-" not in run(path).stdout
 
 
 def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) -> None:

@@ -5,17 +5,23 @@ from __future__ import annotations
 import shutil
 import time
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
+from rich.console import Console
 
 from tests.passes.specs import toy_spec
 from tests.plans import store_schedules
 from ttscompile import Affine, Noise
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.contestants import Way, _different_statistics, contestants
+from ttscompile.cli.contestants import Way, _different_statistics, contestants, print_comparison
+from ttscompile.cli.output import table
 from ttscompile.core.lattice import Source, uniform_plan
-from ttscompile.measure.units import ms
+from ttscompile.measure.points import Comparison, MeasuredPoint
+from ttscompile.measure.units import flops, ms
 from ttscompile.report.timing import Contestant, measure
 from ttscompile.runtimes.random_calls import Observation
 
@@ -65,6 +71,34 @@ def test_plans_that_follow_each_other_share_no_memory(toy_compiled: Path, tmp_pa
     assert reads not in (a, b)
 
 
+@pytest.mark.parametrize("width", [110, 80, 60, 50])
+def test_a_table_breaks_no_number_where_there_is_room(width: int) -> None:
+    """As rich does it, one of 80 columns has '55.8..5' above '9.3': it narrows whichever column is widest."""
+    made = table("", "ms a call", "quartiles", "speed-up", "FLOPs", "reused", "prologue")
+    made.add_row("schedule (default)", "57.57", "55.8..59.3", "16.3 x", "156 MFLOP", "87.5%", "0.38")
+    console = Console(file=StringIO(), width=width)
+    with console.capture() as captured:
+        console.print(made)
+    lines = captured.get().splitlines()
+    assert max(map(len, lines)) <= width
+    words = " ".join(lines).split()
+    assert ({"55.8..59.3", "57.57", "schedule", "(default)", "prologue", "speed-up"} <= {*words}) is (width > 50)
+
+
+def test_an_interval_that_one_call_cannot_give_is_unknown() -> None:
+    told: dict[str, Any] = {"error": 0.2, "error_p90": 0.3, "quartiles_ms": (9.0, 11.0), "sparsity": 0.5, "flops": 1e9}
+    points = [
+        MeasuredPoint("this artifact", name, 0.4, 10.0, interval, **told)
+        for name, interval in (("one", (-1e15, 1e15)), ("many", (0.3, 0.5)))
+    ]
+    console = Console(file=StringIO(), width=110)
+    with console.capture() as captured:
+        print_comparison(Comparison(tuple(points), 1, (3,), 1, 0.5, {}, ()), console)
+    rows = [line.split() for line in captured.get().splitlines() if " 0.400 " in line]
+    assert [row[row.index("0.400") + 1] for row in rows] == ["unknown", "0.300..0.500"]
+
+
 def test_long_times_have_no_exponent() -> None:
     assert [ms(time, 4) for time in (0.12345, 33.274, 9999.4, 11630.2)] == ["0.1235", "33.27", "9999", "11630"]
-    assert [ms(time) for time in (33.27, 1030.4)] == ["33.3", "1030"]
+    assert [ms(time) for time in (33.27, 999.6, 1030.4)] == ["33.3", "1000", "1030"]
+    assert [flops(count) for count in (2.5e6, 999_700, 999.6e9)] == ["2.5 MFLOP", "1000 kFLOP", "1000 GFLOP"]

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from PIL import Image
 
 from ttscompile.core.lattice import Source
 from ttscompile.errors import IllegalPlanError
 from ttscompile.measure.points import Point
 from ttscompile.plots.figure import write_picture
-from ttscompile.plots.frontier import plot_frontier
+from ttscompile.plots.frontier import plot_chunk, plot_frontier
 from ttscompile.plots.maps import COLOURS, plot_plan
 
 
@@ -43,6 +44,25 @@ def test_the_same_plan_is_the_same_file(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         write_picture(plot_plan(plan, ["self_attention", "x"]), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize("steps", [4, 20, 100])
+def test_steps_are_whole_numbers(steps: int) -> None:
+    figures = [
+        plot_plan(np.zeros((steps, 2), np.int8), ["a", "b"]),
+        plot_chunk(np.zeros((steps, 2), np.float32), range(1), ""),
+    ]
+    for figure in figures:
+        figure.canvas.draw()
+        labels = [text.get_text() for text in figure.axes[0].get_xticklabels() if text.get_text()]
+        assert len(labels) > 3 and not [text for text in labels if "." in text]
+
+
+def test_a_name_that_is_moved_from_its_point_is_led_to_it() -> None:
+    near = [Point("s", name, 0.1 + 1e-4 * n, 5.0 + n / 100) for n, name in enumerate("ab")]
+    texts = frontier_of(near).axes[0].texts
+    assert [text.get_text() for text in texts] == ["a", "b"]
+    assert [isinstance(text, Annotation) and text.arrow_patch is not None for text in texts] == [False, True]
 
 
 @pytest.mark.parametrize("plan", [np.zeros((4, 3), np.int8), np.full((4, 2), 4, np.int8), np.zeros((1, 4, 2), np.int8)])

@@ -4,11 +4,13 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numcodecs
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
 import pytest
 import zarr
 
@@ -179,3 +181,50 @@ def test_images_of_another_size_are_resized_where_the_policy_does_that(tmp_path:
     expected = np.zeros((3, 1, 3, 4, 4), np.float32)
     expected[..., 2:, :] = 1
     np.testing.assert_array_equal(episode.observations["top"], expected)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_chunks_that_are_not_there_are_told_of_what_is_read(version: Literal[2, 3], tmp_path: Path) -> None:
+    """zarr leaves chunks of nothing but zeros out; one that a copy lost looks the same."""
+    path = as_zarr(tmp_path, version)
+    chunk = min(file for file in (path / "data" / "state").rglob("*0") if file.is_file())
+    chunk.unlink()
+    with pytest.warns(UserWarning, match=r"it\.zarr: 1 of 3 chunks of 'state' are not there, and read as 0\.0\. If"):
+        first = load_trajectories([path], LOW, 3, SOURCES)[0]
+    assert not first.observations["obs"][0, :, 6:].any()
+    assert len(load_trajectories([path], LOW, 3, {"obs": ("keypoint", "keypoint:2")})) == 2  # without a warning
+
+
+@pytest.mark.parametrize("place", ["file-000 (1).parquet", ".ipynb_checkpoints/file-000.parquet"])
+def test_a_table_that_is_there_twice_is_not_read_twice(place: str, tmp_path: Path) -> None:
+    chunk = as_lerobot(tmp_path) / "data" / "chunk-000"
+    (chunk / place).parent.mkdir(exist_ok=True)
+    shutil.copy(chunk / "file-000.parquet", chunk / place)
+    with pytest.raises(TrajectoryError, match="after frame 0 of episode 0 comes frame 0; expected each once"):
+        load_trajectories([tmp_path / "it"], LOW, 3, SOURCES)
+
+
+def test_a_table_that_lacks_frames_is_refused_and_one_that_is_missing_told(tmp_path: Path) -> None:
+    chunk = as_lerobot(tmp_path) / "data" / "chunk-000"
+    whole = parquet.read_table(chunk / "file-000.parquet")
+    parquet.write_table(pa.concat_tables([whole.slice(0, 2), whole.slice(3)]), chunk / "file-000.parquet")
+    with pytest.raises(TrajectoryError, match="after frame 1 of episode 0 comes frame 3; expected each once"):
+        load_trajectories([tmp_path / "it"], LOW, 3, SOURCES)
+    (chunk / "file-000.parquet").unlink()
+    (tmp_path / "it" / "meta" / "info.json").write_text(json.dumps({"features": {}, "total_frames": 9}))
+    with pytest.warns(UserWarning, match=r"info\.json counts 9 frames, and data/ has 4: the others are left out"):
+        assert len(load_trajectories([tmp_path / "it"], LOW, 3, SOURCES)) == 1
+
+
+def test_a_file_that_is_no_whole_table_is_named(tmp_path: Path) -> None:
+    """As another system leaves one beside each file that it copies."""
+    (as_lerobot(tmp_path) / "data" / "chunk-000" / "._file-000.parquet").write_bytes(b"Mac OS X")
+    with pytest.raises(TrajectoryError, match=r"chunk-000/\._file-000\.parquet: is no whole table .*take it out"):
+        load_trajectories([tmp_path / "it"], LOW, 3, SOURCES)
+
+
+def test_an_episode_without_frames_is_named(tmp_path: Path) -> None:
+    with h5py.File(as_hdf5(tmp_path), "r+") as file:
+        file["data/demo_3/obs/keypoint"], file["data/demo_3/obs/state"] = np.zeros((0, 3, 2)), np.zeros((0, 5))
+    with pytest.raises(TrajectoryError, match=r"arrays of /data/demo_3/obs differ in length, or are empty: \[0\]"):
+        load_trajectories([tmp_path / "it.hdf5"], LOW, 3, SOURCES)

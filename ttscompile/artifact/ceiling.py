@@ -37,7 +37,7 @@ def few_steps(manifest: Manifest) -> str | None:
         return None
     return (
         f"K = {steps} denoising steps: step 0 is always computed, so at most {most:.1%} of the cells can be reused, and"
-        f" no plan has less than 1/{manifest.flops.ceiling(steps):.3g} of the FLOPs of a dense call."
+        f" no plan has less than {1 / manifest.flops.ceiling(steps):.1%} of the FLOPs of a dense call."
     )
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from ttscompile.artifact.ceiling import BOUND, FARTHEST
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.manifest import abbreviated
-from ttscompile.artifact.write import choose_default
+from ttscompile.artifact.write import choose_default, require_unzipped
 from ttscompile.calibration.proposer import near
 from ttscompile.cli import options
 from ttscompile.cli.contestants import Way, compare, contestants, draw_comparison, originals, print_comparison
@@ -143,7 +143,7 @@ def bench(
     ways, artifacts = _ways(runtime, device, threads), _artifacts(directory, others)
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
-    plans = tuple(choosable(artifact)) if chooses and not plans else plans
+    plans = _choices(directory, artifact, plans) if chooses else plans
     executor = ExecutorSettings(**settings)
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
@@ -155,13 +155,13 @@ def bench(
     warn_if_busy(console)
     if default == DENSE and artifact.manifest.steps > 1:
         say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
+    seed = (artifact.manifest.calibration or {}).get("seed", 0)  # holds out the episodes that its calibration held out
+    asked = {"observation": sources, "plans": plans, "calls": calls, "seed": int(seed), **vars(ways[0])}
+    compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
     with console.status("timing") as status:
         measured = measure(entered, calls, 0, lambda done, of: status.update(f"timing: round {done} of {of}"))
     # The longest call has to fit.
     verdicts = {m.label: resolved[m.label].feasibility(max(m.times_ms) / 1e3) for m in measured if m.label in resolved}
-    seed = (artifact.manifest.calibration or {}).get("seed", 0)  # holds out the episodes that its calibration held out
-    asked = {"observation": sources, "plans": plans, "calls": calls, "seed": int(seed), **vars(ways[0])}
-    compared = compare(directory, artifacts, others, trajectories, **asked) if trajectories else None
     limit = 1e3 * max(min(one.max_latency for one in verdicts.values()), 0.0) if verdicts else None
     chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
@@ -194,9 +194,10 @@ def bench(
         say(output, one_line(fingerprint()))
         print_identity(artifact.manifest.identity, output)
         say(output, *(f"{path}: identity {abbreviated(identity)}" for path, identity in identities.items()))
-    if compared is not None and picture is not None:
-        say(console, draw_comparison(compared, directory, picture))
-    if (verdicts and not any(one.feasible for one in verdicts.values())) or (chooses and chosen is None):
+    drawn = [draw_comparison(compared, directory, picture)] if compared is not None and picture is not None else []
+    failed = [f"failed: no plan keeps the deadline. The default stays {default!r}."] * (chooses and chosen is None)
+    say(console, *drawn, *failed)
+    if failed or (verdicts and not any(one.feasible for one in verdicts.values())):
         context.exit(1)
 
 
@@ -223,6 +224,15 @@ def _artifacts(directory: Path, others: Sequence[Path]) -> dict[str, Artifact]:
             raise click.UsageError(f"two artifacts are called {name!r}: they could not be told apart. Rename one.")
         found[name] = load_artifact(other)
     return found
+
+
+def _choices(directory: Path, artifact: Artifact, asked: tuple[str, ...]) -> tuple[str, ...]:
+    """What is timed to choose among: what was asked for, if one of it may be the default, or all that may be it."""
+    require_unzipped(directory)
+    known = tuple(choosable(artifact))
+    if asked and not set(asked) & set(known):
+        raise click.UsageError(f"--choose: no --plan may be the default; expected one of {', '.join(known)}.")
+    return asked or known
 
 
 def _ways(runtimes: Sequence[str], device: str | None, threads: Sequence[int]) -> list[Way]:

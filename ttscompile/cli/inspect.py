@@ -1,6 +1,7 @@
 """``ttscompile inspect``: what is in an artifact, as tables, as a picture of a plan, or all of it on a page."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -91,7 +92,7 @@ def inspect(
         kinds = [block.kind for block in artifact.manifest.blocks]
         write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
         say(console, f"wrote {picture}")
-    print_artifact(artifact, as_json)
+    print_artifact(replace(artifact, path=directory), as_json)  # of a zipped one, not where it was unpacked
     if not passed:
         say(console, "failed: the artifact does not hold what it promises; the page says where.")
         context.exit(1)

@@ -11,7 +11,8 @@ from typing import Any, TextIO
 
 import click
 from rich import box
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
 from ttscompile.artifact.load import load_artifact, read_manifest, require_artifact_path
@@ -102,9 +103,25 @@ def warn_if_busy(console: Console) -> None:
         say(console, f"warning: {warning}")
 
 
+class _Table(Table):
+    """Breaks no word or number where the console has room for all; rich squeezes the widest columns first."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        cells = [[str(cell) for cell in (one.header, *one.cells)] for one in self.columns]
+        widths = [max(map(cell_len, each)) for each in cells]
+        least = [max(cell_len(word) for cell in each for word in cell.split(" ")) for each in cells]
+        side = int(sum(least) <= options.max_width - 3 * len(cells) - 1)  # of each cell, to both sides
+        self.padding, room = (0, side), options.max_width - (1 + 2 * side) * len(cells) - 1
+        while sum(least) <= room < sum(widths):  # names last
+            widths[max(range(len(cells)), key=lambda n: (widths[n] > least[n], n > 0, widths[n]))] -= 1
+        for n, (column, width) in enumerate(zip(self.columns, widths, strict=True)):
+            column.width, column.no_wrap = (width, False) if sum(widths) <= room else (None, n == 0)
+        return super().__rich_console__(console, options)
+
+
 def table(*columns: str, rows: Iterable[Iterable[str]] = ()) -> Table:
     """A table whose first column is text and whose others are figures."""
-    made = Table(box=box.SIMPLE_HEAD)
+    made = _Table(box=box.SIMPLE_HEAD)
     for i, column in enumerate(columns):
         made.add_column(column, justify="right" if i else "left", no_wrap=i == 0, overflow="fold")
     for row in rows:

@@ -101,10 +101,10 @@ def predict(
         how = {"plan": report.plan_name, "seed": seed, "executed": [executed.start, executed.stop], "notes": notes}
         print_json({"identity": identity, **how, "actions": chunk.tolist()})
     else:
-        say(output := results(), f"{'step':<15}{''.join(f'{number:>10}' for number in range(chunk.shape[1]))}")
+        say(output := results(), f"{'step':<14}{''.join(f'{number:>11}' for number in range(chunk.shape[1]))}")
         for step, action in enumerate(chunk):
-            numbers = "".join(f"{number:>10.4g}" for number in action)
-            say(output, f"{step:>4} {'executed' * (step in executed):<10}{numbers}")
+            numbers = "".join(f"{number:>11.4g}" for number in action)
+            say(output, f"{step:>4} {'executed' * (step in executed):<9}{numbers}")
         say(output, f"{told}: {len(chunk)} steps of {chunk.shape[1]} numbers", *notes)
         print_identity(identity, output)
     if picture is not None:

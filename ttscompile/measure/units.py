@@ -7,7 +7,7 @@ def flops(count: float) -> str:
     """FLOPs with a unit: ``16.1 GFLOP``."""
     for unit, size in (("GFLOP", 1e9), ("MFLOP", 1e6), ("kFLOP", 1e3)):
         if count >= size:
-            return f"{count / size:.3g} {unit}" if count < 1000 * size else f"{count / size:.0f} {unit}"
+            return f"{count / size:.3g} {unit}" if count < 999.5 * size else f"{count / size:.0f} {unit}"
     return f"{count:.0f} FLOP"
 
 
@@ -20,7 +20,7 @@ def share(part: float | None) -> str:
 
 def ms(milliseconds: float, digits: int = 3) -> str:
     """A time to so many digits at least, without an exponent."""
-    return f"{milliseconds:.{digits}g}" if milliseconds < 10**digits else f"{milliseconds:.0f}"
+    return f"{milliseconds:.{digits}g}" if milliseconds < 10**digits - 0.5 else f"{milliseconds:.0f}"
 
 
 def plain(value: object) -> str:

@@ -60,7 +60,8 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
         above = 4 + 12 * sum(abs(x) < 0.15 and abs(y) < 0.2 for x, y in apart)
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
         name = f"{p.series} {p.name}" if several else p.name
-        axes.annotate(name, (p.latency_ms, p.distance), fontsize=8, **beside(place, name, above))
+        led: Any = {"arrowstyle": "-", "color": "#999999", "linewidth": 0.5} if above > 4 else None
+        axes.annotate(name, (p.latency_ms, p.distance), fontsize=8, arrowprops=led, **beside(place, name, above))
     best = [point for point in efficient if point.distance > ROUNDING]
     if len(best) > 1:  # of one point there is no line
         line: dict[str, Any] = {"color": "#999999", "linewidth": 4, "alpha": 0.35, "zorder": 0}
@@ -89,6 +90,7 @@ def plot_chunk(actions: FloatArray, executed: range, title: str) -> Figure:
         axes.plot(range(len(curve)), curve, marker=".", linewidth=1.2, label=f"{number}")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), ncols=1 + actions.shape[1] // 16)
     axes.set(xlabel="step of the chunk", ylabel="action, in its units")
+    axes.locator_params(axis="x", integer=True)
     axes.set_title(title, fontsize=10, loc="left")
     return figure
 

@@ -102,4 +102,5 @@ def _map(width: float, height: float, kinds: Sequence[str], told: str) -> tuple[
     names = [f"{_ABBREVIATIONS.get(kind, kind[:12])} {b}" for b, kind in enumerate(kinds)]
     axes.set_yticks(range(len(kinds)), names, fontsize=7)
     axes.set(xlabel=STEPS_AXIS, ylabel="residual block")
+    axes.locator_params(axis="x", integer=True)
     return figure, axes

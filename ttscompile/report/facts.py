@@ -322,7 +322,7 @@ def limits(artifact: Artifact) -> Section:
     sampler = manifest.spec.sampler
     points = []
     if manifest.calibration is None or manifest.default_plan == DENSE:
-        points.append("Not calibrated: its default plan computes everything. It is as slow as a dense call.")
+        points.append("Not calibrated: its default plan computes every cell of its loop.")
     else:
         points.append(
             "Errors are of the actions, on recorded episodes, against the dense policy with the same noise. They are no"

@@ -20,8 +20,9 @@ _PARTS = {
     "prologue": ("#0072b2", "prologue"),
     "wait_pruner": ("#cc79a7", "wait for the pruner"),
     "decode": ("#d55e00", "denoising loop"),
+    "": ("#999999", "the rest"),
 }
-"""Colour and name of the parts of a call that add up to nearly all of it."""
+"""Colour and name of the parts of a call."""
 
 _DWARFS = 4.0
 """A bar is cut off where it is so many times as long as the next."""
@@ -52,19 +53,18 @@ def shares_picture(course: Course) -> bytes:
         axes.set_title(f"{source.name}: {shares[source].mean():.1%} of the cells", fontsize=10, loc="left")
         axes.set_ylabel("block")
     panels[-1].set_xlabel(STEPS_AXIS)
+    panels[-1].locator_params(axis="x", integer=True)
     figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
     return encoded(figure)
 
 
 def sparsity_picture(course: Course) -> bytes:
     """Reused cells, call by call; and those that had to be replaced."""
-    from matplotlib.ticker import MaxNLocator
-
     figure = new_figure(6.0, 3.2)
     axes = figure.add_subplot()
     calls = np.arange(len(course.sparsity))
     axes.plot(calls, 100 * course.sparsity, color=COLOURS[Source.COMPUTE], marker="o", markersize=3, linewidth=1.2)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.locator_params(axis="x", integer=True)
     axes.set(xlabel="call of the episode", ylabel="cells reused, %")
     axes.set_ylim(max(min(100 * float(course.sparsity.min()) - 2, 90.0), -2.0), 100.5)
     with_grid(axes)
@@ -101,7 +101,8 @@ def latency_picture(measured: Sequence[Measurement]) -> bytes:
     rows = np.arange(len(measured))[::-1]
     left = np.zeros(len(measured))
     for part, (colour, name) in _PARTS.items():
-        widths = np.array([one.parts_ms[part] for one in measured])
+        rest = (max(one.median_ms - end, 0) for one, end in zip(measured, left, strict=True))
+        widths = np.array([one.parts_ms.get(part, own) for one, own in zip(measured, rest, strict=True)])
         axes.barh(rows, widths, left=left, height=0.6, color=colour, label=name)
         left += widths
     ends = sorted(left)
@@ -117,7 +118,7 @@ def latency_picture(measured: Sequence[Measurement]) -> bytes:
         axes.annotate(told, (place, row), color=colour, **moved)
     axes.set_xlabel("ms of a call, median")
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return encoded(figure)
 
 

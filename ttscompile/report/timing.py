@@ -60,6 +60,8 @@ class Measurement:
         flops: median over the calls; None where they are not known.
         sparsity: mean share of reused cells.
         legalised: cells that had to be replaced because they were never computed, all calls together.
+        otherwise: of a plan that begins with the chunk of the call before, as all counted calls did, the plan of a call
+            that has none.
     """
 
     label: str
@@ -69,6 +71,7 @@ class Measurement:
     flops: float | None = None
     sparsity: float = 0.0
     legalised: int = 0
+    otherwise: str | None = None
 
     @property
     def median_ms(self) -> float:
@@ -165,6 +168,9 @@ def timing_remarks(measured: Sequence[Measurement]) -> str:
         "Speed-up: how many times faster than the first row.",
         "Right of 'reused': the ms of a call's parts.",
     ]
+    for one in (each for each in measured if each.otherwise is not None):
+        without = f"the first call of an episode, and a late one, compute {one.otherwise!r}"
+        told.append(f"{one.plan!r} was timed with the chunk of the call before; {without}.")
     if _taken(measured, "pruner"):
         told.append("The pruner runs beside step 0: only the wait for it lengthens a call.")
     if _taken(measured, "frames"):
@@ -188,6 +194,8 @@ def _taken(measured: Sequence[Measurement], part: str) -> bool:
 def _summary(contestant: Contestant, times: Times, reports: Sequence[Any]) -> Measurement:
     if reports[0] is None:
         return Measurement(contestant.label, contestant.plan, times.ms, flops=contestant.dense_flops)
+    plans = {} if contestant.policy is None else contestant.policy.plans
+    plan = plans.get(contestant.plan.partition("@")[0])
     return Measurement(
         label=contestant.label,
         plan=contestant.plan,
@@ -196,4 +204,5 @@ def _summary(contestant: Contestant, times: Times, reports: Sequence[Any]) -> Me
         flops=float(np.median([r.flops[0] for r in reports])),
         sparsity=float(np.mean([np.mean(r.plan != Source.COMPUTE) for r in reports])),
         legalised=sum(sum(r.legalised) for r in reports),
+        otherwise=next((name for name, one in plans.items() if plan and one is plan.otherwise), None),
     )

@@ -130,7 +130,7 @@ class Course:
     """One episode with one plan.
 
     Attributes:
-        plans: int8 ``[R, K, blocks]``, as executed.
+        plans: int8 ``[R, K, blocks]``, as executed; without a first call in another loop.
         legalised: cells of each call that were replaced because they were never computed.
         tokens: of image encoders that were computed, and that the new pictures had; zeros where none are reused.
         seen: of some calls, by number, what each camera showed; nothing where no tokens are reused.
@@ -170,7 +170,8 @@ def run_episode(policy: CompiledPolicy, episode: Episode, plan: str | None = Non
             seen[row] = tuple(replace(s, computed=s.computed & (not k)) for s, k in zip(shown, known, strict=True))
         last = {i: one.number for i, one in enumerate(shown)}
     policy.reset()
-    plans = np.stack([report.plan[0] for report in made])
     frames = [report.frames for report in made]
     tokens = sum(one.tokens for one in frames), sum(one.of for one in frames)
-    return Course(episode.name, plans, tuple(report.legalised[0] for report in made), tokens, seen)
+    kept = [one for one in made if one.plan.shape == made[-1].plan.shape]  # the first may be in another loop
+    name = episode.name + " (without its first call)" * (len(kept) < len(made))
+    return Course(name, np.stack([r.plan[0] for r in kept]), tuple(r.legalised[0] for r in kept), tokens, seen)

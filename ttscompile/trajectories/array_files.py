@@ -35,15 +35,18 @@ def zarr_recording(path: Path) -> Recording:
         data: Any = group["data"]
         ends = group["meta/episode_ends"]
         names = tuple(sorted(name for name, _ in data.arrays()))
-    size = bytes_of(path)
+    size, notes = bytes_of(path), list[str]()
 
     def read(name: str) -> tuple[int, Iterator[Array]]:
         array = data[name]
         _require_plain_zarr(path, array, size)
+        if array.shards is None and (lacking := array.nchunks - array.nchunks_initialized):
+            told = f"{path}: {lacking} of {array.nchunks} chunks of {name!r} are not there, and read as"
+            notes.append(f"{told} {array.fill_value}. If that is not what was recorded, copy it again.")
         return array.shape[0], _zarr_blocks(path, array)
 
     _require_plain_zarr(path, ends, size)
-    return Recording(names, read, np.concatenate(list(_zarr_blocks(path, ends))))
+    return Recording(names, read, np.concatenate(list(_zarr_blocks(path, ends))), notes=notes)
 
 
 def _require_plain_zarr(path: Path, array: Any, size: int) -> None:
@@ -129,8 +132,8 @@ def _group(path: Path, file: Any, name: str) -> Any:
 
 def _length(path: Path, group: Any) -> int:
     lengths = {len(_inside(path, group, name)) for name in group}
-    if len(lengths) != 1:
-        raise TrajectoryError(f"{path}: arrays of {group.name} differ in length: {sorted(lengths)}.")
+    if len(lengths) != 1 or 0 in lengths:
+        raise TrajectoryError(f"{path}: arrays of {group.name} differ in length, or are empty: {sorted(lengths)}.")
     return int(lengths.pop())
 
 

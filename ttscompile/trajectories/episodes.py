@@ -263,7 +263,7 @@ def _other_format(path: Path) -> str | None:
 
 def meta_of(path: Path, value: Array | None) -> dict[str, Any]:
     """What the array ``meta`` of an ``.npz`` says of it; nothing where there is none."""
-    meta = {} if value is None else None
+    meta: Any = {} if value is None else None
     if value is not None and value.ndim == 0 and value.dtype.kind in "SU":
         text = value.item()
         with suppress(ValueError):

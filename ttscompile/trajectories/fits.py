@@ -145,7 +145,7 @@ def examine_recordings(
             episodes = episodes_of(spec, paths, renamed, tokenizer)
         except TrajectoryError as error:
             return [*found, Finding(PART, "load", str(error), Level.PROBLEM, "As it says; nothing else was tried.")]
-    found += [Finding(PART, "load", str(each.message), Level.NOTE) for each in warned]
+    found += [Finding(PART, "load", told, Level.NOTE) for told in dict.fromkeys(str(each.message) for each in warned)]
     alone, told = len(episodes) < 2, f"{sum(each.calls for each in episodes)} in {len(episodes)} episodes"
     remedy = "'calibrate' needs two: plans are judged on others than those that it learns from. Record sixteen."
     found.append(Finding.judged(PART, "calls", told, alone, remedy, Level.PROBLEM))

@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +49,14 @@ class Recording:
         read: the rows of an array by its name, F, and blocks ``[n, ...]`` of them as they are stored.
         ends: for each episode the frame after its last, increasing.
         order: ``[F]`` which stored row is which frame, if they are not in order.
+        notes: what was found odd so far, to be told as warnings.
     """
 
     names: Sequence[str]
     read: Callable[[str], tuple[int, Iterator[Array]]]
     ends: Array
     order: Array | None = None
+    notes: list[str] = field(default_factory=list)
 
 
 def frames_of_calls(frames: Frames, stride: int) -> Frames:

@@ -35,8 +35,6 @@ def lerobot_recording(path: Path, most: int | None = None) -> Recording:
     Raises:
         TrajectoryError: not one, or damaged.
     """
-    import pyarrow.parquet as parquet
-
     require_files(path / "data")
     require_files(path / "meta")
     files = sorted((path / "data").rglob("*.parquet"))
@@ -49,13 +47,16 @@ def lerobot_recording(path: Path, most: int | None = None) -> Recording:
         videos = [name for name, feature in info["features"].items() if feature.get("dtype") == "video"]
     hint = f"; expected tables with the columns {EPISODE} and {FRAME}"
     with one_error(f"{path}: cannot be read as a LeRobot data set", hint):
-        tables = [parquet.ParquetFile(file) for file in files]
+        tables = [_table(file) for file in files]
         names = [name for name in tables[0].schema_arrow.names if name not in (EPISODE, FRAME)]
         episodes, numbers = (_index(path, tables, name, size) for name in (EPISODE, FRAME))
     if len(episodes) != len(numbers):
         raise TrajectoryError(f"{path}: {EPISODE} has {len(episodes)} rows, and {FRAME} {len(numbers)}.")
     order = np.lexsort((numbers, episodes))
-    ends = np.append(np.flatnonzero(np.diff(episodes[order])) + 1, len(order))
+    ends, total = _ends(path, episodes[order], numbers[order]), info.get("total_frames")
+    counted = f"{path}: meta/info.json counts {total} frames, and data/ has {len(order)}: the others are left out"
+    fewer = most is None and isinstance(total, int) and total > len(order)
+    notes = [f"{counted}. If they should be there, copy it again."] * fewer
 
     told = TASKS in names and TASK not in names and any((path / "meta").glob("tasks.*"))
 
@@ -72,7 +73,7 @@ def lerobot_recording(path: Path, most: int | None = None) -> Recording:
         return len(episodes), found
 
     def columns(files: Sequence[Path], name: str) -> Array:
-        return np.concatenate(list(_column(path, [parquet.ParquetFile(file) for file in files], name, size)))
+        return np.concatenate(list(_column(path, [_table(file) for file in files], name, size)))
 
     if most is not None:
         files_of = [_begins(path, name, info, columns) for name in videos]
@@ -82,8 +83,24 @@ def lerobot_recording(path: Path, most: int | None = None) -> Recording:
         if not len(ends):
             raise TrajectoryError(f"{path}: the first episode has no videos of {', '.join(videos)} in the first files.")
         order = order[: ends[-1]]
-    sorted_already = np.array_equal(order, np.arange(len(episodes)))
-    return Recording([*names, *videos, *([TASK] if told else [])], read, ends, None if sorted_already else order)
+    stored = None if np.array_equal(order, np.arange(len(episodes))) else order
+    return Recording([*names, *videos, *([TASK] if told else [])], read, ends, stored, notes)
+
+
+def _table(file: Path) -> Any:
+    import pyarrow.parquet as parquet
+
+    with one_error(f"{file}: is no whole table", ". Copy it again, or take it out of the data set"):
+        return parquet.ParquetFile(file)
+
+
+def _ends(path: Path, episodes: Array, numbers: Array) -> Array:
+    """For each episode the row after its last, where rows are in order. Raises TrajectoryError: one lacks frames."""
+    same = np.diff(episodes) == 0
+    for i in np.flatnonzero(same & (np.diff(numbers) != 1))[:1]:
+        told = f"after frame {numbers[i]} of episode {episodes[i]} comes frame {numbers[i + 1]}; expected each once"
+        raise TrajectoryError(f"{path}: {told}. Is a file of data/ there twice, or missing?")
+    return np.append(np.flatnonzero(~same) + 1, len(episodes))
 
 
 def _index(path: Path, tables: list[Any], name: str, size: int) -> Array:

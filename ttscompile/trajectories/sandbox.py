@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -53,6 +54,8 @@ def sandboxed_frames(path: Path, kind: str, wanted: Sequence[str], **how: int) -
                 own[line["own"]] = array
             else:
                 arrays[line["array"]] = array[own["order"]] if "order" in own else array
+        for note in line["notes"]:
+            warnings.warn(note, stacklevel=2)
     return Frames(names, arrays.__getitem__, own["ends"])
 
 
@@ -150,7 +153,7 @@ def serve(request: Mapping[str, Any], out: BinaryIO) -> None:
             for name in request["wanted"]:
                 if name in recording.names:
                     _send_array(path, out, {"array": name}, *recording.read(name))
-            _send(out, end=True)
+            _send(out, end=True, notes=recording.notes)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         told = f"{path}: reading this takes the package {package!r}, which is not installed"

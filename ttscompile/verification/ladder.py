@@ -56,7 +56,7 @@ def verify(
         What every rung found. Nothing is raised for a rung that fails.
 
     Raises:
-        ArtifactError: there is no artifact, or none that was made with a golden record.
+        ArtifactError: there is no artifact, none that was made with a golden record, or a copy without its fp32.
         TrajectoryError: the recordings do not fit the policy.
         RuntimeUnavailableError: onnxruntime is missing.
     """
@@ -67,6 +67,7 @@ def verify(
     rung, artifact = check_integrity(Path(path))
     if artifact is None:
         return Verification(str(path), None, None, (rung,), time.monotonic() - begun)
+    artifact.require_whole()
     manifest, episodes = artifact.manifest, []
     if trajectories:
         episodes = choose(episodes_of(manifest.spec, trajectories, sources, artifact.tokenizer), calls)
