@@ -13,9 +13,8 @@ def main(prog_name: str | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except (MemoryError, ImportError, SystemError, OSError) as error:  # SystemError: Python's own, without memory
-        sys.stderr.write(
-            f"ttscompile cannot be loaded: {type(error).__name__}: {error!s:.200}. Is there memory for it?\n"
-        )
+        told = " ".join(str(error).split())  # numpy's own have ten lines
+        sys.stderr.write(f"ttscompile cannot be loaded: {type(error).__name__}: {told:.200}. Is there memory for it?\n")
         sys.exit(2)
     commands(prog_name=prog_name)
 
