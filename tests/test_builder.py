@@ -224,7 +224,7 @@ def test_the_rate_of_training_is_kept_and_decides_the_deadline(
     said: str, asked: dict[str, Any], directory: Path
 ) -> None:
     """A control loop of 50 Hz leaves a policy of 10 Hz five times as long as one of 50 Hz."""
-    given = {"policy_hz": 10} if said == "by who builds" else {}
+    given: dict[str, Any] = {"policy_hz": 10} if said == "by who builds" else {}
     path = policies.record(directory.parent / "calls.npz")
     if said == "by the recording":
         np.savez(path, **np.load(path), meta=np.array('{"policy_hz": 10}'))

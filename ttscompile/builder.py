@@ -38,7 +38,7 @@ most of an hour."""
 def build(
     checkpoint: str | os.PathLike[str],
     directory: str | os.PathLike[str],
-    trajectories: Sequence[str | os.PathLike[str]] = (),
+    trajectories: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] = (),
     *,
     control_hz: float | None = None,
     policy_hz: float | None = None,

@@ -362,7 +362,7 @@ def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept
     steps = {name: notes[name]["steps"] for name in (SAFE, FAST) if name in notes}
     own["learned"] = list(dict.fromkeys([*record.get("learned", []), *own["learned"]]))
     own["told"] = {**record.get("told", {}), **own["told"]}
-    more = {key: own[key] for key in ("plans", "learned", "told", "policy_hz") if key in own}
+    more: dict[str, Any] = {key: own[key] for key in ("plans", "learned", "told", "policy_hz") if key in own}
     record |= {**notes.pop(SCHEDULE, {}), **own, "named_steps": steps} if anew else more
     pruner, loop = (None, ORIGINAL) if kept.pruner is None else kept.pruner
     update_plans(

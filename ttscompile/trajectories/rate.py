@@ -13,7 +13,7 @@ from .frames import one_error
 from .lerobot_dataset import MAX_INFO
 
 
-def recorded_rate(paths: Sequence[str | os.PathLike[str]]) -> float | None:
+def recorded_rate(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> float | None:
     """Rate in Hz of the frames and actions of recordings; None where none says it, or where they say different ones.
 
     A LeRobot data set has it as ``fps``; an ``.npz`` may have ``{"policy_hz": 10}`` in its ``meta``.
