@@ -37,7 +37,6 @@ class CleanUp(Pass[AnyPhase, AnyPhase]):
     """
 
     def call(self, program: AnyPhase) -> PassResult[AnyPhase]:
-        """Clean the denoiser, and the pieces if there are any."""
         weights = dict(program.weights)
         new = mapped(program, lambda graph: clean_graph(graph, weights))
         before, after = program.graphs(), new.graphs()

@@ -28,7 +28,6 @@ class CutCopies(Pass[Captured, Captured]):
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
-        """Rewrite in the denoiser."""
         graph = program.denoiser
         types, producers = graph.types(), graph.producers()
         nodes: list[Node] = []

@@ -38,7 +38,6 @@ class Hoist(Pass[Cut, Program]):
     """
 
     def call(self, program: Cut) -> PassResult[Program]:
-        """Hoist."""
         spec = program.spec
         inputs = input_bindings(spec)
         prologue, renamed = _name_inputs(program.prologue)

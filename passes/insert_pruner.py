@@ -45,7 +45,6 @@ class InsertPruner(Pass[Program, Program]):
     width: int = 64
 
     def call(self, program: Program) -> PassResult[Program]:
-        """Build the head and choose its features."""
         condition, features = _features(program)
         read = {f: condition.types()[f] for f in features}
         loops = program.spec.all_loops

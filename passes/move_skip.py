@@ -31,7 +31,6 @@ class MoveSkip(Pass[Captured, Captured]):
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
-        """Move the sample."""
         graph, spec = program.denoiser, program.spec
         inside = _network(graph, spec.sample_argument)
         if inside is None:

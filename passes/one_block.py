@@ -33,7 +33,6 @@ class OneBlock(Pass[Captured, Captured]):
     reason: str
 
     def call(self, program: Captured) -> PassResult[Captured]:
-        """Wrap the network."""
         graph, sample = program.denoiser, program.spec.sample_argument
         (made,) = graph.outputs
         type_ = graph.inputs[sample]

@@ -30,7 +30,6 @@ class Partition(Pass[Captured, Cut]):
     blocks: tuple[Block, ...]
 
     def call(self, program: Captured) -> PassResult[Cut]:
-        """Cut along the blocks."""
         graph, spec, blocks = program.denoiser, program.spec, self.blocks
         types = graph.types()
         reached = reachable_from(graph, [spec.sample_argument])

@@ -29,7 +29,6 @@ class RegroupSums(Pass[Captured, Captured]):
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
-        """Regroup in the denoiser."""
         graph, sample = program.denoiser, program.spec.sample_argument
         producers, types, users = graph.producers(), graph.types(), graph.users()
         points = set(dominators(graph, [sample], graph.outputs))

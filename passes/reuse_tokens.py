@@ -6,20 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from ttscompile.ir import pieces as names
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
-from ttscompile.ir.pieces import (
-    INDEX,
-    NOT_KEPT,
-    PIXELS,
-    PLACES,
-    ROWS,
-    frame_name,
-    pixels_name,
-    renewed_name,
-    tokens_name,
-)
 from ttscompile.ir.program import Program
 from ttscompile.ir.tokens import ATTENTION, TokenStream, find_tokens
 
@@ -57,19 +47,18 @@ class ReuseTokens(Pass[Program, Program]):
     """
 
     def call(self, program: Program) -> PassResult[Program]:
-        """Add the forms, or say why there is none."""
         pieces, found, notes = program.pieces, dict[str, Graph](), list[str]()
         if pieces.tokens:
             return PassResult(program)
         for i, tower in enumerate(pieces.towers):
             stream = find_tokens(tower, program.weights)
             if isinstance(stream, str):
-                notes.append(f"{frame_name(i)}: the whole frame is the unit: {stream}")
+                notes.append(f"{names.frame_name(i)}: the whole frame is the unit: {stream}")
                 continue
             graph = for_tokens(tower, stream)
-            found |= {pixels_name(i): _pixels_graph(tower, stream), tokens_name(i): graph}
-            kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in NOT_KEPT)
-            notes.append(f"{frame_name(i)}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
+            found |= {names.pixels_name(i): _pixels_graph(tower, stream), names.tokens_name(i): graph}
+            kept = sum(math.prod(type_.at(1)) for name, type_ in graph.inputs.items() if name not in names.NOT_KEPT)
+            notes.append(f"{names.frame_name(i)}: {stream.tokens} tokens, of which {kept * 4 / 1e6:.1f} MB are kept")
         if not found:
             return PassResult(program, tuple(notes))
         return PassResult(replace(program, pieces=replace(pieces, tokens=found)), tuple(notes))
@@ -78,18 +67,18 @@ class ReuseTokens(Pass[Program, Program]):
         """With all of its tokens the second form gives what the tower gives."""
         pieces, rng = program.pieces, np.random.default_rng(0)
         for i, tower in enumerate(pieces.towers):
-            if tokens_name(i) not in pieces.tokens:
+            if names.tokens_name(i) not in pieces.tokens:
                 continue
             (name,) = tower.inputs
             row = torch.from_numpy(rng.standard_normal(tower.inputs[name].at(1), dtype=np.float32))
-            graph = pieces.tokens[tokens_name(i)]
-            kept = {n: torch.full(t.at(1), torch.nan) for n, t in graph.inputs.items() if n not in NOT_KEPT}
+            graph = pieces.tokens[names.tokens_name(i)]
+            kept = {n: torch.full(t.at(1), torch.nan) for n, t in graph.inputs.items() if n not in names.NOT_KEPT}
             tokens = torch.arange(next(iter(kept.values())).shape[0])
             with torch.no_grad():
                 whole = evaluator(tower, program.weights)({name: row})
-                (pixels,) = evaluator(pieces.tokens[pixels_name(i)], program.weights)({name: row})
-                twice = {PLACES: tokens.repeat(2), ROWS: tokens.repeat(2)}
-                parts = evaluator(graph, program.weights)({PIXELS: pixels, INDEX: tokens, **twice, **kept})
+                (pixels,) = evaluator(pieces.tokens[names.pixels_name(i)], program.weights)({name: row})
+                twice = {names.PLACES: tokens.repeat(2), names.ROWS: tokens.repeat(2)}
+                parts = evaluator(graph, program.weights)({names.PIXELS: pixels, names.INDEX: tokens, **twice, **kept})
             for output, one, other in zip(tower.outputs, whole, parts, strict=False):
                 if not torch.allclose(one, other, rtol=0, atol=_CLOSE * float(one.abs().max()), equal_nan=True):
                     raise self.fail(f"%{output} of all tokens is not what the tower gives.")
@@ -108,8 +97,8 @@ def _rowless(batch: Batch) -> int:
 def _pixels_graph(tower: Graph, stream: TokenStream) -> Graph:
     """The row to what patches are cut from, under a name of its own."""
     graph, type_ = backward_slice(tower, (stream.pixels,), {}), tower.types()[stream.pixels]
-    copy = Node(PIXELS, "aten.clone.default", (Ref(stream.pixels),), (), (type_,))
-    return replace(graph, inputs=tower.inputs, nodes=(*graph.nodes, copy), outputs=(PIXELS,))
+    copy = Node(names.PIXELS, "aten.clone.default", (Ref(stream.pixels),), (), (type_,))
+    return replace(graph, inputs=tower.inputs, nodes=(*graph.nodes, copy), outputs=(names.PIXELS,))
 
 
 @dataclass
@@ -137,9 +126,10 @@ class _Changed:
         types, stream, axes = self.tower.types(), self.stream, self.stream.axes
         own = backward_slice(self.tower, self.tower.outputs, {stream.pixels: types[stream.pixels]})
         self.makers, self.types = own.producers(), types
-        numbers = {name: TensorType((Batch(size),), "int64") for name, size in ((INDEX, 1), (PLACES, 2), (ROWS, 2))}
+        sizes = {names.INDEX: 1, names.PLACES: 2, names.ROWS: 2}
+        numbers = {name: TensorType((Batch(size),), "int64") for name, size in sizes.items()}
         pixels = types[stream.pixels].resized(_rowless)
-        self.nodes.append(Node(stream.pixels, "aten.clone.default", (Ref(PIXELS),), (), (pixels,)))
+        self.nodes.append(Node(stream.pixels, "aten.clone.default", (Ref(names.PIXELS),), (), (pixels,)))
         for node in own.nodes:
             if node.name in axes and node.name != stream.entry:
                 self._changed(node)
@@ -152,7 +142,7 @@ class _Changed:
                 self._gather(node.name, axes[node.name])
         for name in own.outputs:
             self._whole(name)
-        given = {PIXELS: pixels, **numbers, **self.inputs}
+        given = {names.PIXELS: pixels, **numbers, **self.inputs}
         return Graph(given, own.constants, tuple(self.nodes), (*own.outputs, *self.outputs))
 
     def _part(self, type_: TensorType, axis: int) -> TensorType:
@@ -163,7 +153,7 @@ class _Changed:
 
     def _gather(self, name: str, axis: int) -> Ref:
         if not any(node.name == f"{name}.changed" for node in self.nodes):
-            args = (Ref(name), axis, Ref(INDEX))
+            args = (Ref(name), axis, Ref(names.INDEX))
             type_ = self._part(self.types[name], axis)
             self.nodes.append(Node(f"{name}.changed", "aten.index_select.default", args, (), (type_,)))
         return Ref(f"{name}.changed")
@@ -212,10 +202,10 @@ class _Changed:
         back = tuple(front.index(a) for a in range(len(front)))
         rest = tuple(type_.shape[a] for a in front[1:])
         all_rows, new_rows, placed = (replace(type_, shape=(n, *rest)) for n in (self.stream.tokens, Batch(), Batch(2)))
-        kept, renewed = f"{name}.kept", renewed_name(f"{name}.kept")
+        kept, renewed = f"{name}.kept", names.renewed_name(f"{name}.kept")
         self.inputs[kept] = all_rows
         self.outputs.append(renewed)
-        take, put = (Ref(f"{name}.rows"), 0, Ref(ROWS)), (Ref(kept), 0, Ref(PLACES), Ref(f"{name}.placed"))
+        take, put = (Ref(f"{name}.rows"), 0, Ref(names.ROWS)), (Ref(kept), 0, Ref(names.PLACES), Ref(f"{name}.placed"))
         # Past axes of size 1 nothing moves, and nothing is to be copied.
         moves = any(size != 1 for size in type_.shape[:axis])
 

@@ -53,7 +53,6 @@ class SplitFrames(Pass[Program, Program]):
         self._least = least_flops
 
     def call(self, program: Program) -> PassResult[Program]:
-        """Split."""
         graph, found = program.pieces.condition, list[_Tower]()
         if program.pieces.towers:
             return PassResult(program)

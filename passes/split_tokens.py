@@ -43,7 +43,6 @@ class SplitTokens(Pass[Cut, Cut]):
     """
 
     def call(self, program: Cut) -> PassResult[Cut]:
-        """Split in the prologue."""
         splitter = _Splitter(program.prologue, input_bindings(program.spec))
         rewritten = splitter.run()
         new = replace(program, prologue=rewritten) if splitter.split_at else program
@@ -220,7 +219,6 @@ class SplitFeatures(Pass[Cut, Cut]):
     """
 
     def call(self, program: Cut) -> PassResult[Cut]:
-        """Split in the prologue."""
         prologue, spec = program.prologue, program.spec
         known, producers, types = bindings(prologue, input_bindings(spec)), prologue.producers(), prologue.types()
         nodes: list[Node] = []
@@ -258,7 +256,6 @@ class SplitStem(Pass[Captured, Captured]):
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
-        """Split in the denoiser."""
         graph = program.denoiser
         loop, producers = reachable_from(graph, [program.spec.sample_argument]), graph.producers()
         nodes, notes, types = list[Node](), list[str](), graph.types()

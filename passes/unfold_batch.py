@@ -24,7 +24,6 @@ class UnfoldBatch(Pass[Cut, Cut]):
     """
 
     def call(self, program: Cut) -> PassResult[Cut]:
-        """Unfold the stream and the contexts."""
         loop, stream = program.loop, program.blocks[0].stream
         rows = unfold(program.denoiser, (*loop.contexts, stream))
         if not rows:

@@ -29,7 +29,6 @@ class WidenAttention(Pass[Captured, Captured]):
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:
-        """Rewrite in the denoiser."""
         graph = program.denoiser
         types = graph.types()
         nodes: list[Node] = []

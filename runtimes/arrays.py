@@ -5,17 +5,14 @@ Everything comes through ``core.coercion.plain`` first, so that what is checked 
 
 import sys
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ttscompile.core.coercion import integer, is_tensor, plain
+from ttscompile.core.coercion import Array, integer, is_tensor, plain
 from ttscompile.core.spec import FloatArray, Noise, ObservationSpec, PolicySpec
 from ttscompile.core.values import check_numbers, check_values, fitted
 from ttscompile.errors import ObservationError, TtscompileError
-
-Array: TypeAlias = npt.NDArray[Any]
 
 _MISSING = object()
 
@@ -95,14 +92,14 @@ def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
     found = f"{array.dtype!s:.80} {list(array.shape)}"
     if array.shape[1:] != spec.shape or len(array) < 1:
         single = " A single stream needs a first axis of 1: use obs[None]."
-        remedy = single if array.shape == spec.shape else _image_remedy(array, spec)
+        remedy = single if array.shape == spec.shape else image_remedy(array, spec)
         raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
     remedy = f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of training."
-    remedy = _image_remedy(array, spec) or remedy
+    remedy = image_remedy(array, spec) or remedy
     raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
 
 
-def _image_remedy(array: Array, spec: ObservationSpec) -> str:
+def image_remedy(array: Array, spec: ObservationSpec) -> str:
     """What to do with an image of bytes, or with its channels last; nothing for other arrays."""
     remedy = ""
     if spec.image and array.dtype.kind in "iu":

@@ -16,28 +16,22 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.manifest import PieceRecord
+from ttscompile.core.coercion import Array
 from ttscompile.ir.pieces import FRAMES, frame_pieces
 
 from .tokens import Lane, Run, Seen, TokenTower
 
-Array: TypeAlias = npt.NDArray[Any]
 Content: TypeAlias = tuple[bytes, ...]
 """The bytes of one frame, of each input of the piece that reads it; before them those of its lane, if it has one."""
 Stop: TypeAlias = Callable[[], bool]
 Compute: TypeAlias = Callable[[int], tuple[tuple[Array, ...], int, int]]
 """The number of a row to what a frame piece gives for it, ``[1, ...]`` each; how many of its tokens were computed, and
 how many it has: 0 where the whole frame is the unit."""
-
-
-def _never() -> bool:
-    return False
-
 
 WINDOWS = 2
 """How many calls' rows are remembered: those of the last one, and those that have come since."""
@@ -80,14 +74,8 @@ class FrameMemory:
         """Forget all."""
         self._known.clear()
 
-    def learn(self, contents: Sequence[Content], compute: Compute, stop: Stop = _never) -> FrameWork:
-        """Compute the rows that are not known; nothing is kept of one whose computing fails.
-
-        Args:
-            contents: of the rows.
-            compute: asked once for each new row.
-            stop: asked before each; the rest is left out if it says so.
-        """
+    def learn(self, contents: Sequence[Content], compute: Compute, stop: Stop = lambda: False) -> FrameWork:
+        """Compute the rows that are not known, until ``stop`` says so; nothing is kept of one whose computing fails."""
         work = FrameWork()
         for i, content in enumerate(contents):
             known = self._known.get(content)
@@ -159,19 +147,19 @@ class FramePieces:
         for tower in self._tokens.values():
             tower.forget()
 
-    def learn(self, obs: Mapping[str, Array], stop: Stop = _never) -> FrameWork:
+    def learn(self, obs: Mapping[str, Array], stop: Stop = lambda: False) -> FrameWork:
         """Compute what is new in normalised observations ``[B, ...]``, until ``stop`` says so."""
         return self._learned(obs, stop)[0]
 
     def values(self, obs: Mapping[str, Array]) -> dict[str, Array]:
         """What the condition piece reads beside normalised observations ``[B, ...]``; nothing without frame pieces."""
         found = dict[str, Array]()
-        self.work, known = self._learned(obs)
+        self.work, known = self._learned(obs, lambda: False)
         for name, contents in known.items():
             found |= zip(self._pieces[name].outputs, self._memory[name].values(contents), strict=True)
         return found
 
-    def _learned(self, obs: Mapping[str, Array], stop: Stop = _never) -> tuple[FrameWork, dict[str, list[Content]]]:
+    def _learned(self, obs: Mapping[str, Array], stop: Stop) -> tuple[FrameWork, dict[str, list[Content]]]:
         """What was done for new rows, until ``stop`` said so; and the contents of all rows, by piece."""
         rows, work, known = self._rows_of(obs), FrameWork(), dict[str, list[Content]]()
         for name, piece in self._pieces.items():

@@ -2,13 +2,13 @@
 
 import os
 from collections.abc import Mapping
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.core.coercion import Errors, plain
+from ttscompile.core.coercion import plain
 from ttscompile.core.spec import PolicySpec
 from ttscompile.core.tokenizer import TASK, ReadTokenizer, Tokenizer, padded
 from ttscompile.errors import ObservationError
@@ -94,10 +94,6 @@ def instruct_of(artifact: Artifact, tokenizer: str | os.PathLike[str] | None = N
         if spec.instruction is None:
             remedy = "Leave the tokenizer out."
             raise ObservationError(f"{tokenizer}: this policy takes no text that alone would give its tokens. {remedy}")
-        return Instruct(spec, partial(_same, Tokenizer(tokenizer, ObservationError)))
+        own = Tokenizer(tokenizer, ObservationError)
+        return Instruct(spec, lambda error: own)
     return None if spec.instruction is None or artifact.tokenizer is None else Instruct(spec, artifact.tokenizer)
-
-
-def _same(tokenizer: Tokenizer, _: Errors) -> Tokenizer:
-    """One that is read already."""
-    return tokenizer

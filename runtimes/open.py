@@ -21,7 +21,6 @@ CPU = "cpu"
 MOST_THREADS = 1024
 """More than any machine has a use for: onnxruntime tries to make as many as it is told, for minutes."""
 
-
 Open: TypeAlias = Callable[[View], Backend[Any]]
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ttscompile.artifact.load import Artifact
-from ttscompile.core.coercion import integer
+from ttscompile.core.coercion import Array, integer
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import NonFiniteActionsError, TtscompileError
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
-from .arrays import Array, check_observation, check_seed, like, read_observation
+from .arrays import check_observation, check_seed, like, read_observation
 from .frames import FrameWork
 from .info import BlockInfo, PolicyInfo
 from .inpainting import check_prefix, prefix_refusal

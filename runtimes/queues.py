@@ -9,10 +9,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import FloatArray, ObservationSpec
 from ttscompile.errors import ObservationError
 
-from .arrays import Array, check_observation
+from .arrays import check_observation
 
 Frames = dict[str, deque[Array]]
 

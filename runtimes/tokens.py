@@ -6,19 +6,18 @@ held against these pixels, not against the frame before, so that slow changes ad
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.manifest import MANIFEST, Manifest
 from ttscompile.artifact.strict_json import REMEDY
 from ttscompile.artifact.towers import TokensRecord
+from ttscompile.core.coercion import Array
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import ArtifactError
 from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, frame_pieces, pixels_name, tokens_name
 
-Array: TypeAlias = npt.NDArray[Any]
 Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
 """A piece, by its name, on inputs by theirs; its outputs in order."""
 Renew: TypeAlias = Callable[[str, Mapping[str, Array], Mapping[str, Array]], tuple[Array, ...]]

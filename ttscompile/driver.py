@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -144,9 +144,9 @@ def convert(
         explain("files_beside", ("none: no step of its program makes the tokens that this policy reads",))
     if spec.instruction is not None:
         explain("tokenizer_of", (words,))
-    loop, added = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL), _Added(beside or {}, tokenizer)
+    loop = ORIGINAL if loops else next(iter(spec.loops), ORIGINAL)
     return _compile(
-        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, added, loop
+        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, loop, beside, tokenizer
     )
 
 
@@ -186,17 +186,7 @@ def compile_denoiser(
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
     """
     module = own_copy(module)  # the program, which is returned, shares memory with it
-    return _compile(
-        module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain, _Added(), ORIGINAL
-    )
-
-
-@dataclass(frozen=True)
-class _Added:
-    """What goes into the directory with the program: see ``write_artifact``."""
-
-    beside: Mapping[str, bytes] = field(default_factory=dict)
-    tokenizer: bytes | None = None
+    return _compile(module, spec, directory, prediction_horizon, precision, keep_fp32, single_file, explain)
 
 
 def _compile(
@@ -208,10 +198,11 @@ def _compile(
     keep_fp32: Collection[str],
     single_file: str | os.PathLike[str] | None,
     explain: Explain,
-    added: _Added,
-    loop: str,
+    loop: str = ORIGINAL,
+    beside: Mapping[str, bytes] | None = None,
+    tokenizer: bytes | None = None,
 ) -> Program:
-    """See ``compile_denoiser``. The single file is of ``loop``.
+    """See ``compile_denoiser``. The single file is of ``loop``; what is ``beside`` and the tokenizer go with it.
 
     Nobody else may change the module: the program shares memory with it.
     """
@@ -245,7 +236,7 @@ def _compile(
         told = f"{len(golden.steps)} of {spec.sampler.steps} steps, {golden.streams} streams"
         further = (f"{name}: {len(golden.loops[name].steps)} of {table.steps}" for name, table in spec.loops.items())
         explain("record_original", (told, *further))
-        manifest = write_artifact(program, models, directory, lowered, golden, added.beside, loop, added.tokenizer)
+        manifest = write_artifact(program, models, directory, lowered, golden, beside or {}, loop, tokenizer)
         explain("write", (f"identity {manifest.short_identity}",))
     if whole is not None and single_file is not None:
         try:

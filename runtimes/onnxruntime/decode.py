@@ -8,11 +8,11 @@ from itertools import islice
 
 import numpy as np
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.lattice import BoolArray
 from ttscompile.runtimes.instructions import Instructions
 
 from .idle_steps import WORTH, IdleSteps
-from .sessions import Array
 from .workspace import Workspace
 
 

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from ttscompile.core.coercion import Array
 from ttscompile.core.correction import FEATURES, remember
 from ttscompile.core.spec import FloatArray, SamplerTable
 from ttscompile.core.update import clips, rows
 from ttscompile.ir.pieces import BASE, PRODUCT, SHIFT, TOTAL
 
-from .sessions import Array, Bound
+from .sessions import Bound
 
 WORTH = 3
 """So many idle steps in a row are quicker here; one or two are not, since the stem has to run once more after them."""

@@ -19,16 +19,16 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
-import numpy.typing as npt
 
 from ttscompile.artifact.files import read_file
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.tensors import MAPPED
 from ttscompile.artifact.view import View
+from ttscompile.core.coercion import Array
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError, RuntimeUnavailableError
 from ttscompile.ir import pieces as kinds
@@ -37,9 +37,6 @@ from ttscompile.ir.pieces import Joint, join
 from ttscompile.measure.machine import has_integer_dot_product
 from ttscompile.measure.versions import release
 from ttscompile.runtimes.contexts import ContextValues
-
-Array: TypeAlias = npt.NDArray[Any]
-
 
 SINGLE_THREADED = frozenset({kinds.STEM, kinds.ADVANCE, kinds.PRUNER, kinds.IDLE})
 """Pieces too small for a second thread."""

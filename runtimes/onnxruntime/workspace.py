@@ -15,6 +15,7 @@ import numpy as np
 
 from ttscompile.artifact.manifest import PieceRecord
 from ttscompile.artifact.view import View
+from ttscompile.core.coercion import Array
 from ttscompile.core.correction import HISTORY, Correction, no_correction, remember
 from ttscompile.core.spec import FloatArray, Noise
 from ttscompile.core.update import matrices
@@ -25,7 +26,7 @@ from ttscompile.runtimes.contexts import ContextValues
 from ttscompile.runtimes.inpainting import Known, MaskedUpdates
 
 from .idle_steps import IdleSteps
-from .sessions import FIRST_STEP, Array, Bound, run_named, run_prologue
+from .sessions import FIRST_STEP, Bound, run_named, run_prologue
 
 KEPT_CORRECTIONS = 64
 """Whose bindings a workspace keeps; there are two of each, with a prefix and without."""

@@ -4,8 +4,6 @@ Nothing here is written in place and nothing is read back, so a call can be capt
 Sample and what belongs to it have the action dimensions first, ``[D, B, T]``, as ``core.update`` wants them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Mapping, Sequence
 from itertools import islice
 from typing import Protocol

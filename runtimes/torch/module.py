@@ -241,16 +241,9 @@ class PrunedCall(CallModule):
                 cell: residuals.flatten(0, 1)[cell].index_select(axis, members)
                 for cell in np.flatnonzero(line.rollout).tolist()
             }
-            part, computed = denoise(
-                network.of(members),
-                line,
-                keep,
-                advance,
-                initial.index_select(0, members),
-                offset.index_select(2, members).unbind(),
-                reads,
-                None if read is None else read.index_select(0, members),
-            )
+            own, steps_of = initial.index_select(0, members), offset.index_select(2, members).unbind()
+            seen = None if read is None else read.index_select(0, members)
+            part, computed = denoise(network.of(members), line, keep, advance, own, steps_of, reads, seen)
             sample = sample.index_copy(0, members, part)
             for cell, residual in computed.items():
                 after.flatten(0, 1)[cell].index_copy_(axis, members, residual)

@@ -1,18 +1,14 @@
 """The network of an artifact on a device: its constants, and what each piece computes for one number of streams."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from importlib import import_module
-from typing import TypeAlias
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ttscompile.artifact.view import View
+from ttscompile.core.coercion import Array
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
 from ttscompile.ir.pieces import BLOCKS, CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece
@@ -22,8 +18,6 @@ from ttscompile.runtimes.contexts import ContextValues
 from . import devices
 from .functions import Function, write_function
 from .sampler import IdleSteps
-
-Array: TypeAlias = npt.NDArray[np.generic]
 
 
 class Placed:

@@ -12,8 +12,6 @@ It is in the program once, with every block once, whatever K is. A block is eval
 computes it; the others then take what they reuse.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 

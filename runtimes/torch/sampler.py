@@ -163,19 +163,19 @@ class IdleSteps(devices.OnTensors):
         def there(array: object) -> Tensor:
             return devices.placed(np.asarray(array, np.float32), device)
 
-        self._turned, self._norm = form.turned, form.norm
+        self._turned, self._eps = form.turned, form.eps
         self.constant, self.head, self.shift = there(form.constant), there(form.head), there(form.shift)
         self._dimensions = form.head.shape[1]
         product = there(form.product)
         self.along, self.across = product[: self._dimensions + 1], product[self._dimensions + 1 :]
         self._held = not form.product.any()  # the prediction is the total's, whatever the sample is
-        self.basis = None if form.norm is None else there(form.norm.basis)
+        self.basis = None if form.basis is None else there(form.basis)
         self.fused: Any = None  # the module of that name, where there are a GPU and Triton
 
     def prepare(self, total: Tensor) -> Prepared:
         """What is known as soon as the total is."""
         stream = (total.transpose(0, 1) if self._turned else total) + self.constant
-        if self._norm is None or self.basis is None:
+        if self.basis is None:
             numerator = stream @ self.head
             blank = torch.zeros_like(numerator)
             rows = torch.cat([blank, torch.ones_like(blank[..., :1])], 2)
@@ -184,7 +184,7 @@ class IdleSteps(devices.OnTensors):
             centred = stream - stream.mean(2, keepdim=True)
             along = centred @ self.basis
             across = centred - along @ self.basis.T
-            deviation = ((across * across).sum(2, keepdim=True) / width + self._norm.eps).sqrt()
+            deviation = ((across * across).sum(2, keepdim=True) / width + self._eps).sqrt()
             rows, numerator = torch.cat([along / width**0.5, deviation], 2), centred @ self.head
         shift = self.shift.expand(-1, len(stream), -1)
         return Prepared(rows.permute(2, 0, 1).flatten(1), numerator.permute(2, 0, 1).flatten(1), shift.flatten(1))

@@ -91,17 +91,9 @@ class Workspace:
             read, added = advance.of_condition(self.network.condition())
             own, rest = offset[..., : self._horizon], offset[..., self._horizon :]
             offset = torch.cat([own + added * self._free.tensor, rest], 3)
-        sample, residuals = denoise(
-            self.network,
-            plan,
-            frozenset(np.flatnonzero(keep).tolist()),
-            advance,
-            self._initial.tensor,
-            offset.unbind(),
-            {cell: self.rollout[cell] for cell in np.flatnonzero(plan.rollout).tolist()},
-            read,
-            self._free.tensor,
-        )
+        kept, initial, free = frozenset(np.flatnonzero(keep).tolist()), self._initial.tensor, self._free.tensor
+        entries = {cell: self.rollout[cell] for cell in np.flatnonzero(plan.rollout).tolist()}
+        sample, residuals = denoise(self.network, plan, kept, advance, initial, offset.unbind(), entries, read, free)
         self.result.copy_(sample)
         for cell, residual in residuals.items():
             self.rollout[cell].copy_(residual)

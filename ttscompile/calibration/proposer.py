@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from .judge import Score
     from .trials import Trials
 
-
 SURE = 1.25
 """The upper limit of the distance, with 95 % confidence, may be so many times as far. A plan 0.099 away,
 and 0.142 at worst, lost 9 points of success. Where it is near 0 the root of an energy distance has wide limits."""

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..artifact import tensors
 from ..artifact.files import replace_file
 from ..artifact.strict_json import Value
+from ..core.coercion import Array
 from ..core.untrusted_json import parse_json
 from ..errors import ArtifactError, CalibrationError
-
-Array = npt.NDArray[Any]
 
 FILE = "calibration-state.safetensors"
 """Never listed in the manifest: an artifact is complete without it, and it is removed when calibration ends."""

@@ -151,9 +151,8 @@ def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: in
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if enough(middle) else (middle, high)
-    return replace(
-        goal, cells=high * blocks, measured={"errors": {str(n): error for n, error in sorted(tried.items())}}
-    )
+    errors = {str(n): error for n, error in sorted(tried.items())}
+    return replace(goal, cells=high * blocks, measured={"errors": errors})
 
 
 def named_plans(

@@ -53,7 +53,6 @@ COMPONENTS = 64
 MOST_NUMBERS = 16384
 """Of the condition, above which the correction does not read it: the keys of a prefix are millions."""
 
-
 HIDDEN = 128
 """H, the width of a jump's hidden layers. On Push-T 256 is no better, and one layer is worse."""
 

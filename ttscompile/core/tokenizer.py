@@ -24,7 +24,6 @@ _MOST_BYTES = 64 * 2**20
 _WORDS = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
 """What CLIP takes for a word, as transformers has it; its ``vocab.json`` does not say so."""
 
-
 IN_WORDS = "{state}"
 """Stands in what is after a text for the words of the state."""
 _PARTS = np.linspace(-1, 1, 257)[:-1]

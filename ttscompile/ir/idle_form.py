@@ -37,19 +37,6 @@ _NORM = "aten.layer_norm.default"
 
 
 @dataclass(frozen=True, eq=False)
-class Norm:
-    """What the LayerNorm of a tail makes of a stream that moves in D directions.
-
-    Attributes:
-        basis: ``[W, D]``, E above.
-        eps: of the LayerNorm.
-    """
-
-    basis: Wide
-    eps: float
-
-
-@dataclass(frozen=True, eq=False)
 class IdleForm:
     """Stem and tail in this form; the sample has D dimensions, the stream W, and there are T tokens.
 
@@ -57,7 +44,8 @@ class IdleForm:
         type: of the total, which is that of the residual stream.
         turned: whether its tokens come before the streams of the batch.
         constant: ``[T, W]``, what the stem adds to the total.
-        norm: None where the tail is affine.
+        basis: ``[W, D]``, E above; None where the tail is affine.
+        eps: of the tail's LayerNorm.
         head: ``[W, D]``, H above.
         product: ``[2 D + 1, D]``, what the sample is multiplied with: rows of y, then those of the numerator.
         shift: ``[D, 1, T]``, what is added to the quotient.
@@ -66,7 +54,8 @@ class IdleForm:
     type: TensorType
     turned: bool
     constant: Wide
-    norm: Norm | None
+    basis: Wide | None
+    eps: float
     head: Wide
     product: Wide
     shift: Wide
@@ -107,7 +96,7 @@ def _form(pieces: Pieces, weights: Weights) -> IdleForm:
     if all(node.op != _NORM for node in tail.nodes):
         head = _affine(_wide(tail), weights, turned_in=turned)
         product = np.concatenate([np.zeros((dimensions + 1, dimensions)), (stem.matrix @ head.matrix).T])
-        return IdleForm(kind, turned, stem.constant, None, head.matrix, product, head.constant.T[:, None])
+        return IdleForm(kind, turned, stem.constant, None, 0.0, head.matrix, product, head.constant.T[:, None])
     norm, rest = _split_at_norm(tail, stream)
     head = _affine(_wide(rest), weights, turned_in=turned)
     if dimensions >= width:
@@ -117,7 +106,7 @@ def _form(pieces: Pieces, weights: Weights) -> IdleForm:
     centred = stem.matrix - stem.matrix.mean(axis=1, keepdims=True)
     basis, triangle = np.linalg.qr(centred.T)
     product = np.concatenate([triangle / np.sqrt(width), np.zeros((1, dimensions)), (centred @ head.matrix).T])
-    return IdleForm(kind, turned, stem.constant, Norm(basis, eps), head.matrix, product, head.constant.T[:, None])
+    return IdleForm(kind, turned, stem.constant, basis, eps, head.matrix, product, head.constant.T[:, None])
 
 
 def _affine(graph: Graph, weights: Weights, turned_in: bool = False, turned_out: bool = False) -> _Affine:

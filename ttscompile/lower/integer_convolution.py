@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from onnx import ModelProto, NodeProto, shape_inference
 
+from ..core.coercion import Array
 from .graph_writer import GraphWriter
 from .onnx_model import replaced
-
-Array = npt.NDArray[Any]
 
 DOMAIN = "com.microsoft"
 INTEGER_PRODUCT = "MatMulIntegerToFloat"

@@ -33,13 +33,9 @@ def _join_blocks(blocks: Sequence[names.LoopPiece], own: Sequence[ModelProto]) -
             places = dict(zip(blocks[first].contexts, joint.places[first], strict=True))
             return _leaf(own[first], {blocks[first].stream: names.STREAM, **places}, output, f"b{first}")
         middle = halves(first, stop)
+        then, other = branch(first, middle, depth + 1), branch(middle, stop, depth + 1)
         node = helper.make_node(
-            "If",
-            [joint.switches[depth]],
-            [name],
-            name=f"if.{first}.{stop}",
-            then_branch=branch(first, middle, depth + 1),
-            else_branch=branch(middle, stop, depth + 1),
+            "If", [joint.switches[depth]], [name], name=f"if.{first}.{stop}", then_branch=then, else_branch=other
         )
         return GraphProto(name=f"blocks.{first}.{stop}", node=[node], output=[output])
 

@@ -153,7 +153,7 @@ class DenoisingLoop:
         value = self._add_in_step(w, step, value, made, len(self._groups))
         arrays = [tensor(name, np.float32) for name in (*state.values, table)]
         state = self._advance(w, replace(state, stream=value), k)
-        fresh = _joined(w, made)
+        fresh = w.op("Concat", *made, axis=0)
         renewed = w.op("ScatterND", table, w.op("Transpose", w.op("NonZero", step.computed), perm=[1, 0]), fresh)
         idle = self._idle_step(w, k, renewed)
         after = w.ops("Loop", [w.op("Gather", plan.idle, i), "", *state.values, last], len(state.values) + 1, body=idle)
@@ -208,7 +208,7 @@ class DenoisingLoop:
             block, reused = self._block(step, value, [*before, *made], b), self._reused(w, value, names.block_name(b))
             value, residual = w.choose(flag, block, reused)
             made.append(residual)
-        return w.body(f"group_{members.start}", value, _joined(w, made))
+        return w.body(f"group_{members.start}", value, w.op("Concat", *made, axis=0))
 
     def _block(self, step: _Step, stream: str, before: Sequence[str], b: int) -> GraphProto:
         """The gap before a computed block, and the block; gives the stream and the residual as a row."""
@@ -240,7 +240,8 @@ class DenoisingLoop:
         bounds = reads.constant([0]), reads.constant([b])
         row = reads.op("Slice", reads.op("Gather", self._plan.from_step, gap), *bounds)
         share = reads.op("Compress", row, reads.op("Slice", step.computed, *bounds))
-        total = reads.op("MatMul", reads.op("Unsqueeze", share, reads.constant([0])), _joined(reads, before))
+        row = reads.op("Unsqueeze", share, reads.constant([0]))
+        total = reads.op("MatMul", row, reads.op("Concat", *before, axis=0))
         added = reads.op("Add", stream, reads.op("Reshape", total, self._shape))
         in_step = w.op("Gather", step.in_step, w.constant(b))
         return w.choose(in_step, reads.body("in_step", added), plain.body("plain", same))[0]
@@ -307,7 +308,3 @@ class DenoisingLoop:
 def _flags(w: GraphWriter, vector: str, which: range) -> list[str]:
     part = w.op("Slice", vector, w.constant([which.start]), w.constant([which.stop]))
     return w.ops("Split", [part], len(which), axis=0, num_outputs=len(which))
-
-
-def _joined(w: GraphWriter, rows: Sequence[str]) -> str:
-    return w.op("Concat", *rows, axis=0)

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from onnx import AttributeProto, ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
+from ..core.coercion import Array
 from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, columns_at_once, pack
 from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
@@ -31,8 +32,6 @@ from .onnx_model import live_nodes, replaced
 
 if TYPE_CHECKING:
     from ..ir.program import Program
-
-Array = npt.NDArray[Any]
 
 PROLOGUE = "prologue"
 """All parts but the blocks, where parts are named that stay fp32."""
@@ -52,14 +51,12 @@ LARGEST = 127
 MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 """Terms of a sum of products that an int32 holds whatever their values."""
 
-
 LEAST_TABLE = 2**20
 """Numbers of a table whose rows are read in eight bits: an embedding of words has some 10**8."""
 
 FOUR_BITS = (BLOCKS, CONDITION, STEP)
 """The parts that precision int4 has in four bits, a language model's prefix among them. Image encoders have eight: they
 wait for arithmetic, which takes longer in four."""
-
 
 Matrices = Mapping[str, tuple[str, Array]]
 """Constant float32 matrices ``[rows, columns]`` by the names of their values, each with the name of its constant."""

@@ -4,29 +4,14 @@ To find that out its exporter evaluates every operation once more. The types of 
 places are written out, and the exporter looks for others only where there may be some.
 """
 
-from collections.abc import Mapping
-
-from ..ir.graph import Argument, Graph, Node, TensorType
-from ..ir.operations import find_operation
-
-Types = Mapping[str, TensorType]
+from ..ir.graph import Argument, Graph, Node
+from ..ir.operations import Types, find_operation
 
 _SUMS = ("sum", "prod", "cumsum", "cumprod")
 """Of truth values and small whole numbers they are int64."""
 
 _MIXED = (
-    *(
-        "embedding",
-        "index",
-        "index_select",
-        "index_copy",
-        "gather",
-        "take_along_dim",
-        "argmax",
-        "argmin",
-        "topk",
-        "sort",
-    ),
+    *"embedding index index_select index_copy gather take_along_dim argmax argmin topk sort".split(),
     *("scaled_dot_product_attention", "pad", "_to_copy"),
 )
 """They are given, or give, several types: indices, masks, what is converted, what a mask is padded with."""

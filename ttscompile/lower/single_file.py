@@ -229,12 +229,7 @@ def write_interface(main: GraphWriter, program: Program, weights: Weights) -> tu
     inputs, outputs = _of_every_policy(program)
     if pieces.pruner is not None:
         inputs += _of_pruner(main, pieces.pruner, weights)
-    given = correction.no_correction(spec.sampler.steps, spec.sample)
-    own = {
-        correction.ANCHORS: given.anchors,
-        correction.CORRECTION: given.weights,
-        correction.CORRECTION_BIAS: given.bias,
-    }
+    own = correction.no_correction(spec.sampler.steps, spec.sample).inputs()
     own[PLAIN] = np.zeros((spec.sampler.steps, len(program.blocks)), np.int8)
     inputs += [main.default(name, array) for name, array in own.items()]
     if numbers := condition_numbers(program):

@@ -69,17 +69,9 @@ def write_streams(
     new = w.op("Reshape", by_stream, shape, allowzero=1)
     more = [w.op("SequenceInsert", rows, new), w.op("SequenceInsert", cells, flat)]
     going_on = w.op("Identity", on)
-    body = w.graph(
-        "streams_of_one_plan",
-        [tensor(going_on, np.bool_), tensor(every, np.float32), sequence(more[0]), sequence(more[1], np.int64)],
-        [
-            tensor(i, np.int64, []),
-            tensor(on, np.bool_, []),
-            tensor(samples, np.float32),
-            sequence(rows),
-            sequence(cells, np.int64),
-        ],
-    )
+    results = [tensor(going_on, np.bool_), tensor(every, np.float32), sequence(more[0]), sequence(more[1], np.int64)]
+    given = [tensor(i, np.int64, []), tensor(on, np.bool_, []), tensor(samples, np.float32)]
+    body = w.graph("streams_of_one_plan", results, [*given, sequence(rows), sequence(cells, np.int64)])
     count = main.op("Reshape", count, main.constant(np.zeros(0)))
     sample, *kept_ones = main.ops("Loop", [count, "", *carried], len(carried), body=body)
     new_rows, new_cells = (main.op("ConcatFromSequence", each, axis=0) for each in kept_ones)

@@ -18,8 +18,9 @@ from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
-from ttscompile.calibration.proposers.weights import NAME, Array, Lesson, Student, Weights, trainable
+from ttscompile.calibration.proposers.weights import NAME, Lesson, Student, Weights, trainable
 from ttscompile.calibration.trials import Trials
+from ttscompile.core.coercion import Array
 from ttscompile.core.lattice import whole_steps_plan
 from ttscompile.core.plan import Plan
 from ttscompile.trajectories.episodes import Episode

@@ -16,13 +16,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from ...artifact.load import Artifact
 from ...artifact.stores import BlockWeights
 from ...artifact.view import view_of
+from ...core.coercion import Array
 from ...core.lattice import Source, whole_steps_plan
 from ...core.plan import ORIGINAL, Plan
 from ...errors import CalibrationError, CalibrationFailedError
@@ -37,8 +37,6 @@ from ..kept import holding
 from ..proposer import Proposal, Proposals, Proposer
 from ..sparse_loop import fit_correction
 from ..trials import Trials
-
-Array = npt.NDArray[Any]
 
 BATCH, PART = 64, 16
 """Calls of one update, and how many of them a thread differentiates at once: gradients are summed in this order,

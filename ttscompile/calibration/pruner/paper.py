@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ...core.lattice import PlanArray, Source, whole_steps_plan
-from ...ir.plan_head import first_numbers, has_head
+from ...ir.plan_head import NAMES, first_numbers, has_head
 from ...runtimes.plans import pruner_plan
 from ..calls import Calls, IntArray, calls_of
 from ..step_counts import spacings
@@ -64,9 +64,6 @@ FORBIDDEN = -1e9
 """Logit of a source that may not be taken."""
 
 BASE = "pruner.base"
-
-TRAINED = tuple(f"pruner.{n}" for n in ("hidden.weight", "hidden.bias", "code.weight", "code.bias", "step", "block"))
-"""Of the pruner, what the observation goes through."""
 
 
 class Paper(NothingAfter):
@@ -282,7 +279,7 @@ def _first_numbers(head: Mapping[str, Array]) -> dict[str, Array]:
     """What the observation goes through, as it was before any calibration: an artifact has what the last one left."""
     (width, inputs), rank = head["pruner.hidden.weight"].shape, head["pruner.step"].shape[1]
     first = first_numbers(inputs, width, rank, *head[BASE].shape[:2])
-    return {name: first[name] for name in TRAINED}
+    return {name: value for name, value in first.items() if name in NAMES - {BASE}}
 
 
 def _divided(task: Task) -> tuple[IntArray, IntArray]:
