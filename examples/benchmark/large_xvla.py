@@ -56,7 +56,7 @@ def save(directory: Path) -> None:
         made = [{"registry_name": step, "config": config} for step, config in own.items()]
         write_json(directory / f"policy_{name}processor.json", {"steps": made})
     layers = TowerConfig(1024, 4096, 24, 16, "gelu_pytorch_tanh")
-    florence = read_florence(Settings(FLORENCE, ""), (_SIDE, _SIDE), True)
+    florence = read_florence(Settings(FLORENCE, ""), (_SIDE, _SIDE), (True,) * _VIEWS)
     numbers = {"state": 32, "time": 32, "prompts": 32, "positions": 512, "views": _VIEWS, "padding": 1}
     with torch.device("meta"):
         shapes = XVLA(XVLAConfig(florence, layers, _CHUNK, _ACTIONS, (9, 19), **numbers)).state_dict()

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from .hybrid import fill
-from .vlas import CAMERAS, SHAPES as SHAPES, Array, drawn_frame, unpack
+from .vlas import CAMERAS, SHAPES as SHAPES, STATE, Array, drawn_frame, unpack
 
 KINDS = ("words", "native")
 """The second has statistics and groups of its base, two frames a camera, and differs in rarer entries."""
@@ -39,6 +39,15 @@ def with_liberos_rule(policy: Path) -> None:
         (policy / name).write_text(json.dumps(told))
 
 
+def without_clipping(policy: Path) -> None:
+    """Of a policy that is saved: a state may be out of range."""
+    path = policy / "policy_preprocessor.json"
+    told = json.loads(path.read_text())
+    (own,) = (step["config"] for step in told["steps"] if "clip_outliers" in step["config"])
+    own["clip_outliers"] = False
+    path.write_text(json.dumps(told))
+
+
 def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
     """By the names and shapes that lerobot saves."""
     drawn = fill({name: torch.empty(shape) for name, shape in shapes.items()}, 5)
@@ -49,6 +58,12 @@ def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
 def observation(call: int) -> dict[str, Array]:
     """One frame; of the second call's images the size is another, and so is the state."""
     return drawn_frame(call + 3, STATE_DIM, dict.fromkeys(CAMERAS, SIZES[call]))
+
+
+def far() -> dict[str, Array]:
+    """A frame of which the state is far out of range."""
+    given = observation(0)
+    return given | {STATE: given[STATE] * 20}
 
 
 def noise() -> Array:

@@ -12,13 +12,13 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import SpecError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.examined import examine
-from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.families import AS_SAVED, LoadOptions
 
 from . import groots
 from .lerobot_tiny import change_json
 from .refused import assert_not_read
 from .vlas import Array
-from .whole_vlas import GROOT, Refusals, assert_refused, refusals, rename_weight
+from .whole_vlas import GROOT, Refusals, assert_refused, eager_chunk, refusals, rename_weight
 
 MODEL = GROOT
 EMBEDDING = "_groot_model.backbone.model.model.language_model.embed_tokens.weight"
@@ -136,12 +136,21 @@ def test_an_embodiment_that_is_in_no_table_has_the_first_ones_weights(directory:
     assert doubts["embodiment"].remedy and "weights of number 0" in doubts["embodiment"].found
 
 
+def test_a_state_that_is_out_of_range_and_not_clipped(directory: Path, golden: Mapping[str, Array]) -> None:
+    given = groots.far(), groots.noise(), GROOT.tokenizer("words"), groots.TASKS[0]
+    clipped = eager_chunk(directory, AS_SAVED, *given)[1]
+    groots.without_clipping(directory)
+    found = eager_chunk(directory, AS_SAVED, *given)[1]
+    expected = golden["words.far"]
+    assert np.abs(found[:, : expected.shape[1]] - expected).max() < 1e-4
+    assert np.abs(found - clipped).max() > 0.01
+
+
 REFUSED: Refusals = {
     "step/pack": [
         ({"embodiment_tag": None}, "embodiment_tag is None, .*expected the name of an embodiment"),
         ({"embodiment_mapping": {"new_embodiment": "x"}}, "embodiment_mapping .*; expected .* whole numbers by name"),
         ({"embodiment_mapping": {"new_embodiment": 11}}, "weight _groot_model.* has no part 11, of the"),
-        ({"clip_outliers": False}, "clip_outliers is False; expected true"),
         ({"max_state_dim": 7}, "max_state_dim is 6; expected 7"),
         ({"state_horizon": 2}, "state_horizon is 2; expected 1"),
         ({"registry_name": "groot_pack_inputs_v3"}, "the step groot_pack_inputs_v3 is of GR00T N1.5"),

@@ -152,7 +152,7 @@ def test_steps_that_leave_actions_as_they_are(tmp_path: Path) -> None:
         ({"exclude_joints": [1]}, {}, {}, "expected names in action_names and exclude_joints"),
         ({"last": True}, {}, {}, "expected relative_actions_processor before the state is changed"),
         ({}, {"first": True}, {}, "expected absolute_actions_processor after actions are unnormalised"),
-        ({}, {}, {"adapt_to_pi_aloha": True}, "adapt_to_pi_aloha is set: joints are turned into others"),
+        ({}, {}, {"adapt_to_pi_aloha": True}, "adapt_to_pi_aloha is set: lerobot turns joints into others that are"),
     ],
 )
 def test_steps_that_are_no_pair_are_refused(
@@ -176,6 +176,16 @@ def test_steps_that_are_no_pair_are_refused(
 def test_a_state_that_is_shorter_than_an_action(tmp_path: Path) -> None:
     directory = relatives.with_relative_steps(pis.save("pi0", tmp_path / "policy"), None)
     assert_not_read(directory, "the 5 numbers of an action are relative to a state, which has 4; expected as many")
+
+
+def test_a_state_of_one_number_is_added_to_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As lerobot's step does it, but to those that are absolute."""
+    monkeypatch.setitem(relatives.STATE_DIMS, "pi0", 1)
+    directory = relatives.with_wide_state(pis.save("pi0", tmp_path / "policy"), "pi0")
+    relatives.with_relative_steps(directory, list(relatives.NAMES))
+    relative = load_checkpoint_policy(directory)[1].chunk.relative
+    assert relative is not None
+    assert relative.entries == (0, 0, None, 0, None)
 
 
 def test_a_gripper_of_two_values_has_to_be_absolute(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 import ttscompile
 from tests.once import Once
@@ -27,7 +28,7 @@ from ..verification.broken import edited
 from . import originals
 from .lerobot_tiny import change_json
 from .refused import assert_not_read
-from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame
+from .vlas import CAMERAS, MASK, STATE, TOKENS, Array, arrays, as_given, frame, with_fewer_layers
 
 pytestmark = pytest.mark.slow
 
@@ -208,6 +209,49 @@ def test_an_instruction_that_is_compiled_in(directory: Path, golden: Mapping[str
     assert encoder.task.tolist() == [given["tokens"][given["attention_mask"]].tolist()]
     assert set(spec.observations) == {STATE, *CAMERAS}
     assert np.abs(eager(directory, given, observed(given), task) - golden[f"call{call}.action"]).max() < 1e-4
+
+
+@pytest.mark.parametrize(("name", "without"), [("around", None), ("around.missing", [CAMERAS[1]])])
+def test_tokens_around_images(
+    directory: Path, tmp_path: Path, golden: Mapping[str, Array], others: Mapping[str, Array], name: str, without: Any
+) -> None:
+    """Those around a black image, of which LeRobot shows as many as are called empty, are not masked."""
+    policy, given = copy(directory, tmp_path), arrays(golden, 0)
+    for empty, close in ((1, True), (0, without is None)):
+        change_json(policy / "config.json", add_image_special_tokens=True, empty_cameras=empty)
+        found = eager(policy, given, observed(given), LoadOptions(without_cameras=without))
+        assert (np.abs(found - others[name]).max() < 1e-4) == close
+    assert np.abs(found - golden["call0.action"]).max() > 0.01
+    path = tmp_path / "smolvlm-tiny" / "tokenizer.json"
+    path.write_text(path.read_text().replace("<global-img>", "<another>"))
+    assert_not_read(policy, "its tokenizer has no <fake_token_around_image> or no <global-img> among the 288 tokens")
+
+
+def test_tokens_around_images_are_compiled(
+    directory: Path, tmp_path: Path, golden: Mapping[str, Array], others: Mapping[str, Array]
+) -> None:
+    policy, given = copy(directory, tmp_path), arrays(golden, 0)
+    change_json(policy / "config.json", add_image_special_tokens=True)
+    ttscompile.convert(policy, tmp_path / "compiled")
+    compiled = ttscompile.load(tmp_path / "compiled")
+    found = compiled.predict_action_chunk(observed(given), noise=Noise(given["noise"]), plan="dense")
+    assert np.abs(found - others["around"]).max() < 1e-4
+
+
+def test_an_expert_with_fewer_layers(
+    directory: Path, tmp_path: Path, golden: Mapping[str, Array], others: Mapping[str, Array]
+) -> None:
+    """Each sees what the first of two layers of the language model has."""
+    policy, given = copy(directory, tmp_path), arrays(golden, 0)
+    path, own = policy / "model.safetensors", {"num_expert_layers": 2, "self_attn_every_n_layers": -1}
+    weights = with_fewer_layers(load_file(path))
+    path.unlink()  # it is mapped
+    save_file(weights, path)
+    change_json(policy / "config.json", **own)
+    found = eager(policy, given, observed(given), LoadOptions())
+    assert np.abs(found - others["fewer"]).max() < 1e-4
+    change_json(policy / "config.json", num_expert_layers=3)
+    assert_not_read(policy, "num_expert_layers is 3; expected none, 4 as the language model has, or a part of it if")
 
 
 def copy(directory: Path, folder: Path) -> Path:

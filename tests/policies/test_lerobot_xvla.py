@@ -13,15 +13,16 @@ from safetensors.torch import load_file, save_file
 from tests.once import Once
 from ttscompile.errors import TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.passes.split_frames import SplitFrames
 from ttscompile.policies.lerobot.files import files_beside
+from ttscompile.policies.networks.internvl import MEAN
 
 from . import xvlas
 from .lerobot_tiny import change_json
 from .refused import assert_not_read
 from .vlas import CAMERAS, STATE, Array
-from .whole_vlas import XVLA, Refusals, assert_refused, refusals
+from .whole_vlas import XVLA, Refusals, assert_refused, eager_chunk, refusals
 
 MODEL = XVLA
 TOKENIZER = xvlas.SAVED / xvlas.LANGUAGE
@@ -61,6 +62,25 @@ def test_what_is_beside_an_image_is_the_mean_colour(directory: Path) -> None:
     """lerobot pads what is normalised with zeros."""
     _, spec = load_checkpoint_policy(directory)
     assert [spec.observations[key].fill for key in CAMERAS] == [(0.485, 0.456, 0.406)] * 2
+
+
+def test_cameras_of_which_some_are_normalised(directory: Path, golden: Mapping[str, Array]) -> None:
+    """By name; or all but observation.image, where no name is given. Beside the others there is black."""
+    given = xvlas.observation(1), xvlas.noise("ee6d"), TOKENIZER, xvlas.TASKS[0]
+    every = eager_chunk(directory, AS_SAVED, *given)[1]
+    xvlas.normalise(directory, [CAMERAS[1]])
+    found = eager_chunk(directory, AS_SAVED, *given)[1]
+    assert np.abs(found - golden["ee6d.one"]).max() < 1e-5
+    assert np.abs(found - every).max() > 1e-3
+    assert [load_checkpoint_policy(directory)[1].observations[key].fill for key in CAMERAS] == [(), MEAN]
+
+
+def test_a_single_cameras_name_beside_others(directory: Path) -> None:
+    path, alone = directory / "config.json", "observation.image"
+    features = json.loads(path.read_text())["input_features"]
+    change_json(path, input_features={alone if key == CAMERAS[0] else key: one for key, one in features.items()})
+    _, spec = load_checkpoint_policy(directory)
+    assert [spec.observations[key].fill for key in (alone, CAMERAS[1])] == [(), MEAN]
 
 
 def test_the_robot_is_the_preprocessors(directory: Path, golden: Mapping[str, Array]) -> None:
@@ -149,7 +169,6 @@ REFUSED: Refusals = {
         ({"truncation": False}, "expected such a step, which cuts an instruction"),
     ],
     "step/xvla_add_domain_id": [({"domain_id": -1}, "domain_id is -1; expected a whole number, 2 at most")],
-    "step/xvla_imagenet_normalize": [({"image_keys": [CAMERAS[0]]}, "image_keys is .*; expected all cameras, or none")],
 }
 
 

@@ -1,6 +1,7 @@
 """What tests of vision-language-action models and the makers of their golden files share."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -58,6 +59,18 @@ def arrays(golden: Mapping[str, Array], call: int) -> dict[str, Array]:
     names = ("task", "tokens", "attention_mask", "noise")
     frames = {key: golden[f"call{call}.frame0.{key}"] for key in (STATE, *CAMERAS)}
     return frames | {name: golden[f"call{call}.{name}"] for name in names}
+
+
+def with_fewer_layers(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """SmolVLA's, of whose expert every other layer is left: those that cross."""
+    found = dict[str, torch.Tensor]()
+    for name, value in weights.items():
+        layer = re.search(r"(\.lm_expert\.layers\.)(\d+)\.", name)
+        if layer is None:
+            found[name] = value
+        elif int(layer[2]) % 2:
+            found[name.replace(layer[0], f"{layer[1]}{int(layer[2]) // 2}.")] = value
+    return found
 
 
 def frame(given: Mapping[str, Array], size: tuple[int, int]) -> dict[str, Array]:

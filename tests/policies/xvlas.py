@@ -47,6 +47,15 @@ def save(kind: str, folder: Path) -> Path:
     return directory
 
 
+def normalise(directory: Path, cameras: list[str]) -> None:
+    """Have only the images of these normalised by the colours of ImageNet."""
+    path = directory / "policy_preprocessor.json"
+    steps = json.loads(path.read_text())["steps"]
+    (own,) = (step["config"] for step in steps if step["registry_name"] == "xvla_imagenet_normalize")
+    own["image_keys"] = cameras
+    change_json(path, steps=steps)
+
+
 def weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
     """By the names and shapes that lerobot saves."""
     return fill({name: torch.empty(shape) for name, shape in shapes.items()}, 5)

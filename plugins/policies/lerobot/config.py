@@ -13,7 +13,7 @@ CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ENVIRONMENT, ACTION = "observation.environment_state", "action"
 
 MOST_PIXELS, MOST_STEPS, MOST = 4096, 4096, 2**16
-MOST_LAYERS, MOST_VOCABULARY, MOST_LETTERS, _MOST_CAMERAS = 512, 2**20, 400, 64
+MOST_LAYERS, MOST_VOCABULARY, MOST_LETTERS, MOST_CAMERAS = 512, 2**20, 400, 64
 """Sizes above these are no policy's. Whether the weights are there for them is asked later."""
 
 
@@ -88,9 +88,9 @@ def read_lerobot_config(
         len(shape) != 3 or shape[0] != 3 for shape in cameras.values()
     ):
         raise settings.error(f"cameras have the shapes {cameras!s:.300}; expected the same [3, height, width] of all")
-    if len(cameras) > _MOST_CAMERAS or any(max(shape) > MOST_PIXELS for shape in cameras.values()):
+    if len(cameras) > MOST_CAMERAS or any(max(shape) > MOST_PIXELS for shape in cameras.values()):
         raise settings.error(
-            f"there are {len(cameras)} cameras of {next(iter(cameras.values()))}; expected {_MOST_CAMERAS} at most, of"
+            f"there are {len(cameras)} cameras of {next(iter(cameras.values()))}; expected {MOST_CAMERAS} at most, of"
             f" {MOST_PIXELS} pixels a side at most"
         )
     config = LeRobotConfig(

@@ -40,7 +40,7 @@ def _examined(directory: Path, spec: PolicySpec, encoders: str | os.PathLike[str
         if key != ACTION and name not in spec.observations:
             continue
         if one is not None:
-            doubts.append(judged(name, one.first, one.second, one.mode == "MEAN_STD", one.clipped))
+            doubts.append(judged(name, one.first, one.second, one.mode == "MEAN_STD", one.still))
         elif mode == "IDENTITY" and kind not in ("STATE", "ACTION"):
             continue  # as SmolVLA and its like see pictures
         elif mode == "IDENTITY" and key in measured:

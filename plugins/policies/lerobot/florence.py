@@ -25,13 +25,13 @@ _STAGES: Mapping[str, list[Any]] = {
 """What transformers takes for an entry that a file leaves out."""
 
 
-def read_florence(model: Settings, size: tuple[int, int], colours: bool) -> FlorenceConfig:
+def read_florence(model: Settings, size: tuple[int, int], colours: tuple[bool, ...]) -> FlorenceConfig:
     """Sizes and variant, as transformers or Microsoft's code writes them.
 
     Args:
         model: the entries.
         size: height and width of the images.
-        colours: whether pixels are normalised.
+        colours: of each camera, whether pixels are normalised.
     """
     vision, text = _translated(part_of(model, "vision_config")), part_of(model, "text_config")
     text.choice("model_type", "florence2_language", "bart")

@@ -99,7 +99,7 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
     pack, encode = (_one(directory, before, name) for name in (_PACK, _ENCODE))
     decode = _one(directory, after, _UNPACK, _DECODE)
     packing = _settings(directory, pack)
-    packing.require(state_horizon=1, language_key=TASK, clip_outliers=True)
+    packing.require(state_horizon=1, language_key=TASK)
     kind, known = packing.values.get("embodiment_tag"), packing.values.get("embodiment_mapping")
     # An embodiment that is not there has the weights of number 0, in LeRobot's training, too; ``examined`` says so.
     number = known.get(kind, 0) if isinstance(known, dict) and isinstance(kind, str) else None
@@ -107,7 +107,8 @@ def read_groot_processors(directory: Path, features: lerobot.Features) -> GrootP
         expected = "expected the name of an embodiment, and in embodiment_mapping whole numbers by name"
         raise packing.error(f"embodiment_tag is {kind!r:.80}, embodiment_mapping {known!r:.200}; {expected}")
     read = packing.flag("normalize_min_max", True)
-    state = _statistics(directory, lerobot.state_of(directory, pack) if read else {}, STATE, features)
+    clipped = packing.flag("clip_outliers", True)
+    state = _statistics(directory, lerobot.state_of(directory, pack) if read else {}, STATE, features, clipped)
     actions, added = _actions(directory, decode, features), lerobot.relative_entries(directory, before, after, features)
     if added and ({*actions.relative} - {None} or actions.poses):
         raise CheckpointError(f"{directory}: {_DECODE} and the steps after it add the state to actions; expected one.")
@@ -256,7 +257,7 @@ def _group(
 
 
 def _statistics(
-    directory: Path, tensors: Mapping[str, Tensor], key: str, features: lerobot.Features
+    directory: Path, tensors: Mapping[str, Tensor], key: str, features: lerobot.Features, clipped: bool = False
 ) -> lerobot.Statistics | None:
     """The range of a feature; None where nothing is known of it."""
     names = [f"{key}.{name}" for name in ("min", "max")]
@@ -264,4 +265,4 @@ def _statistics(
         return None
     kind, shape = features[key]
     low, high = (lerobot.as_statistic(directory, name, tensors[name], kind, shape) for name in names)
-    return lerobot.Statistics("MIN_MAX", low, high, _EPSILON, clipped=True)
+    return lerobot.Statistics("MIN_MAX", low, high, _EPSILON, still=True, clipped=clipped)

@@ -85,13 +85,15 @@ class Statistics:
         mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.
         first: mean, or the lower end of the range.
         second: standard deviation, or the upper end.
-        clipped: whether what is out of range is clipped, and is 0 where there is no range.
+        still: whether a number that has no range is 0.
+        clipped: whether what is out of range is clipped.
     """
 
     mode: str
     first: torch.Tensor
     second: torch.Tensor
     eps: float
+    still: bool = False
     clipped: bool = False
 
     @property
@@ -147,10 +149,11 @@ class Normalizer(nn.Module):
     def __init__(self, statistics: Statistics | None) -> None:
         super().__init__()
         self.mode = None if statistics is None else statistics.mode
+        self.clipped = statistics is not None and statistics.clipped
         if statistics is not None:
             self.register_buffer("first", statistics.first, persistent=False)
             self.register_buffer("width", statistics.width, persistent=False)
-            still = statistics.second == statistics.first if statistics.clipped else None
+            still = statistics.second == statistics.first if statistics.still else None
             self.register_buffer("still", still, persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -160,7 +163,8 @@ class Normalizer(nn.Module):
         if self.mode == "MEAN_STD":
             return (x - self.first) / self.width
         scaled = 2 * (x - self.first) / self.width - 1
-        return scaled if self.still is None else torch.where(self.still, 0.0, scaled).clamp(-1, 1)
+        scaled = scaled if self.still is None else torch.where(self.still, 0.0, scaled)
+        return scaled.clamp(-1, 1) if self.clipped else scaled
 
 
 @dataclass(frozen=True)
@@ -248,14 +252,14 @@ def relative_entries(
         raise CheckpointError(f"{directory}: {told}; found {orders[0]} and {orders[1]}, enabled: {enabled}.")
     if orders[1].index(_ABSOLUTE) < max(i for i, name in enumerate(orders[1]) if name in _CHANGES):
         raise CheckpointError(f"{directory}: expected {_ABSOLUTE} after actions are unnormalised; found {orders[1]}.")
-    if state < count:
+    if state < count and state != 1:  # lerobot adds one number to all
         told = f"{_RELATIVE}: the {count} numbers of an action are relative to a state, which has {state}"
         raise CheckpointError(f"{directory}: {told}; expected as many.")
     for entry in (names or [], excluded):
         if not isinstance(entry, list) or not all(isinstance(name, str) for name in entry):
             raise own[0].error(f"found {own[0].values!s:.300}; expected names in action_names and exclude_joints")
     absolute = [any(part and part.lower() in name.lower() for part in excluded) for name in (names or [])[:count]]
-    return tuple(None if i < len(absolute) and absolute[i] else i for i in range(count))
+    return tuple(None if i < len(absolute) and absolute[i] else min(i, state - 1) for i in range(count))
 
 
 def read_steps(directory: Path, name: str, own: Collection[str]) -> list[dict[str, Any]]:

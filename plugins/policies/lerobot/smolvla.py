@@ -4,6 +4,7 @@ Neither lerobot nor transformers is needed. Source: ``SmolVLAPolicy.predict_acti
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import torch
 from torch import nn
 
 from ttscompile.core.spec import PolicySpec
+from ttscompile.core.tokenizer import Tokenizer
+from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.instruction import encoder_folders, find_encoder, language_model_folder, task_tokens
@@ -20,7 +23,7 @@ from ttscompile.frontends.settings import Settings, read_json
 from ..networks.siglip import SiglipConfig
 from ..networks.smolvla import Expert, Prefix, SmolVLA, SmolVLAConfig, expert_of
 from . import vla
-from .config import CONFIG, MOST, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
+from .config import CONFIG, MOST, MOST_CAMERAS, MOST_LAYERS, MOST_LETTERS, MOST_PIXELS, MOST_VOCABULARY, LeRobotConfig
 from .policy import read_weights
 
 _MODEL = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
@@ -49,6 +52,8 @@ _LLAMA |= dict.fromkeys(("num_attention_heads", "num_hidden_layers"), 32)
 _UNREAD = (".vlm.lm_head.weight", ".text_model.norm.weight")
 """Weights of what the policy does not compute: the language model's answer."""
 
+_AROUND = ("<fake_token_around_image>", "<global-img>")
+
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
@@ -58,6 +63,8 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     folders = encoder_folders(options.encoders, directory)
     name = settings.text("vlm_model_name", _MODEL, MOST_LETTERS)
     config = read_config(shared, _language_model(name, folders))
+    if settings.flag("add_image_special_tokens", False):
+        config = _with_words_around(config, shared, language_model_folder(name, folders, "smolvlm"))
     length = settings.number("tokenizer_max_length", 48, MOST)
     sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
     if options.task is not None:
@@ -76,13 +83,15 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
 def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
     """Sizes and variant, of the policy's entries and those of its language model."""
     settings = shared.settings
-    settings.require(add_image_special_tokens=False, use_delta_joint_actions_aloha=False)
+    settings.require(use_delta_joint_actions_aloha=False)
     vision_entries, text = vla.part_of(model, "vision_config"), vla.part_of(model, "text_config")
     text = Settings(_LLAMA | dict(text.values), text.where)
     text.require(hidden_act="silu", attention_bias=False, mlp_bias=False)
     names = {field for field in SiglipConfig.__dataclass_fields__ if field in vision_entries.values}
     vision = SiglipConfig(**{name: vision_entries.values[name] for name in names})
     layers = _layers(settings, text.number("num_hidden_layers", None, MOST_LAYERS))
+    crosses = _crosses(settings, layers)
+    every = _every(settings, crosses)
     heads, width = text.number("num_attention_heads", None, MOST), text.number("hidden_size", None, MOST)
     own = Settings({"num_key_value_heads": heads} | dict(text.values), text.where)
     language = vla.read_language(own, layers, width // heads)
@@ -97,11 +106,26 @@ def read_config(shared: LeRobotConfig, model: Settings) -> SmolVLAConfig:
         scale=scale,
         image=_image(shared, vision.patch_size * scale),
         expert=expert,
-        crosses=_crosses(settings, layers),
+        crosses=crosses[::every],
         state=vla.padded_size(settings, "max_state_dim", shared.state_dim),
         actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
         periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
+        every=every,
     )
+
+
+def _with_words_around(config: SmolVLAConfig, shared: LeRobotConfig, folder: Path) -> SmolVLAConfig:
+    """With the tokens around each image, those of cameras counted that lerobot shows as black ones."""
+    tokenizer, settings = Tokenizer(folder, CheckpointError), shared.settings
+    known = min(tokenizer.size, config.vocabulary)
+    image, whole = tokenizer.with_words(_AROUND)
+    if max(image, whole) >= known:
+        found = f"its tokenizer has no {' or no '.join(_AROUND)} among the {known} tokens that the model knows"
+        raise CheckpointError(f"{folder}: {found}; add_image_special_tokens needs both. It is of another model.")
+    features = settings.values["input_features"].values()
+    missing = sum(feature.get("type") == "VISUAL" for feature in features) - len(shared.cameras)
+    absent = min(missing, settings.number("empty_cameras", 0, MOST_CAMERAS, least=0))
+    return replace(config, around=((image, whole), (image,)), absent=absent)
 
 
 def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
@@ -113,13 +137,19 @@ def _image(shared: LeRobotConfig, multiple: int) -> tuple[int, int]:
 
 
 def _layers(settings: Settings, there: int) -> int:
-    wanted, expert = settings.values.get("num_vlm_layers", 16), settings.values.get("num_expert_layers", -1)
-    if type(wanted) is not int or type(expert) is not int:
-        raise settings.refusal("num_vlm_layers", "a whole number, as num_expert_layers is")
-    used = min(wanted, there) if wanted > 0 else there
-    if expert > 0 and expert != used:
-        raise settings.refusal("num_expert_layers", f"none, or {used} as the language model has: fewer are not rebuilt")
-    return used
+    wanted = settings.values.get("num_vlm_layers", 16)
+    if type(wanted) is not int:
+        raise settings.refusal("num_vlm_layers", "a whole number", 16)
+    return min(wanted, there) if wanted > 0 else there
+
+
+def _every(settings: Settings, crosses: tuple[bool, ...]) -> int:
+    """Layers of the language model to each of the expert. With fewer, lerobot fails where one does not cross."""
+    own, used = settings.values.get("num_expert_layers", -1), len(crosses)
+    if type(own) is not int or (own > 0 and (used % own or (own < used and not all(crosses[1:])))):
+        expected = f"none, {used} as the language model has, or a part of it if all cross (self_attn_every_n_layers -1)"
+        raise settings.refusal("num_expert_layers", expected, -1)
+    return used // own if own > 0 else 1
 
 
 def _crosses(settings: Settings, layers: int) -> tuple[bool, ...]:

@@ -49,8 +49,8 @@ def read_vla_config(
     config = read_lerobot_config(directory, entries, horizon=50, n_action_steps=50, chunked=True, stateless=stateless)
     if config.settings.flag("adapt_to_pi_aloha", False):
         raise config.settings.error(
-            "adapt_to_pi_aloha is set: joints are turned into others around the policy, which is not compiled; expected"
-            " false"
+            "adapt_to_pi_aloha is set: lerobot turns joints into others that are normalised already, which is not"
+            " compiled; expected false"
         )
     if entries["type"] != "pi05" and config.settings.values.get("rtc_training_max_delay", 0) != 0:
         raise config.settings.error(

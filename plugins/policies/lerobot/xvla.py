@@ -102,8 +102,11 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     encoder = Gathered(shared, processors, Prefix(network), config.state or None, task)
     sizes = {"actions": mode.actions, "tokens": length, "vocabulary": florence.text.vocab_size}
     spec = vla_spec(shared, processors, resize, "start", sizes, options, lambda each: _sampler(settings, each))
-    fill = MEAN if resize and colours else ()  # lerobot resizes what is normalised
-    observations = {key: replace(one, fill=fill) if one.image else one for key, one in spec.observations.items()}
+    observations = dict(spec.observations)
+    for key, own in zip(shared.cameras, colours, strict=True):
+        if resize and own:  # lerobot resizes what is normalised
+            name = processors.renamed.get(key, key)
+            observations[name] = replace(observations[name], fill=MEAN)
     spec = replace(spec, observations=observations, source={**spec.source, "domain": str(domain)})
     return EncodedDenoiser(encoder, Denoiser(network)).eval(), spec
 
@@ -175,17 +178,16 @@ def _domain(settings: Settings, processors: Processors) -> int:
     return step.number("domain_id", 0, count - 1, least=0)
 
 
-def _colours(shared: LeRobotConfig, processors: Processors) -> bool:
-    """Whether images are normalised by the colours of ImageNet."""
+def _colours(shared: LeRobotConfig, processors: Processors) -> tuple[bool, ...]:
+    """Of each camera whether its images are normalised by the colours of ImageNet."""
     if IMAGENET not in processors.own:
-        return False
+        return (False,) * len(shared.cameras)
     if list(processors.own) != [name for name in OWN_STEPS["xvla"] if name in processors.own]:
         raise shared.settings.error(f"{IMAGENET} is before xvla_image_to_float; expected it after")
     keys = processors.own[IMAGENET].get("image_keys")
-    told = {key in keys if isinstance(keys, list) else key.startswith("observation.images") for key in shared.cameras}
-    if len(told) > 1:
-        raise shared.settings.error(f"{IMAGENET}.image_keys is {keys!r:.200}; expected all cameras, or none")
-    return told == {True}
+    # lerobot passes over a single camera's name, observation.image, where no names are given.
+    every = keys if isinstance(keys, list) else [key for key in shared.cameras if key.startswith("observation.images")]
+    return tuple(key in every for key in shared.cameras)
 
 
 def _words(

@@ -62,7 +62,7 @@ class FlorenceConfig:
         positions: rows, and columns, that have an embedding.
         moments: rows of the embedding of time, of which the first one is read.
         size: height and width of the images.
-        colours: whether pixels are normalised by the mean and the deviation of ImageNet.
+        colours: of each camera, whether pixels are normalised by the mean and the deviation of ImageNet.
     """
 
     stages: tuple[Stage, ...]
@@ -71,7 +71,7 @@ class FlorenceConfig:
     positions: int
     moments: int
     size: tuple[int, int]
-    colours: bool
+    colours: tuple[bool, ...]
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -162,7 +162,7 @@ def _block(stage: Stage, window: int) -> nn.Module:
 
 
 class Davit(nn.Module):
-    """Pixels in -1..1 ``[N, 3, H, W]`` to patches ``[N, C, *grid]``."""
+    """Pixels, normalised, ``[N, 3, H, W]`` to patches ``[N, C, *grid]``."""
 
     def __init__(self, config: FlorenceConfig) -> None:
         super().__init__()
@@ -172,14 +172,12 @@ class Davit(nn.Module):
             nn.Sequential(*(_block(stage, config.window) for _ in range(stage.tower.num_hidden_layers)))
             for stage in config.stages
         )
-        self.colours = Colours() if config.colours else Colours((0.0,) * 3, (1.0,) * 3)
 
     def forward(self, pixels: Tensor) -> Tensor:
         """See the class."""
-        x = self.colours(pixels)
         for conv, blocks in zip(self.convs, self.blocks, strict=True):
-            x = blocks(conv(x))
-        return x  # type: ignore[no-any-return]
+            pixels = blocks(conv(pixels))
+        return pixels
 
 
 class _Projector(nn.Module):
@@ -248,6 +246,8 @@ class Florence(nn.Module):
         super().__init__()
         self.vision_tower, self.multi_modal_projector = Davit(config), _Projector(config)
         self.language_model = _Language(config.text)
+        plain = (0.0,) * 3, (1.0,) * 3
+        self.colours = nn.ModuleList(Colours() if own else Colours(*plain) for own in config.colours)
 
     def forward(self, images: list[Tensor], tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Features of the first image and the words ``[B, N + L, width]``; tokens of other images ``[B, V, N, width]``.
@@ -256,6 +256,7 @@ class Florence(nn.Module):
             images: of each camera ``[B, 3, H, W]``, in -1..1.
             tokens: int64 ``[B, L]``.
         """
-        seen = self.multi_modal_projector(self.vision_tower(torch.stack(images, 1).flatten(0, 1)))
+        pixels = [own(image) for own, image in zip(self.colours, images, strict=True)]
+        seen = self.multi_modal_projector(self.vision_tower(torch.stack(pixels, 1).flatten(0, 1)))
         seen = seen.unflatten(0, (-1, len(images)))
         return self.language_model(seen[:, 0], tokens), seen[:, 1:]

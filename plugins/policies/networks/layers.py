@@ -35,12 +35,12 @@ class ModulatedFinal(nn.Module):
 
 
 class TimmAttention(nn.Module):
-    """timm's self-attention: one projection for query, key and value."""
+    """timm's self-attention: one projection for query, key and value, which may have no bias."""
 
-    def __init__(self, width: int, count: int) -> None:
+    def __init__(self, width: int, count: int, biased: bool = True) -> None:
         super().__init__()
         self.count = count
-        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.qkv, self.proj = nn.Linear(width, 3 * width, bias=biased), nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """``[B, T, width]`` to the same."""
@@ -50,15 +50,16 @@ class TimmAttention(nn.Module):
 
 
 class TimmMlp(nn.Module):
-    """timm's feed-forward, so many times as wide inside."""
+    """timm's feed-forward, so many times as wide inside, with GELU as it is or as the hyperbolic tangent gives it."""
 
-    def __init__(self, width: int, out: int | None = None, times: int = 4) -> None:
+    def __init__(self, width: int, out: int | None = None, times: int = 4, exact: bool = False) -> None:
         super().__init__()
         self.fc1, self.fc2 = nn.Linear(width, times * width), nn.Linear(times * width, out or width)
+        self.approximate = "none" if exact else "tanh"
 
     def forward(self, x: Tensor) -> Tensor:
         """``[B, T, width]`` to ``[B, T, out]``."""
-        added: Tensor = self.fc2(functional.gelu(self.fc1(x), approximate="tanh"))
+        added: Tensor = self.fc2(functional.gelu(self.fc1(x), approximate=self.approximate))
         return added
 
 

@@ -28,9 +28,12 @@ class SmolVLAConfig:
         scale: patches along each axis that become one token.
         image: height and width of the images that the encoder sees.
         crosses: whether layer ``i`` of the expert sees the prefix alone; otherwise prefix and actions.
+        every: so many layers of the language model are one of the expert, which sees the first of them.
         state: numbers of the state, padded.
         actions: numbers of an action, padded.
         periods: shortest and longest of the timestep's waves.
+        around: tokens before each image, and after it.
+        absent: cameras of which there are these tokens alone, after all images.
     """
 
     vision: SiglipConfig
@@ -43,6 +46,9 @@ class SmolVLAConfig:
     state: int
     actions: int
     periods: tuple[float, float]
+    every: int = 1
+    around: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+    absent: int = 0
 
 
 def expert_of(text: layers.LanguageConfig, multiplier: float) -> layers.LanguageConfig:
@@ -130,7 +136,8 @@ class Prefix(nn.Module):
     def __init__(self, network: SmolVLA) -> None:
         super().__init__()
         model: Any = network.vlm_with_expert.vlm.model
-        self.channels, self.width = network.config.text.channels, network.config.text.width
+        config = self.config = network.config
+        self.channels, self.width = config.text.channels, config.text.width
         self.vision_model, self.connector, self.text_model = model.vision_model, model.connector, model.text_model
         self.state_proj = network.state_proj
 
@@ -145,10 +152,14 @@ class Prefix(nn.Module):
         """
         scale = math.sqrt(self.width)
         seen = self.connector(self.vision_model(torch.stack(images, 1).flatten(0, 1))) * scale
-        seen = seen.unflatten(0, (-1, len(images))).flatten(1, 2)
+        seen, rest = seen.unflatten(0, (-1, len(images))), list[Tensor]()
+        if any(self.config.around):
+            both = (torch.tensor(each, device=tokens.device) for each in self.config.around)
+            before, after = (self.text_model.embed_tokens(each).expand(*seen.shape[:2], -1, -1) for each in both)
+            seen, rest = torch.cat([before, seen, after], 2), [before[:, 0], after[:, 0]] * self.config.absent
         words = self.text_model.embed_tokens(tokens) * scale
-        x = torch.cat([seen, words, self.state_proj(state)[:, None]], 1)
-        valid = functional.pad(mask, (seen.shape[1], 1), value=True)
+        x = torch.cat([seen.flatten(1, 2), *rest, words, self.state_proj(state)[:, None]], 1)
+        valid = functional.pad(mask, (x.shape[1] - words.shape[1] - 1, 1), value=True)
         turns = layers.rotation(torch.cumsum(valid, 1) - 1, self.channels)
         # Images and words do not see the state.
         return valid, *layers.read_prefix(self.text_model.layers, x, turns, layers.prefix_mask(valid, late=1))
@@ -182,6 +193,6 @@ class Expert(nn.Module):
         later = layers.added(torch.ones(count, count, dtype=torch.bool, device=x.device).tril())[None, None]
         whole = torch.cat([crossing.expand(-1, -1, count, -1), later.expand(len(sample), -1, -1, -1)], 3)
         for i, layer in enumerate(self.layers):
-            prefix = layers.Seen(seen[2 * i], seen[2 * i + 1])
+            prefix = layers.Seen(*seen[2 * i * config.every :][:2])
             x = layer(x, prefix, turns, own_turns, crossing if layer.crosses else whole)
         return self.action_out_proj(self.norm(x))  # type: ignore[no-any-return]

@@ -146,6 +146,10 @@ def main() -> None:
         given = {key: value for key, value in groots.observation(0).items() if key != CAMERAS[0]}
         numbers[f"{kind}.missing"] = chunk(policy, 0, given)
         shutil.copytree("policy", "plain")
+        if kind == "words":  # the other one's actions do not look at its state
+            groots.without_clipping(folder / "policy")
+            numbers[f"{kind}.far"] = chunk(policy, 0, groots.far())
+            shutil.copy(Path("plain", "policy_preprocessor.json"), "policy")
         groots.with_liberos_rule(folder / "policy")
         policy.config.action_decode_transform = "libero"
         numbers[f"{kind}.libero"] = chunk(policy, 0, groots.observation(0))

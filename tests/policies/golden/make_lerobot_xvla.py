@@ -138,6 +138,11 @@ def main() -> None:
             directory = xvlas.save(mode, Path(folder))
             policy, given = XVLAPolicy.from_pretrained(directory), xvlas.observation(0, mode)
             numbers[mode] = chunk(policy, str(directory), mode, 0, given)
+    with TemporaryDirectory() as folder:
+        directory = xvlas.save("ee6d", Path(folder))
+        xvlas.normalise(directory, [CAMERAS[1]])
+        policy, given = XVLAPolicy.from_pretrained(directory), xvlas.observation(1)
+        numbers["ee6d.one"] = chunk(policy, str(directory), "ee6d", 0, given)
     path = Path(__file__).with_name("lerobot_xvla.npz")
     np.savez_compressed(path, **numbers)
     print(path, path.stat().st_size, "bytes")
