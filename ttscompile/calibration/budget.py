@@ -17,7 +17,7 @@ from ..artifact.view import view_of
 from ..core.coercion import integer
 from ..core.lattice import dense_plan, uniform_plan
 from ..core.plan import Plan
-from ..errors import CalibrationError
+from ..errors import CalibrationError, CalibrationFailedError
 from ..measure.timer import Timer
 from ..runtimes.open import open_runtime
 from ..runtimes.policy import CompiledPolicy
@@ -162,7 +162,7 @@ def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> 
 
     here = f"on this machine with {goal.threads} thread{'s' * (goal.threads > 1)}"
     if not fits(1):
-        raise CalibrationError(
+        raise CalibrationFailedError(
             f"{goal} cannot be reached: a call that computes step 0 alone takes {measured[1]:.4g} ms {here}. Allow"
             " more, or convert with fewer denoising steps or --precision int8."
         )
