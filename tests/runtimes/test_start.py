@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 
 import ttscompile
 from tests.once import Once
@@ -19,10 +20,12 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
+from ttscompile.cli import main
 from ttscompile.core.correction import groups_of, no_correction
 from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.core.start import rest_of
 from ttscompile.errors import ArtifactError, IllegalPlanError, ObservationError, TtscompileError
+from ttscompile.report.timing import measure_plans, timing_remarks
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.reference.model import ReferenceModel, noise_tensors
 
@@ -137,6 +140,24 @@ def test_it_says_what_it_is(warm: CompiledPolicy, whole: Path) -> None:
     assert (warm.info.K, cold.K) == (LAST, STEPS)
     assert (warm.info.follows, cold.follows) == (True, False)
     assert warm.info.default_plan == WARM
+
+
+def test_a_timing_says_that_its_calls_begin_with_a_chunk(warm: CompiledPolicy, whole: Path) -> None:
+    measured = measure_plans(warm, load_artifact(whole).manifest.spec, ("dense", "full", WARM, f"{WARM}@fp32"), 1)
+    assert [one.otherwise for one in measured] == [None, None, "full", "full"]
+    assert "'warm' was timed with the chunk of the call before; the first call of" in timing_remarks(measured)
+    assert "with the chunk" not in timing_remarks(measured[:2])
+
+
+def test_a_page_of_an_episode_leaves_the_first_call_out(whole: Path, tmp_path: Path) -> None:
+    """Which computes ``full``: it has other steps."""
+    obs = np.concatenate([drawn(call, 1)[0]["obs"] for call in range(4)])
+    np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=np.array([4]))
+    words = ["inspect", str(whole), "-o", str(tmp_path / "page.html"), "-t", str(tmp_path / "calls.npz")]
+    result = CliRunner().invoke(main, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.stderr
+    page = (tmp_path / "page.html").read_text()
+    assert "3 consecutive calls of calls.npz[0] (without its first call) with the default plan" in page
 
 
 def test_the_weights_are_there_once(warm: CompiledPolicy) -> None:
