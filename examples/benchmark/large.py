@@ -13,6 +13,7 @@
     python examples/benchmark/large.py --xvla                                   # LeRobot's xvla, whole
     python examples/benchmark/large.py --rdt                                    # RDT-170M, behind its encoders
     python examples/benchmark/large.py --octo                                   # Octo-small 1.5, whole
+    python examples/benchmark/large.py --dita                                   # Dita, whole
     python examples/benchmark/large.py --clip                                   # its multi_task_dit with CLIP B/16
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
@@ -59,6 +60,7 @@ WHOLE = {
     "xvla": "LeRobot's xvla",
     "rdt": "RDT-170M",
     "octo": "Octo-small 1.5",
+    "dita": "Dita",
 }
 """Policies that are compiled from what is saved of them, in place of the transformer; LeRobot's are whole."""
 
@@ -161,6 +163,7 @@ def tell_sizes(directory: Path) -> None:
 
 def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     """Where a whole policy is saved, which is written unless it is there; and the instruction that is compiled in."""
+    import large_dita
     import large_eo1
     import large_evo1
     import large_groot
@@ -176,9 +179,10 @@ def saved(folder: Path, name: str) -> tuple[Path, str | None]:
     if not directory.exists():
         pi05 = partial(large_pi0.save, adaptive=True)
         others = [large_groot, large_evo1, large_eo1, large_wall_x, large_vla_jepa, large_xvla, large_rdt, large_octo]
-        saves = [large_smolvla.save, large_pi0.save, pi05, *(each.save for each in others)]
+        saves = [large_smolvla.save, large_pi0.save, pi05, *(each.save for each in (*others, large_dita))]
         dict(zip(WHOLE, saves, strict=True))[name](directory)
-    return directory, large_evo1.TASK if name in TOLD else None
+    path = directory / large_dita.CHECKPOINT if name == "dita" else directory
+    return path, large_evo1.TASK if name in TOLD else None
 
 
 def convert_clip(folder: Path) -> None:
@@ -241,7 +245,7 @@ def _original(folder: Path, name: str) -> tuple[Eager, PolicySpec]:
 
 def _vision(module: nn.Module) -> nn.Module:
     """The image encoder of a vision-language-action model; of RDT the adaptor of its tokens, and of Octo its T5."""
-    names = ("vision_model", "vision_tower", "visual", "encoder.image", "hf_model")
+    names = ("vision_model", "vision_tower", "visual", "encoder.image", "hf_model", "image_tokenizer.tokenizer")
     return next(one for name, one in module.named_modules() if name.endswith(names))
 
 

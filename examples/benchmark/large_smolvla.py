@@ -135,6 +135,7 @@ def eager(module: nn.Module, vision: nn.Module, spec: PolicySpec) -> Callable[[]
         start = process_time()
         sample = run(given, noise).numpy()
         whole_call, seen, prefix = process_time() - start, took[vision], took[whole.encoder]
-        return spec.chunk.unnormalized(sample), [seen, prefix - seen, whole_call - prefix]
+        actions = spec.chunk.unnormalized(sample)[:, spec.chunk.start : spec.chunk.stop]
+        return actions, [seen, prefix - seen, whole_call - prefix]
 
     return timed

@@ -1,47 +1,67 @@
-"""Dita's denoiser: a causal Llama over words, images, the timestep and the actions, a token each.
+"""Dita, whole: from pictures and words to actions, read from a checkpoint and the configuration of its training.
 
-Parameters are called as in the original, ``scripts/llama_dp.py`` of RoboDita/Dita (arXiv 2503.19757), which evaluates
-all tokens at every step. No token sees those behind it, so keys and values of the prefix and of the timestep are
-computed apart from those of the actions. The ones are computed once a call; the others are made for all steps in one
-batch.
+The words' encoder, CLIP's, is in no checkpoint: it is read from a folder of its name. Where there is none, features of
+words are observed.
+
+Source: ``RobotTransformerNet.inference`` of RoboDita/Dita at 66350e7, and what its evaluations do to pictures and text.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.core.spec import Affine, ChunkSpec, Instruction, ObservationSpec, PolicySpec
+from ttscompile.core.tokenizer import find_tokenizer, padded
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
+from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
+from ttscompile.frontends.instruction import (
+    NAME_FOLDER,
+    encoder_folders,
+    find_encoder,
+    language_model_folder,
+    task_tokens,
+)
 from ttscompile.frontends.refusals import MERGE
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.settings import Settings
 
 from .loops import ddim_loops
-from .networks.language_layers import FeedForward, LanguageConfig, Norm
+from .networks.clip import ClipText, TextConfig, encoder_config
+from .networks.dinov2 import DinoConfig, own_names
+from .networks.dita_head import DitaHead
+from .networks.dita_tokens import IMAGE, MASK, TOKENS, WORDS, WRIST, Observed, PictureConfig, Pictures, Words
+from .networks.qformer import CHANNELS
+from .quantiles import STATISTICS, read_statistics
+from .shards import read_part
 from .yaml_files import read_yaml
 
 CONFIG = Path(".hydra") / "config.yaml"
 """Hydra writes it into the folder of a training; checkpoints are in a folder of that."""
 
-WORDS = 77
-"""Tokens of an instruction, with its padding: CLIP's."""
+CLIP, LENGTH = "openai/clip-vit-large-patch14", 77
+"""What makes features of words, and how many tokens these have, with their padding."""
 
-_CHANNELS = 64
-"""Of a head, whatever the width is."""
+_LLAMA, _PICTURES = "transformer.", "image_tokenizer."
+_TOWER, _MAKER = f"{_PICTURES}tokenizer.", f"{_PICTURES}qformer."
+_WRIST = f"{_TOWER}wrist_image_part."
+_UNREAD = (".rotary_emb.inv_freq", ".qformer.num_iter")
+"""Older versions of transformers saved the one, computed here; the other counts the steps of the training."""
 
-_LLAMA, _FIRST, _LAST = "transformer.", "transformer.model.layers.0.mlp.gate_proj.weight", "transformer.lm_head.weight"
-_QUERIES = ("image_tokenizer.qformer.queries", "image_tokenizer.qformer.latents")
-_UNREAD = ".rotary_emb.inv_freq"  # older versions of transformers saved it; computed here
-_MOST_STEPS = 4096
+_MOST_STEPS, _MOST_PIXELS = 4096, 4096
+_ARM, _METRES = 7, 0.0768
+"""Numbers of an action without a quaternion; and by what ``inference`` multiplies the pose of one that has it."""
 
 _REMEDY = (
     f"Give the {CONFIG} that hydra wrote for this training. For a released checkpoint write one with dataset:"
@@ -50,122 +70,52 @@ _REMEDY = (
 )
 
 
-Cache = list[tuple[Tensor, Tensor]]
-
-
-class _Attention(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.q_proj, self.k_proj, self.v_proj, self.o_proj = (nn.Linear(width, width, bias=False) for _ in range(4))
-
-    def forward(self, x: Tensor, past: tuple[Tensor, Tensor] | None) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        q, k, v = (
-            p(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for p in (self.q_proj, self.k_proj, self.v_proj)
-        )
-        before = 0 if past is None else past[0].shape[2]
-        q, k = _rotated(q, before), _rotated(k, before)
-        if past is not None:
-            k, v = torch.cat([past[0], k], 2), torch.cat([past[1], v], 2)
-        mask = torch.ones(x.shape[1], before + x.shape[1], dtype=torch.bool).tril(before)
-        y = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        return self.o_proj(y.transpose(1, 2).flatten(2)), (k, v)
-
-
-def _rotated(x: Tensor, start: int) -> Tensor:
-    """Rotary embedding of ``[B, H, T, C]`` from a position on, the two halves of the channels as pairs."""
-    rates = 1.0 / 10000 ** (torch.arange(0, x.shape[-1], 2).float() / x.shape[-1])
-    angle = torch.arange(start, start + x.shape[2]).float()[:, None] * rates.repeat(2)
-    left, right = x.chunk(2, -1)
-    return x * angle.cos() + torch.cat([-right, left], -1) * angle.sin()
-
-
-class _Layer(nn.Module):
-    def __init__(self, config: LanguageConfig) -> None:
-        super().__init__()
-        self.self_attn, self.mlp = _Attention(config.width, config.heads), FeedForward(config)
-        self.input_layernorm, self.post_attention_layernorm = Norm(config), Norm(config)
-
-    def forward(self, x: Tensor, past: tuple[Tensor, Tensor] | None) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        y, own = self.self_attn(self.input_layernorm(x), past)
-        x = x + y
-        return x + self.mlp(self.post_attention_layernorm(x)), own
-
-
-class DitaHead(nn.Module):
-    """``forward`` on the tokens of the prefix; inputs ``sample [B, T, D]``, ``timestep [B]``, ``prefix [B, P, E]``.
-
-    The prefix is the words of the instruction (CLIP), then the tokens of the frames.
-    """
-
-    def __init__(self, width: int, heads: int, hidden: int, layers: int, actions: int) -> None:
-        super().__init__()
-        self.width = width
-        self.transformer: Any = nn.Module()
-        self.transformer.model = nn.Module()
-        config = LanguageConfig(width, hidden, layers, heads, heads, width // heads)
-        self.transformer.model.layers = nn.ModuleList(_Layer(config) for _ in range(layers))
-        self.transformer.model.norm = Norm(config)
-        self.transformer.lm_head = nn.Linear(width, actions, bias=False)
-
-    def _through(self, x: Tensor, past: Cache | None) -> tuple[Tensor, Cache]:
-        """Tokens behind those whose keys and values are given, and the keys and values of both."""
-        layers = self.transformer.model.layers
-        every = []
-        for layer, seen in zip(layers, [None] * len(layers) if past is None else past, strict=True):
-            x, own = layer(x, seen)
-            every.append(own)
-        return x, every
-
-    def forward(self, sample: Tensor, timestep: Tensor, prefix: Tensor) -> Tensor:
-        """See the class."""
-        half = self.width // 2
-        wave = timestep[:, None] * torch.exp(torch.arange(half) * (-math.log(10000) / (half - 1)))
-        time = torch.cat([wave.sin(), wave.cos()], -1)[:, None]
-        actions = functional.pad(sample, (0, self.width - sample.shape[-1]))
-        past: Cache | None = None
-        for before in (prefix, time):
-            _, past = self._through(before, past)
-        x, _ = self._through(actions, past)
-        return self.transformer.lm_head(self.transformer.model.norm(x))  # type: ignore[no-any-return]
-
-
 def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
-    """Rebuild a head from a checkpoint and the configuration of its training; see ``Family.load``."""
+    """Rebuild a policy from a checkpoint and the configuration of its training; see ``Family.load``."""
     where = next(each for each in config_files(path) if each.is_file())
     settings = Settings(read_yaml(where), f"{where}: ", _REMEDY)
     settings.require(use_action_head_diff=0, dim_align_type=0, abs_sup=0, cfg=0)
+    if "model" in settings.values:
+        settings.part("model").require(use_depth_img=False)
     horizon, predicted = _lengths(settings)
-    saved = _saved(path)
-    width, hidden, layers, actions = _sizes(path, saved)
-    weights = {name: value for name, value in saved.items() if name.startswith(_LLAMA) and not name.endswith(_UNREAD)}
-    network = filled(
-        lambda: DitaHead(width, width // _CHANNELS, hidden, layers, actions),
-        as_float32(weights, f"{path}: "),
-        "A Llama of the width of its first layer",
-        path,
-    )
     frames = horizon - predicted + 1
-    prefix = WORDS + frames * _tokens(path, saved)
+    saved = _Saved(path)
+    sizes = saved.head_sizes()
+    pictures = _pictures(settings, saved, frames, sizes["width"])
+    head = filled(lambda: DitaHead(**sizes), saved.part(_LLAMA), "A Llama of the width of its first layer", path)
+    seen = own_names(saved.part(_TOWER)) | saved.part(_MAKER)
+    seen = {name.removeprefix(_PICTURES): value for name, value in seen.items()}
+    made = filled(lambda: Pictures(pictures), seen, "a network of its pictures' size", path)
     # Of the original's two schedules the one has a thousand timesteps, as diffusers has where nothing is said.
     linear = settings.number("scheduler_type", 0, least=0) == 1
     schedule: dict[str, Any] = {"beta_schedule": "linear"} if linear else {"num_train_timesteps": 100}
     schedule["prediction_type"] = settings.choice("prediction_type", "epsilon", "sample", "v_prediction")
     loops = ddim_loops(where, settings.number("num_inference_steps", 10), options, **schedule)
+    image = ObservationSpec((frames, 3, *pictures.size), bounds=(0.0, 1.0))
+    words = _words(path, sizes["width"], options)
+    statistics, normalizer = _normalizer(path, sizes["actions"])
+    source = {"format": "dita", "policy": "Dita", "frames": str(frames), "statistics": statistics, **loops.source}
     spec = PolicySpec(
-        sample=(horizon, actions),
-        observations={"prefix": ObservationSpec((prefix, width), window=False)},
+        sample=(horizon, sizes["actions"]),
+        observations={IMAGE: image, **({WRIST: image} if pictures.wrist else {}), **_told(words, sizes["width"])},
         sampler=loops.original,
         loops=loops.others,
-        chunk=ChunkSpec(actions, frames - 1, horizon),
-        source={"format": "dita", "policy": "Dita", "frames": str(frames), **loops.source},
+        chunk=ChunkSpec(sizes["actions"], frames - 1, horizon, normalizer, ranged=False),
+        source=source | ({} if options.task is None else {"task": options.task}),
+        instruction=Instruction(TOKENS, MASK, False) if isinstance(words, Words) else None,
     )
-    return network.eval(), spec
+    return EncodedDenoiser(Observed(made, words), head).eval(), spec
 
 
 def config_files(path: Path) -> tuple[Path, Path]:
     """Where the configuration of a checkpoint may be."""
     return path.parent / CONFIG, path.parent.parent / CONFIG
+
+
+def tokenizer_file(path: Path, encoders: str | os.PathLike[str] | None) -> Path | None:
+    """The tokenizer of CLIP, if it is on this machine, in the folder of its text encoder."""
+    folder = find_encoder(CLIP, encoder_folders(encoders, path.parent))
+    return None if folder is None else find_tokenizer(folder)
 
 
 def _lengths(settings: Settings) -> tuple[int, int]:
@@ -179,43 +129,162 @@ def _lengths(settings: Settings) -> tuple[int, int]:
     return horizon, predicted
 
 
-def _saved(path: Path) -> Mapping[str, Any]:
-    """What was saved of the network; under ``parameter``, or alone."""
-    payload = read_checkpoint(path)
-    saved = payload.get("parameter", payload)
-    if not isinstance(saved, dict):
-        found = type(saved).__name__
-        raise CheckpointError(
-            f"{path}: its entry 'parameter' is a {found}; expected weights by name. Give what was saved."
-        )
-    names = [str(name) for name in saved]
-    if adapted := next((name for name in names if ".lora_A." in name), None):
-        raise CheckpointError(f"{path}: holds an adapter (LoRA: {adapted:.120}). {MERGE}")
-    return {str(name).replace("_orig_mod.", "").removeprefix("module."): value for name, value in saved.items()}
+class _Saved:
+    """What was saved of the network, under ``parameter`` or alone, and what its sizes are."""
 
-
-def _sizes(path: Path, saved: Mapping[str, Any]) -> tuple[int, int, int, int]:
-    """Width, width inside the feed-forward layers, layers, and numbers of an action."""
-    first, last = saved.get(_FIRST), saved.get(_LAST)
-    for name, value in ((_FIRST, first), (_LAST, last)):
-        if not isinstance(value, Tensor) or value.ndim != 2:
+    def __init__(self, path: Path) -> None:
+        payload = read_checkpoint(path, mapped=True)
+        self.path, saved = path, payload.get("parameter", payload)
+        if not isinstance(saved, dict):
             raise CheckpointError(
-                f"{path}: no weight {name}, a matrix; expected a checkpoint of Dita's network. {_REMEDY}"
+                f"{path}: its entry 'parameter' is a {type(saved).__name__}; expected weights by name. Give what was"
+                " saved."
             )
-    assert isinstance(first, Tensor) and isinstance(last, Tensor)
-    hidden, width = first.shape
-    if width % _CHANNELS or not width:
-        raise CheckpointError(f"{path}: weight {_FIRST} is {width} wide; expected a multiple of {_CHANNELS}. {_REMEDY}")
-    layers = len({name.split(".")[3] for name in saved if name.startswith(f"{_LLAMA}model.layers.")})
-    return width, hidden, layers, last.shape[0]
+        names = [str(name) for name in saved]
+        if adapted := next((name for name in names if ".lora_A." in name), None):
+            raise CheckpointError(f"{path}: holds an adapter (LoRA: {adapted:.120}). {MERGE}")
+        plain = {str(name).replace("_orig_mod.", "").removeprefix("module."): value for name, value in saved.items()}
+        self.weights: Mapping[str, Any] = {name: each for name, each in plain.items() if not name.endswith(_UNREAD)}
+        self.shape(f"{_LLAMA}lm_head.weight", 2)
+        for name in self.weights:
+            if not name.startswith((_LLAMA, _TOWER, _MAKER)) or name.startswith(f"{_TOWER}patch_embed_depth."):
+                why = "expected a network without use_action_head_diff, dim_align_type and use_depth_img"
+                raise self.error(f"holds the weight {name:.120}; {why}: another is not rebuilt here")
+
+    def part(self, prefix: str) -> dict[str, Tensor]:
+        """The weights whose names begin so, as float32."""
+        part = {name: value for name, value in self.weights.items() if name.startswith(prefix)}
+        return as_float32(part, f"{self.path}: ")
+
+    def shape(self, name: str, axes: int) -> tuple[int, ...]:
+        """Of a weight that has so many axes, none of them empty."""
+        value = self.weights.get(name)
+        if not isinstance(value, Tensor) or value.ndim != axes or not value.numel():
+            found = f"one of {tuple(value.shape)}" if isinstance(value, Tensor) else "none"
+            raise self.error(
+                f"no weight {name} of {axes} axes (found {found}); expected a checkpoint of Dita's network"
+            )
+        return tuple(value.shape)
+
+    def count(self, prefix: str) -> int:
+        """How many layers have names that begin so."""
+        return len({name.removeprefix(prefix).split(".")[0] for name in self.weights if name.startswith(prefix)})
+
+    def head_sizes(self) -> dict[str, int]:
+        """Of the Llama: width, heads, width inside the feed-forward layers, layers, and numbers of an action."""
+        first = f"{_LLAMA}model.layers.0.mlp.gate_proj.weight"
+        hidden, width = self.shape(first, 2)
+        if width % CHANNELS:
+            raise self.error(f"weight {first} is {width} wide; expected a multiple of {CHANNELS}")
+        layers, actions = self.count(f"{_LLAMA}model.layers."), self.shape(f"{_LLAMA}lm_head.weight", 2)[0]
+        return {"width": width, "heads": width // CHANNELS, "hidden": hidden, "layers": layers, "actions": actions}
+
+    def error(self, what: str) -> CheckpointError:
+        """The error for what is wrong with it."""
+        return CheckpointError(f"{self.path}: {what}. {_REMEDY}")
 
 
-def _tokens(path: Path, saved: Mapping[str, Any]) -> int:
-    """Of a frame."""
-    queries = next((saved[name] for name in _QUERIES if name in saved), None)
-    if not isinstance(queries, Tensor) or queries.ndim < 2:
-        raise CheckpointError(
-            f"{path}: neither weight {' nor '.join(_QUERIES)}, whose rows are the tokens of a frame; expected a Dita"
-            f" with use_qformer. {_REMEDY}"
+def _pictures(settings: Settings, saved: _Saved, frames: int, width: int) -> PictureConfig:
+    """Sizes of what makes tokens of pictures; of these the weights say all but the height."""
+    queries, latents = (saved.weights.get(f"{_MAKER}{name}") for name in ("queries", "latents"))
+    if not isinstance(queries if latents is None else latents, Tensor):
+        raise saved.error(
+            f"neither weight {_MAKER}queries nor {_MAKER}latents, whose rows are the tokens of a frame; expected a Dita"
+            " with use_qformer"
         )
-    return queries.shape[-2]
+    own, _, patch, across = saved.shape(f"{_TOWER}patch_embed.proj.weight", 4)
+    if own != width or patch != across:
+        raise saved.error(
+            f"its image encoder is {own} wide, with patches of {patch} x {across}; expected the width of its Llama,"
+            f" {width}, and square patches"
+        )
+    vision = DinoConfig(
+        hidden_size=width,
+        intermediate_size=saved.shape(f"{_TOWER}blocks.0.mlp.fc1.weight", 2)[0],
+        num_hidden_layers=saved.count(f"{_TOWER}blocks."),
+        num_attention_heads=width // CHANNELS,
+        grid=_grid(settings, saved.shape(f"{_TOWER}pos_embed", 3)[1], patch),
+        registers=saved.shape(f"{_TOWER}reg_token", 3)[1],
+        patch_size=patch,
+    )
+    wrist = any(name.startswith(_WRIST) for name in saved.weights)
+    if latents is None:
+        count = saved.shape(f"{_MAKER}queries", 3)[1]
+        return PictureConfig(vision, frames, saved.count(f"{_MAKER}blocks."), count, wrist)
+    count, places = saved.shape(f"{_MAKER}latents", 2)[0], saved.shape(f"{_MAKER}media_pos_emb", 3)[0]
+    return PictureConfig(vision, frames, saved.count(f"{_MAKER}layers."), count, wrist, places)
+
+
+def _grid(settings: Settings, patches: int, patch: int) -> tuple[int, int]:
+    """Patches along height and width. Of ``input_size`` a training reads one side, and the network both, as a text."""
+    side = math.isqrt(patches)
+    given = settings.values.get("input_size")
+    both = re.fullmatch(r"\(\s*(\d{1,4})\s*,\s*(\d{1,4})\s*\)", given) if isinstance(given, str) else None
+    if both is not None:
+        height, width = (int(each) for each in both.groups())
+    else:
+        height = width = side * patch if given is None else settings.number("input_size", most=_MOST_PIXELS)
+    rows, columns = height // patch, width // patch
+    if rows * columns != patches or height % patch or width % patch:
+        what = f"'(height, width)' in pixels, of {patches} patches of {patch} x {patch}, which its weights are for"
+        raise settings.refusal("input_size", what)
+    return rows, columns
+
+
+def _words(path: Path, width: int, options: LoadOptions) -> Words | Tensor | None:
+    """What makes features of words; or those of the one instruction that is compiled in; or neither, with a warning."""
+    folders = encoder_folders(options.encoders, path.parent)
+    folder = find_encoder(CLIP, folders)
+    if folder is None and options.task is None and options.encoders is None:
+        warnings.warn(
+            f"{path}: the text encoder {CLIP} is in no checkpoint of Dita, and not on this machine, so the features of"
+            f" the words are observed: {WORDS} [{LENGTH}, {width}]. To give the policy words: {NAME_FOLDER}",
+            stacklevel=5,
+        )
+        return None
+    try:
+        folder = language_model_folder(CLIP, folders, "clip", "text encoder")
+        config = encoder_config(CLIP, "text_config", TextConfig, folders)
+        if config.hidden_size != width or config.max_position_embeddings < LENGTH:
+            found = f"{config.hidden_size} wide, for {config.max_position_embeddings} tokens"
+            raise CheckpointError(f"the text encoder in {folder} is {found}; expected {width}, and {LENGTH}: {CLIP}.")
+        weights = {name: value for name, value in read_part(folder, "text_model.").items() if value.is_floating_point()}
+        text = filled(lambda: ClipText(config), as_float32(weights, f"{folder}: "), "its config.json", folder)
+        # In old configurations the end is wrongly 2; the real one, which the original pads with, is the last token.
+        made = Words(text, config.vocab_size - 1 if config.eos_token_id == 2 else config.eos_token_id).eval()
+        if options.task is None:
+            return made
+        tokens = task_tokens(options.task, CLIP, folder, LENGTH, config.vocab_size)
+    except CheckpointError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    with torch.no_grad():
+        return made(*map(torch.from_numpy, padded([tokens], LENGTH)))  # type: ignore[no-any-return]
+
+
+def _told(words: Words | Tensor | None, width: int) -> dict[str, ObservationSpec]:
+    """What is observed of the instruction."""
+    if words is None:
+        return {WORDS: ObservationSpec((LENGTH, width), window=False)}
+    if isinstance(words, Tensor):
+        return {}
+    last = float(words.text_model.embeddings.token_embedding.num_embeddings - 1)
+    return {
+        TOKENS: ObservationSpec((LENGTH,), dtype="int64", window=False, bounds=(0.0, last)),
+        MASK: ObservationSpec((LENGTH,), dtype="bool", window=False, bounds=(0.0, 1.0)),
+    }
+
+
+def _normalizer(path: Path, actions: int) -> tuple[str, Affine | None]:
+    """Whose statistics actions have, and how they are undone.
+
+    The original's own code multiplies poses with a quaternion, and leaves others to whoever evaluates it: its scripts
+    undo quantiles of a data set. They are read where somebody has put them in the folder of the training.
+    """
+    if actions != _ARM:
+        scale = np.ones(actions, np.float32)
+        scale[:_ARM] = 1 / _METRES
+        return "none", Affine(scale, np.zeros(actions, np.float32))
+    if not (path.absolute().parents[1] / STATISTICS).is_file():
+        return "none", None
+    found = read_statistics(path, actions, ())
+    return found.name, found.normalizer

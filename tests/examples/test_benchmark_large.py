@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import large
+import large_dita
 import large_eo1
 import large_octo
 import large_pi0
@@ -55,6 +56,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     words, head = Words("language", 16, 24, 16, 24, 2, 2, 16, 32), replace(octo.head, width=16)
     octo = replace(octo, width=32, hidden=48, layers=2, heads=4, words=words, head=head, stems=stems)
     monkeypatch.setattr(large_octo, "config", lambda: octo)
+    monkeypatch.setattr(large_dita, "SIZES", {**large_dita.SIZES, "width": 64, "heads": 1, "hidden": 48, "layers": 2})
+    monkeypatch.setattr(large_dita, "LAYERS", 2)
+    for name, size in {"hidden_size": 64, "num_attention_heads": 1, "num_hidden_layers": 2, "vocab_size": 99}.items():
+        monkeypatch.setitem(large_dita.TEXT, name, size)
 
 
 @pytest.mark.parametrize(
@@ -66,6 +71,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         ("pi0", (1, 50, 32)),
         ("pi05", (1, 50, 32)),
         ("octo", (1, 4, 7)),
+        ("dita", (1, 11, 7)),
     ],
 )
 def test_what_is_written_is_read(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:

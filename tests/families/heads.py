@@ -15,7 +15,6 @@ from tests.families.weights import draw_weights
 from ttscompile import ChunkSpec, ObservationSpec, PolicySpec, SamplerTable
 from ttscompile.policies.cogact import CogACTHead
 from ttscompile.policies.dit_policy import DiTPolicyHead
-from ttscompile.policies.dita import DitaHead
 from ttscompile.policies.last_step import marked
 from ttscompile.policies.rdt import RDTConfig, RDTHead
 from ttscompile.policies.scaledp import ScaleDPConfig, ScaleDPHead
@@ -149,16 +148,6 @@ def scaledp() -> Family:
     )
 
 
-def dita() -> Family:
-    return Family(
-        title="Dita, read from its file",
-        verified=f"Dita 66350e7 `forward`, `inference`, {UP_TO}",
-        module=DitaHead(128, heads=2, hidden=80, layers=2, actions=7),
-        conditions=("prefix",),
-        sampler=ddim(10),
-    )
-
-
 FAMILIES = {
     "smolvla": smolvla,
     "rdt": rdt,
@@ -168,7 +157,6 @@ FAMILIES = {
     "cogact": cogact,
     "dit_policy": dit_policy,
     "scaledp": scaledp,
-    "dita": dita,
 }
 
 

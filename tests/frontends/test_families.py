@@ -45,7 +45,7 @@ def test_options_are_the_arguments_of_convert_and_of_the_command_line() -> None:
 def test_an_option_of_other_families_is_refused_before_anything_is_loaded(option: str, tmp_path: Path) -> None:
     own = Family("own", "our own", "a file", "file", lambda path: True, "there_is_no_such_module", frozenset())
     given: dict[str, Any] = {option: 7 if option in ("steps", "prediction_horizon") else "x"}
-    with pytest.raises(CheckpointError, match=rf"the option {option} is for .* policies; this is one of our own"):
+    with pytest.raises(CheckpointError, match=rf"the option {option} is for policies of .*; this is one of our own"):
         own.load(tmp_path / "policy", LoadOptions(**given))
 
 

@@ -278,7 +278,7 @@ def test_adapters_and_other_directories(tmp_path: Path) -> None:
     (empty / "pretrained_model").mkdir(parents=True)
     assert_not_read(empty, "pretrained_model")
     assert_not_read(tmp_path / "nowhere", "no such directory", format="lerobot")
-    assert_not_read(tmp_path / "policy.ckpt", "for LeRobot and Octo policies", options=LoadOptions(task="push"))
+    assert_not_read(tmp_path / "policy.ckpt", "for policies of LeRobot, ", options=LoadOptions(task="push"))
 
 
 def test_samplers_of_the_wrong_objective(tmp_path: Path) -> None:

@@ -98,9 +98,9 @@ class Family:
         """Load a checkpoint of this family."""
         for name in (field.name for field in fields(options) if getattr(options, field.name) is not None):
             if name not in self.options:
-                takers = " and ".join(each.title for each in FAMILIES if name in each.options)
+                takers = ", ".join(each.title for each in FAMILIES if name in each.options)
                 raise CheckpointError(
-                    f"{path}: the option {name} is for {takers} policies; this is one of {self.title}. Leave it out."
+                    f"{path}: the option {name} is for policies of {takers}; this is one of {self.title}. Leave it out."
                 )
         return self.function("load")(path, options)  # type: ignore[no-any-return]
 
@@ -156,6 +156,7 @@ FAMILIES = (
         kind="file",
         detect=lambda at: at.suffix == ".pth" and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
         module="dita",
+        options=DIFFUSION_OPTIONS | {"task", "encoders"},
     ),
     Family(
         name="rdt",

@@ -298,14 +298,18 @@ class ClipText(nn.Module):
         self.encoder = Layers(config)
         self.final_layer_norm = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
 
-    def forward(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """See the class."""
+    def features(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """Of all tokens, ``[B, L, width]``, after the last norm."""
         length = tokens.shape[1]
         square = torch.ones(length, length, dtype=torch.bool, device=tokens.device)
         # Padding before a text sees itself: attention to nothing is not the same number everywhere. Nobody sees it.
         alone = torch.eye(length, dtype=torch.bool, device=mask.device) & ~mask[:, None, None, :1]
         added = torch.where(square.tril() & mask[:, None, None, :] | alone, 0.0, torch.finfo(torch.float32).min)
-        features = self.final_layer_norm(self.encoder(self.embeddings(tokens), added))
+        return self.final_layer_norm(self.encoder(self.embeddings(tokens), added))  # type: ignore[no-any-return]
+
+    def forward(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        """See the class."""
+        features = self.features(tokens, mask)
         ids = tokens.to(torch.int32)  # ArgMax of ONNX knows no int64
         end = (ids if self.end == 2 else (ids == self.end).to(torch.int32)).argmax(dim=-1)
         index = end[:, None, None].expand(-1, 1, features.shape[2])
