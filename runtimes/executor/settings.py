@@ -260,7 +260,8 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
         told = "" if settings.policy_hz else ", at which its recordings were made"
         what = f"control_hz = {control_hz:g} is no multiple of policy_hz = {policy_hz:g}{told}"
         lasts = f"an action would last {control_hz / policy_hz:.4g} ticks"
-        raise ExecutorError(f"{what}: {lasts}. Run the loop at a multiple of the policy's rate.")
+        other = ", or give another policy_hz" if told else ""
+        raise ExecutorError(f"{what}: {lasts}. Run the loop at a multiple of the policy's rate{other}.")
     chunk, tiers = info.action, settings.tiers or (info.default_plan,)
     longest = info.sample[0] - chunk.start
     horizon = settings.horizon or chunk.stop - chunk.start
