@@ -1,7 +1,8 @@
 """RDT-1B, read from the directory that its ``save_pretrained`` wrote: config.json beside its weights.
 
 Source: ``RDTRunner`` of thu-ml/RoboticsDiffusionTransformer at deb71d8. What is compiled is ``predict_action``, and its
-arguments are the observations: what T5 and SigLIP give are two of them.
+arguments are the observations: what T5 gives is one of them, and what SigLIP gives another, or the pictures
+(``rdt_cameras``).
 
 The network has self-attention, cross-attention to language or image by turns, and feed-forward. Parameters are called
 as in a checkpoint. The norm divides by the deviation, not by the root of the mean square: that is what timm 1.0.3 does,
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec
+from ttscompile.core.spec import WITHOUT, ChunkSpec, ObservationSpec, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.encoded import EncodedDenoiser
@@ -28,6 +29,7 @@ from ttscompile.frontends.settings import Settings, read_json
 
 from .last_step import changed, marked, unmarked
 from .networks.layers import TimestepEmbedder, TimmMlp, split
+from .rdt_cameras import Cameras, Pictures, find_cameras
 
 CONFIG, WEIGHTS, PICKLED = "config.json", "model.safetensors", "pytorch_model.bin"
 _MOST, _MOST_LAYERS, _MOST_DEPTH = 2**16, 512, 16
@@ -149,22 +151,27 @@ class RDTHead(nn.Module):
         self.img_adaptor = _adaptor(config.features[1], width, image)
         self.state_adaptor = _adaptor(2 * config.actions, width, state)
 
-    def compiled(self) -> EncodedDenoiser:
-        """The original evaluates the adaptors of what is observed once a call, and the rest at every step."""
-        return EncodedDenoiser(_Observed(self), _Denoiser(self))
+    def compiled(self, cameras: Cameras | None = None) -> EncodedDenoiser:
+        """The original evaluates the adaptors of what is observed once a call, and the rest at every step.
+
+        Args:
+            cameras: what makes tokens of pictures; None where tokens are observed.
+        """
+        return EncodedDenoiser(_Observed(self, cameras), _Denoiser(self))
 
 
 class _Observed(nn.Module):
-    def __init__(self, head: RDTHead) -> None:
+    def __init__(self, head: RDTHead, cameras: Cameras | None) -> None:
         super().__init__()
         self.language, self.image, self.state = head.lang_adaptor, head.img_adaptor, head.state_adaptor
+        self.pictures = None if cameras is None else Pictures(cameras, head.img_adaptor)
 
     def forward(self, observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Tokens of language and images ``[B, ., width]``, of the state ``[B, 1, width]``, and what stays as it is."""
         state = torch.cat([observations["state_tokens"], observations["action_mask"]], 2)
         return {
             "language": self.language(observations["lang_tokens"]),
-            "image": self.image(observations["img_tokens"]),
+            "image": self.image(observations["img_tokens"]) if self.pictures is None else self.pictures(observations),
             "state": self.state(state),
             "seen": observations["lang_attn_mask"],
             "valid": observations["action_mask"],
@@ -206,15 +213,17 @@ def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     steps = scheduler.number("num_inference_timesteps")
     loops = changed(configured_loops(sampler, steps, options, where=f"{where}: noise_scheduler"), marked)
     head = filled(lambda: RDTHead(config), _weights(directory), CONFIG, directory)
+    cameras = find_cameras(directory, settings, (config.lengths[1], config.features[1]), options)
+    without = {} if cameras is None or not cameras.absent else {WITHOUT: ", ".join(cameras.absent)}
     spec = PolicySpec(
         sample=(config.horizon, config.actions),
-        observations=observed(config),
+        observations=observed(config, cameras),
         sampler=loops.original,
         loops=loops.others,
         chunk=ChunkSpec(config.actions, 0, config.horizon),
-        source={"format": "rdt", **loops.source},
+        source={"format": "rdt", **without, **loops.source},
     )
-    return head.compiled().eval(), spec
+    return head.compiled(cameras).eval(), spec
 
 
 def read_config(settings: Settings) -> RDTConfig:
@@ -239,13 +248,18 @@ def read_config(settings: Settings) -> RDTConfig:
     )
 
 
-def observed(config: RDTConfig) -> dict[str, ObservationSpec]:
-    """The arguments of ``predict_action``; language is padded to its longest, and the mask says what of it counts."""
+def observed(config: RDTConfig, cameras: Cameras | None) -> dict[str, ObservationSpec]:
+    """The arguments of ``predict_action``; language is padded to its longest, and the mask says what of it counts.
+
+    Args:
+        cameras: whose pictures are observed in place of tokens.
+    """
     (words, patches), (of_word, of_patch) = config.lengths, config.features
+    tokens = {"img_tokens": ObservationSpec((patches, of_patch), window=False)}
     return {
         "lang_tokens": ObservationSpec((words, of_word), window=False),
         "lang_attn_mask": ObservationSpec((words,), dtype="bool", window=False, bounds=(0.0, 1.0)),
-        "img_tokens": ObservationSpec((patches, of_patch), window=False),
+        **(tokens if cameras is None else cameras.observed),
         "state_tokens": ObservationSpec((1, config.actions), window=False),
         "action_mask": ObservationSpec((1, config.actions), window=False, bounds=(0.0, 1.0)),
         "ctrl_freqs": ObservationSpec((1,), window=False, bounds=_USUAL_HZ),

@@ -20,6 +20,8 @@ from ttscompile.frontends.families import LoadOptions
 from .authors import assert_acts_as_the_original, by_one_command
 from .refused import assert_not_read
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*the image encoder:UserWarning")
+
 
 @pytest.mark.slow
 def test_a_converted_directory_acts_as_the_original(tmp_path: Path) -> None:

@@ -62,8 +62,8 @@ def together(*options: Decorator) -> Decorator:
 encoders_option = click.option(
     "--encoders",
     type=FOLDER,
-    help="Find config.json of CLIP or of the language model (and tokenizer.json) in this folder, if they are not in or"
-    " beside the checkpoint. Nothing is downloaded.",
+    help="Find what the checkpoint names and does not hold (CLIP, SigLIP, or the language model's config.json and"
+    " tokenizer.json) in this folder, if it is not in or beside the checkpoint. Nothing is downloaded.",
 )
 
 lerobot_options = together(

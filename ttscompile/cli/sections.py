@@ -81,7 +81,7 @@ class Section:
     needs: tuple[str, ...] = ()
 
 
-LEROBOT = Section("Policies of LeRobot", ("task", "encoders", "without_cameras", "base"))
+LEROBOT = Section("Policies of LeRobot, and other VLAs", ("task", "encoders", "without_cameras", "base"))
 """Of commands that read a checkpoint."""
 
 

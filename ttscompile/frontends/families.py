@@ -165,6 +165,7 @@ FAMILIES = (
         kind="directory",
         detect=lambda path: "lang_adaptor" in _config(path),
         module="rdt",
+        options=DIFFUSION_OPTIONS | {"encoders", "without_cameras"},
     ),
     Family(
         name="octo",

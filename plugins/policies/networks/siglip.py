@@ -1,4 +1,4 @@
-"""The image encoder SigLIP, as SmolVLM2 and PaliGemma have it: an image to one feature for each patch.
+"""The image encoder SigLIP, alone or as SmolVLM2 and PaliGemma have it: an image to one feature for each patch.
 
 Its layers are those of CLIP's encoders. Attribute names are those under which the weights of transformers load.
 
@@ -36,17 +36,25 @@ class _Embeddings(nn.Module):
 
 
 class Siglip(nn.Module):
-    """Pixels in -1..1 ``[N, 3, H, W]`` to patches ``[N, H/patch * W/patch, width]``, normalised at the end."""
+    """Pixels in -1..1 ``[N, 3, H, W]`` to patches ``[N, H/patch * W/patch, width]``, normalised at the end.
+
+    Args:
+        size: height and width of pictures whose patches have positions by their share, as SmolVLM has it; None for
+            pictures of the configuration's size, each of whose patches has its own.
+    """
 
     positions: torch.Tensor
 
-    def __init__(self, config: SiglipConfig, size: tuple[int, int]) -> None:
+    def __init__(self, config: SiglipConfig, size: tuple[int, int] | None = None) -> None:
         super().__init__()
         self.embeddings = _Embeddings(config)
         self.encoder = Layers(config)
         self.post_layernorm = nn.LayerNorm(config.hidden_size, eps=config.layer_norm_eps)
-        height, width = (_buckets(n // config.patch_size, config.side) for n in size)
-        rows = [row * config.side + column for row in height for column in width]
+        if size is None:
+            rows = list(range(config.side**2))
+        else:
+            height, width = (_buckets(n // config.patch_size, config.side) for n in size)
+            rows = [row * config.side + column for row in height for column in width]
         # Made of numbers, so that a network without memory (on the meta device) has them all the same.
         self.register_buffer("positions", torch.tensor(rows, device="cpu"), persistent=False)
 
