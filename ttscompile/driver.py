@@ -100,7 +100,7 @@ def convert(
             the policy's own. Those that a policy of its kind cannot have are left out.
         task: of a LeRobot policy: the one instruction that is compiled in, so that the robot needs no tokenizer; None
             makes its tokens an observation.
-        encoders: folder with what a checkpoint names and does not hold: CLIP, SigLIP, or a language model's configuration
+        encoders: folder with what a checkpoint names and does not hold: CLIP, SigLIP, a language model's configuration
             (and tokenizer, for ``task``), where it is neither in nor beside the checkpoint. Nothing is ever downloaded.
         without_cameras: of a vision-language-action model: names of cameras that it was trained with and that the robot
             lacks. None leaves out only those that lerobot calls empty.
