@@ -270,7 +270,7 @@ def print_verdicts(verdicts: Mapping[str, Feasibility], control_hz: float | None
     made = table(f"control loop of {control_hz:g} Hz", "longest ms", "may take ms", "up to Hz", "verdict")
     for label, one in verdicts.items():
         allowed, verdict = ms(max(1e3 * one.max_latency, 0), 4), "feasible" if one.feasible else "too slow"
-        made.add_row(label, ms(1e3 * one.latency, 4), allowed, f"{one.max_policy_hz:.3g}", verdict)
+        made.add_row(label, ms(1e3 * one.latency, 4), allowed, ms(one.max_policy_hz), verdict)
     output.print(made)
     say(output, *(f"{label}: {one.explain()}" for label, one in verdicts.items()))
     if any(UNIFORM in label for label in verdicts):
