@@ -106,8 +106,8 @@ def build(
     target = Path(os.path.realpath(directory))
     with replacing(target) as put, _beside(target) as made:
         _converted(checkpoint, made, resume, explain, how)
-        policy_hz = policy_hz or recorded_rate(trajectories)
         if control_hz is not None:
+            policy_hz = policy_hz or recorded_rate(trajectories)
             latency_ms = _deadline(made, control_hz, policy_hz)
         artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))
         rows = [row for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]

@@ -169,6 +169,8 @@ def test_names_of_plans_are_held_to_what_they_are_written_by(written: Path, name
         ({"plans": {"mine": 3}}, "calibration.plans.mine: expected an object"),
         ({"plans": []}, "calibration.plans: expected an object"),
         ({"other_noise": "1"}, "calibration.other_noise: expected a number"),
+        ({"policy_hz": 0.0}, "calibration.policy_hz: expected a positive number"),
+        ({"policy_hz": "10"}, "calibration.policy_hz: expected a number"),
         ({"seed": 10**30}, "calibration.seed: expected a 64-bit integer"),
         ({"learned": "schedule"}, "calibration.learned: expected a list"),
         ({"learned": [1]}, r"calibration.learned\[0\]: expected a string"),

@@ -30,6 +30,8 @@ def test_a_file_says_it_in_its_meta_and_a_data_set_as_its_frames_a_second(tmp_pa
     said = recorded(tmp_path / "said.npz", policy_hz=10)
     silent = policies.record(tmp_path / "silent.npz")
     of_lerobot = data_set(tmp_path / "set", fps=10)
+    assert recorded_rate(said.rename(tmp_path / "said.NPZ")) == 10.0, "whatever it is called"
+    said = (tmp_path / "said.NPZ").rename(said)
     assert recorded_rate(said) == recorded_rate([silent, said]) == recorded_rate([of_lerobot, str(said)]) == 10.0
     assert recorded_rate([silent]) is None and recorded_rate([data_set(tmp_path / "other")]) is None
 

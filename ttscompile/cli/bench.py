@@ -32,7 +32,7 @@ from ttscompile.errors import ArtifactError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.points import best_plan
 from ttscompile.measure.timer import Times
-from ttscompile.measure.units import ms
+from ttscompile.measure.units import ms, number
 from ttscompile.report.facts import scores
 from ttscompile.report.timing import Contestant, Measurement, measure, timing_remarks, timing_table
 from ttscompile.runtimes.executor import ExecutorSettings, Feasibility
@@ -270,7 +270,7 @@ def print_verdicts(verdicts: Mapping[str, Feasibility], control_hz: float | None
     made = table(f"control loop of {control_hz:g} Hz", "longest ms", "may take ms", "up to Hz", "verdict")
     for label, one in verdicts.items():
         allowed, verdict = ms(max(1e3 * one.max_latency, 0), 4), "feasible" if one.feasible else "too slow"
-        made.add_row(label, ms(1e3 * one.latency, 4), allowed, ms(one.max_policy_hz), verdict)
+        made.add_row(label, ms(1e3 * one.latency, 4), allowed, number(one.max_policy_hz), verdict)
     output.print(made)
     say(output, *(f"{label}: {one.explain()}" for label, one in verdicts.items()))
     if any(UNIFORM in label for label in verdicts):

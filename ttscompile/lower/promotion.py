@@ -11,7 +11,8 @@ _SUMS = ("sum", "prod", "cumsum", "cumprod")
 """Of truth values and small whole numbers they are int64."""
 
 _MIXED = (
-    *"embedding index index_select index_copy gather take_along_dim argmax argmin topk sort".split(),
+    *("embedding", "index", "index_select", "index_copy", "gather", "take_along_dim"),
+    *("argmax", "argmin", "topk", "sort"),
     *("scaled_dot_product_attention", "pad", "_to_copy"),
 )
 """They are given, or give, several types: indices, masks, what is converted, what a mask is padded with."""

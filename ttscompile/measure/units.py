@@ -7,7 +7,7 @@ def flops(count: float) -> str:
     """FLOPs with a unit: ``16.1 GFLOP``."""
     for unit, size in (("GFLOP", 1e9), ("MFLOP", 1e6), ("kFLOP", 1e3)):
         if count >= size:
-            return f"{count / size:.3g} {unit}" if count < 999.5 * size else f"{count / size:.0f} {unit}"
+            return f"{number(count / size)} {unit}"
     return f"{count:.0f} FLOP"
 
 
@@ -18,9 +18,13 @@ def share(part: float | None) -> str:
     return f"{part:.1%}" if part == 0 or part >= 0.01 else f"{part:.3%}"
 
 
-def ms(milliseconds: float, digits: int = 3) -> str:
-    """A time to so many digits at least, without an exponent."""
-    return f"{milliseconds:.{digits}g}" if milliseconds < 10**digits - 0.5 else f"{milliseconds:.0f}"
+def number(value: float, digits: int = 3) -> str:
+    """A positive number to so many digits at least, without an exponent."""
+    return f"{value:.{digits}g}" if value < 10**digits - 0.5 else f"{value:.0f}"
+
+
+ms = number
+"""Of milliseconds, whose unit stands at the head of their column."""
 
 
 def plain(value: object) -> str:

@@ -197,7 +197,7 @@ def recorded_names(path: Path) -> tuple[list[str], bool]:
 def _opened(path: Path, limits: Mapping[str, int], wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
     """What a file is that is no ``.npz``, what it holds, and whether that is frames."""
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
-    other = _other_format(path)
+    other = other_format(path)
     return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted, **limits), True))
 
 
@@ -250,7 +250,8 @@ def read_npz(path: Path, only: str = "") -> dict[str, Array]:
             return {name: np.asarray(file[name]) for name in file.files if only in ("", name)}
 
 
-def _other_format(path: Path) -> str | None:
+def other_format(path: Path) -> str | None:
+    """What a recording is that is no ``.npz``."""
     name = path.name.lower()
     if not path.exists():
         return None

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.untrusted_json import parse_json
 from ..errors import TrajectoryError
-from .episodes import META, local_path, meta_of, read_npz
+from .episodes import META, local_path, meta_of, other_format, read_npz
 from .frames import one_error
 from .lerobot_dataset import MAX_INFO
 
@@ -26,18 +26,19 @@ def recorded_rate(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     rates = {rate for path in paths if (rate := rate_of(local_path(path))) is not None}
     if len(rates) > 1:
         told = " and ".join(f"{rate:g}" for rate in sorted(rates))
-        warnings.warn(f"the recordings are of {told} Hz, so the policy's rate is not known. Give it.", stacklevel=2)
+        remedy = "'build --policy-hz' and ExecutorSettings take it"
+        warnings.warn(f"the recordings are of {told} Hz, so the policy's rate is not known: {remedy}.", stacklevel=2)
     return rates.pop() if len(rates) == 1 else None
 
 
 def rate_of(path: Path) -> float | None:
     """The same of one recording, which is on this machine."""
-    said, name = dict[str, Any](), "policy_hz"
-    if (info := path / "meta" / "info.json").is_file():
+    said, name, other = dict[str, Any](), "policy_hz", other_format(path)
+    if other == "lerobot":
         name = "fps"
         with one_error(f"{path}: meta/info.json cannot be read"):
-            said = dict(parse_json(info.read_bytes(), MAX_INFO))
-    elif path.suffix == ".npz":
+            said = dict(parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO))
+    elif other is None:
         said = meta_of(path, read_npz(path, META).get(META))
     rate = said.get(name)
     if rate is not None and (type(rate) not in (int, float) or not 0 < rate < 1e6):
