@@ -195,7 +195,7 @@ def _warnings(trials: Trials, others: Mapping[str, Artifact]) -> list[str]:
             what = "other ones of these numbers" if same else f"the episodes {held_out}"
             found.append(
                 f"{name}: this comparison judges on the episodes {list(judged)}, and its calibration held out {what}."
-                " Unless these recordings are new, plans may have been learned from them: then give the same files, in"
-                " the same order, and the same seed."
+                " If it learned from these recordings, give the same files, in the same order, and the same seed; new"
+                " recordings are as good."
             )
     return found

@@ -97,7 +97,7 @@ def place(body_world: Any, state: npt.ArrayLike) -> None:
 
 
 class QuickPushT(PushTEnv):  # type: ignore[misc]
-    """gym-pusht: the same numbers in half the time. Polygons are made of the goal once, and of a block that moved."""
+    """gym-pusht, faster and with the same numbers: polygons are made of the goal once, and of a block that moved."""
 
     _goal: tuple[tuple[float, ...], Any] = (), None
     _covered: tuple[tuple[float, ...], float] = (), 0.0
@@ -166,7 +166,7 @@ class PushT:
 
     def step(self, action: npt.ArrayLike) -> None:
         """Send the agent towards a position ``[2]``, pixels, for 0.1 s."""
-        target = Vec2d(*np.asarray(action, dtype=np.float64).tolist())  # whose arithmetic is a tenth of an array's
+        target = Vec2d(*np.asarray(action, dtype=np.float64).tolist())  # cheaper than an array of two numbers
         self.state, _, terminated, truncated, info = self._gym.step(target)
         self.coverage = max(self.coverage, float(info["coverage"]))
         self.done = terminated or truncated
