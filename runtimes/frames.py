@@ -14,7 +14,7 @@ import hashlib
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -29,9 +29,8 @@ from .tokens import Lane, Run, Seen, TokenTower
 Content: TypeAlias = tuple[bytes, ...]
 """The bytes of one frame, of each input of the piece that reads it; before them those of its lane, if it has one."""
 Stop: TypeAlias = Callable[[], bool]
-Compute: TypeAlias = Callable[[int], tuple[tuple[Array, ...], int, int]]
-"""The number of a row to what a frame piece gives for it, ``[1, ...]`` each; how many of its tokens were computed, and
-how many it has: 0 where the whole frame is the unit."""
+Compute: TypeAlias = Callable[[int], tuple[tuple[Array, ...], "FrameWork"]]
+"""The number of a row to what a frame piece gives for it, ``[1, ...]`` each, and what was done for its tokens."""
 
 WINDOWS = 2
 """How many calls' rows are remembered: those of the last one, and those that have come since."""
@@ -47,6 +46,7 @@ class FrameWork:
         waited: ms that computing took.
         saved: ms that those remembered took when they were computed.
         tokens: that were computed of the frames that were.
+        forward: that took the rows of a computed one (FORWARD). The others kept their own (ROLLOUT).
         of: how many tokens these frames have; 0 where tokens are not reused.
     """
 
@@ -55,6 +55,7 @@ class FrameWork:
     waited: float = 0.0
     saved: float = 0.0
     tokens: int = 0
+    forward: int = 0
     of: int = 0
 
     def __add__(self, other: FrameWork) -> FrameWork:
@@ -86,10 +87,10 @@ class FrameMemory:
             if stop():
                 break
             start = time.perf_counter()
-            values, tokens, of = compute(i)
+            values, done = compute(i)
             took = 1000.0 * (time.perf_counter() - start)
             self._known[content] = values, took
-            work += FrameWork(computed=1, waited=took, tokens=tokens, of=of)
+            work += replace(done, computed=1, waited=took)
         while len(self._known) > WINDOWS * len(contents):
             self._known.popitem(last=False)
         return work
@@ -178,12 +179,12 @@ class FramePieces:
         """What computes one of the rows, of each input of the piece ``[N, ...]``."""
         piece, tower = self._pieces[name], self._tokens.get(name)
 
-        def compute(i: int) -> tuple[tuple[Array, ...], int, int]:
+        def compute(i: int) -> tuple[tuple[Array, ...], FrameWork]:
             row = {n: each[i : i + 1] for n, each in zip(piece.inputs, rows, strict=True)}
             if tower is None:
-                return self._run(name, row), 0, 0
-            values, count = tower.compute(lanes[i], row)
-            return values, count, tower.tokens
+                return self._run(name, row), FrameWork()
+            values, computed, forward = tower.compute(lanes[i], row)
+            return values, FrameWork(tokens=computed, forward=forward, of=tower.tokens)
 
         return compute
 

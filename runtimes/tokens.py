@@ -42,12 +42,14 @@ class Seen:
     Attributes:
         pixels: ``[C, H, W]``, each patch as its token was last computed for.
         computed: bool ``[rows, columns]``, the patches whose tokens were computed for the newest frame.
+        forward: bool ``[rows, columns]``, those whose tokens took the rows of a computed one.
         patch: height and width of a patch; pixels beyond the last one are in none.
         number: of this frame, new ones counted alone.
     """
 
     pixels: Array
     computed: Array
+    forward: Array
     patch: tuple[int, int]
     number: int
 
@@ -60,6 +62,7 @@ class _Kept:
         pixels: that each token was computed for, ``[C, H, W]``.
         arrays: rows ``[T, ...]`` by input of the piece.
         index: of the tokens that were computed for the newest frame.
+        forward: of those that took the rows of a computed one.
         age: new frames since all tokens were computed.
         number: of the newest frame.
     """
@@ -68,6 +71,7 @@ class _Kept:
     arrays: dict[str, Array]
     values: tuple[Array, ...]
     index: Array
+    forward: Array
     age: int = 0
     number: int = 0
 
@@ -104,11 +108,12 @@ class TokenTower:
         """What is seen in those of the lanes that had a frame."""
         for kept in (self._lanes[lane] for lane in lanes if lane in self._lanes):
             _, rows, columns, *_ = self._patches(kept.pixels).shape
-            computed = np.isin(np.arange(rows * columns) + self._record.fixed, kept.index).reshape(rows, columns)
-            yield Seen(kept.pixels.copy(), computed, self._record.patch, kept.number)
+            numbers = self._record.fixed + np.arange(rows * columns).reshape(rows, columns)
+            computed, forward = np.isin(numbers, kept.index), np.isin(numbers, kept.forward)
+            yield Seen(kept.pixels.copy(), computed, forward, self._record.patch, kept.number)
 
-    def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
-        """What the tower gives for a new frame, and for how many tokens it was computed.
+    def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int, int]:
+        """What the tower gives for a new frame, and how many tokens were computed and took a computed one's rows.
 
         Args:
             lane: of the frame. What is kept of it is gone if this fails.
@@ -124,13 +129,14 @@ class TokenTower:
         index, off = self._changed(kept, pixels[0])
         if kept is None:
             nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
-            kept = _Kept(pixels[0], nothing, (), index)
+            kept = _Kept(pixels[0], nothing, (), index, index[:0])
         else:
-            kept.age, kept.number = kept.age + 1, kept.number + 1
+            kept.age, kept.number, kept.forward = kept.age + 1, kept.number + 1, index[:0]
         if index.size:
             feed = {PIXELS: pixels, INDEX: index}
             if self._forward:
-                feed |= _written(index, *self._similar(kept.pixels, pixels[0], index, off))
+                kept.forward, rows = self._similar(kept.pixels, pixels[0], index, off)
+                feed |= _written(index, kept.forward, rows)
             kept.values = self._renew(self._part, feed, kept.arrays)
         if len(index) == self.tokens:
             kept.pixels, kept.age = pixels[0], 0
@@ -139,7 +145,7 @@ class TokenTower:
             y, x = np.divmod(index[self._record.fixed :] - self._record.fixed, ours.shape[2])
             theirs[:, y, x] = ours[:, y, x]
         kept.index, self._lanes[lane] = index, kept
-        return kept.values, len(index)
+        return kept.values, len(index), len(kept.forward)
 
     def _changed(self, kept: _Kept | None, pixels: Array) -> tuple[Array, Array]:
         """Numbers of the tokens to compute, int64; none where no patch changed. And by how much each patch differs.

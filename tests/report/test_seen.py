@@ -45,8 +45,8 @@ def test_a_camera_without_a_new_picture_has_no_computed_patch(policy: CompiledPo
     # The first window has two pictures of the left camera, of which the newer one differs by a patch.
     counts = [[np.count_nonzero(one.computed) for one in each] for each in course.seen.values()]
     assert counts == [[4, 36], *[[4, 0]] * (SEEN_CALLS - 1)]
-    computed, of = course.tokens
-    assert 0 < computed < of
+    assert 0 < course.frames.tokens < course.frames.of
+    assert course.frames.forward == 0, "nothing else changed"
 
 
 def test_the_page_shows_it(once: Once, policy: CompiledPolicy) -> None:
@@ -54,8 +54,8 @@ def test_the_page_shows_it(once: Once, policy: CompiledPolicy) -> None:
     page = build(artifact, policy, Given(episode(), calls=1))
     (section,) = (one for one in page.sections if one.title == "Episode")
     _, shown = section.pictures
-    computed, of = run_episode(policy, episode()).tokens
-    assert shown.caption.startswith(f"{computed} of {of} tokens of the image encoders were computed")
+    work = run_episode(policy, episode()).frames
+    assert shown.caption.startswith(f"{work.tokens} of {work.of} tokens of the image encoders were computed")
     drawn = np.asarray(Image.open(BytesIO(shown.png)).convert("RGB")).astype(int)
     half = len(drawn) // 2
     colourful = np.abs(drawn - drawn.mean(-1, keepdims=True)).max(-1) > 40

@@ -17,7 +17,7 @@ from tests.lower.whole_call import Episode
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.errors import ArtifactError, ObservationError
-from ttscompile.runtimes.frames import WINDOWS, FrameMemory, contents_of
+from ttscompile.runtimes.frames import WINDOWS, FrameMemory, FrameWork, contents_of
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.verification import verify
 from ttscompile.verification.reuse import ENGAGED
@@ -214,9 +214,9 @@ def test_memory_is_bounded(policy: CompiledPolicy) -> None:
 def test_frames_that_differ_in_one_number_are_two() -> None:
     memory, asked = FrameMemory(), list[float]()
 
-    def double(i: int) -> tuple[tuple[Any, ...], int, int]:
+    def double(i: int) -> tuple[tuple[Any, ...], FrameWork]:
         asked.append(float(rows[i].sum()))
-        return (2 * rows[i : i + 1],), 0, 0
+        return (2 * rows[i : i + 1],), FrameWork()
 
     rows = np.zeros((3, 4), np.float32)
     rows[1, 2], rows[2, 2] = np.float32(1e-30), np.float32(-0.0)

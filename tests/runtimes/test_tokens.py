@@ -88,7 +88,8 @@ def computed_literally(artifact: Artifact, changes: tuple[int, ...]) -> list[int
     for change in changes:
         for patch in rng.choice(36, size=change, replace=False):
             image = moved(image, patch, rng.uniform(0.1, 1.0))
-        (value, *_), count = tower.compute(b"", {name: image[None]})
+        (value, *_), count, forward = tower.compute(b"", {name: image[None]})
+        assert forward == (len(similar) if count else 0)
         if count:
             np.testing.assert_allclose(value, literal(image[None], asked[-1], similar)[0], rtol=0, atol=1e-5)
             assert len(asked[-1]) == count
@@ -343,8 +344,11 @@ def test_a_token_that_is_not_computed_gets_what_a_similar_one_has(artifact: Arti
         after[:, 4 * y : 4 * y + 4, 4 * x : 4 * x + 4] = level
     tower.compute(b"", {name: before[None]})
     literal(before[None], range(TOKENS))
-    (value, *_), count = tower.compute(b"", {name: after[None]})
-    assert (count, fed[INDEX].tolist()) == (5, [0, 1, 4, 8, 21])
+    (value, *_), count, forward = tower.compute(b"", {name: after[None]})
+    assert (count, forward, fed[INDEX].tolist()) == (5, 2, [0, 1, 4, 8, 21])
+    (seen,) = tower.seen([b""])
+    assert np.flatnonzero(seen.computed).tolist() == [0, 3, 7, 20]
+    assert np.flatnonzero(seen.forward).tolist() == [14, 15]
     similar = {15: 4, 16: 4}
     written = dict(zip(fed[PLACES].tolist(), fed[INDEX][fed[ROWS]].tolist(), strict=True))
     assert written == {token: token for token in fed[INDEX].tolist()} | similar

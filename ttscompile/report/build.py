@@ -152,10 +152,13 @@ def _episode(course: Course) -> Section:
     alt = "A line: the share of reused cells, call by call."
     drawn = [Picture(pictures.sparsity_picture(course), caption, alt)]
     if course.seen:
-        computed, of = course.tokens
-        counts = f"{computed} of {of} tokens of the image encoders were computed, {share(computed / of)}."
-        key = "A row is a camera. In colour: patches whose tokens were computed in this call. Pale: those kept."
-        drawn.append(Picture(pictures.seen_picture(course), f"{counts} {key}"))
+        work = course.frames
+        caption = (
+            f"{work.tokens} of {work.of} tokens of the image encoders were computed, {share(work.tokens / work.of)};"
+            f" {work.forward} took the rows of a computed one, and the others kept their own. A row is a camera. In"
+            " colour: patches whose tokens were computed in this call. Pale and framed: those that took rows."
+        )
+        drawn.append(Picture(pictures.seen_picture(course), caption))
     return Section("Episode", (text,), pictures=tuple(drawn))
 
 

@@ -75,20 +75,25 @@ def sparsity_picture(course: Course) -> bytes:
 
 
 def seen_picture(course: Course) -> bytes:
-    """What each camera showed in some calls: in colour where tokens were computed, pale grey where they were kept."""
+    """What each camera showed in some calls: in colour where tokens were computed, pale grey where they were not.
+
+    Framed are the first, and of the others those that took the rows of a computed one.
+    """
     cameras = list(zip(*course.seen.values(), strict=True))
     figure = new_figure(1.9 * len(course.seen), 2.2 * len(cameras))
     panels = figure.subplots(len(cameras), len(course.seen), squeeze=False)
     for row, camera in zip(panels, cameras, strict=True):
         low, high = (of([of(one.pixels, axis=(1, 2)) for one in camera], axis=0) for of in (np.min, np.max))
         for axes, call, one in zip(row, course.seen, camera, strict=True):
-            cut = np.kron(one.computed, np.ones(one.patch, np.bool_))[..., None]
+            cut, taken = (np.kron(which, np.ones(one.patch, np.bool_)) for which in (one.computed, one.forward))
             shown = np.moveaxis(one.pixels, 0, -1)[: cut.shape[0], : cut.shape[1]]
             shown = (shown - low) / np.maximum(high - low, 1e-6)
             grey = shown.mean(-1, keepdims=True)
-            axes.imshow(np.where(cut, shown if shown.shape[-1] == 3 else grey.repeat(3, -1), 0.6 + 0.4 * grey))
-            if not one.computed.all() and one.computed.any():
-                axes.contour(cut[..., 0], levels=[0.5], colors=COLOURS[Source.COMPUTE], linewidths=1)
+            colourful = shown if shown.shape[-1] == 3 else grey.repeat(3, -1)
+            axes.imshow(np.where(cut[..., None], colourful, 0.6 + 0.4 * grey))
+            for framed, source in ((cut, Source.COMPUTE), (taken, Source.FORWARD)):
+                if framed.any() and not framed.all():
+                    axes.contour(framed, levels=[0.5], colors=COLOURS[source], linewidths=1)
             axes.set_title(f"call {call}: {np.count_nonzero(one.computed)} of {one.computed.size}", fontsize=8)
             axes.set_axis_off()
     return encoded(figure)

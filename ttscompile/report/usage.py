@@ -12,6 +12,7 @@ from ..core.lattice import BoolArray, PlanArray, Source
 from ..core.spec import ORIGINAL
 from ..ir.pieces import IDLE, PRUNER, of_loop, of_tokens
 from ..ir.program import Binding
+from ..runtimes.frames import FrameWork
 from ..runtimes.liveness import sources_of_pruner
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.tokens import Seen
@@ -132,14 +133,14 @@ class Course:
     Attributes:
         plans: int8 ``[R, K, blocks]``, as executed; without a first call in another loop.
         legalised: cells of each call that were replaced because they were never computed.
-        tokens: of image encoders that were computed, and that the new pictures had; zeros where none are reused.
+        frames: what was done for them in all calls, and for their tokens.
         seen: of some calls, by number, what each camera showed; nothing where no tokens are reused.
     """
 
     name: str
     plans: PlanArray
     legalised: tuple[int, ...]
-    tokens: tuple[int, int]
+    frames: FrameWork
     seen: Mapping[int, tuple[Seen, ...]]
 
     @property
@@ -167,11 +168,13 @@ def run_episode(policy: CompiledPolicy, episode: Episode, plan: str | None = Non
         if shown and row in np.linspace(0, count - 1, SEEN_CALLS).astype(int):
             # A camera that shows what it showed in the call before has no new frame, and nothing was computed for it.
             known = [last.get(i) == one.number for i, one in enumerate(shown)]
-            seen[row] = tuple(replace(s, computed=s.computed & (not k)) for s, k in zip(shown, known, strict=True))
+            seen[row] = tuple(
+                replace(s, computed=s.computed & (not k), forward=s.forward & (not k))
+                for s, k in zip(shown, known, strict=True)
+            )
         last = {i: one.number for i, one in enumerate(shown)}
     policy.reset()
-    frames = [report.frames for report in made]
-    tokens = sum(one.tokens for one in frames), sum(one.of for one in frames)
+    frames = sum((report.frames for report in made), FrameWork())
     kept = [one for one in made if one.plan.shape == made[-1].plan.shape]  # the first may be in another loop
     name = episode.name + " (without its first call)" * (len(kept) < len(made))
-    return Course(name, np.stack([r.plan[0] for r in kept]), tuple(r.legalised[0] for r in kept), tokens, seen)
+    return Course(name, np.stack([r.plan[0] for r in kept]), tuple(r.legalised[0] for r in kept), frames, seen)
