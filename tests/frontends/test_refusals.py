@@ -31,6 +31,11 @@ OWN_MODULE = r"compile_denoiser\(module, spec\)"
 PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     ({"model": {"llm_backbone": {"a": W}, "x_embedder": {"mlp.fc1.weight": W}}}, "HybridVLA", "file of its folder ch"),
     ({"parameter": {"blocks.0.weight": W}}, "Dita", r"\.hydra/config\.yaml that its training wrote"),
+    (
+        {"model": {"nets": {"policy.noise_pred_net.down_modules.0.0.a": W}}, "config": "{}", "algo_name": "bc"},
+        "a checkpoint of robomimic",
+        rf"\(told by its entry algo_name\)\. If that is diffusion_policy: .*{OWN_MODULE}",
+    ),
     ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "config.json, and model"),
     (
         {"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}},

@@ -108,6 +108,16 @@ def test_a_zarr_codec_that_unpickles_is_never_run(declared: str, tmp_path: Path)
     assert not target.exists()
 
 
+def test_pictures_in_a_codec_of_another_library(tmp_path: Path) -> None:
+    """As Diffusion Policy caches those of robomimic; the message says which codecs are read, and what to do."""
+    store = as_zarr(tmp_path)
+    meta = json.loads((store / "data" / "img" / ".zarray").read_text())
+    meta["compressor"] = {"id": "imagecodecs_jpeg2k", "level": 50}
+    (store / "data" / "img" / ".zarray").write_text(json.dumps(meta))
+    with pytest.raises(TrajectoryError, match="imagecodecs_jpeg2k.* one of blosc, .*Write it again with such a compr"):
+        load_trajectories([store], LOW, 3, SOURCES)
+
+
 def test_a_zarr_array_of_nothing_but_its_size_is_refused(tmp_path: Path) -> None:
     store = as_zarr(tmp_path)
     shutil.rmtree(store / "data" / "state")

@@ -97,7 +97,10 @@ DIRECTORIES = (
 )
 """By the path of a file in a directory, three levels deep, or an entry of its ``config.json``."""
 
-ENTRIES = (Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),)
+ENTRIES = (
+    Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),
+    Refusal(r"^algo_name$", "a checkpoint of robomimic", f"If that is diffusion_policy: {_BUILD}. If not: {_NO_LOOP}"),
+)
 """By an entry of a torch checkpoint."""
 
 LEROBOT_TYPES = "act, diffusion, eo1, evo1, groot, multi_task_dit, smolvla, pi0, pi05, vla_jepa, wall_x or xvla"
@@ -121,9 +124,7 @@ STATES = (
     Refusal(r"^qwen_vl_interface\.", "a VLA-JEPA or another of starVLA as it is saved", _TRAIN.format("vla_jepa")),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
-    Refusal(
-        r"^(joint_cmps|gating_network)\.", "a policy of VDD, a mixture of experts of one evaluation each", _NO_LOOP
-    ),
+    Refusal(r"^(joint_cmps|gating_network)\.", "a policy of VDD, experts of one evaluation each", _NO_LOOP),
     Refusal(r"^(actor_ft|network)\.(time_embedding|time_mlp|mlp_mean)\.", "a policy of DPPO", _DPPO),
     Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
@@ -167,8 +168,7 @@ def refuse_payload(payload: Mapping[str, Any]) -> None:
     row = next((each for each in ENTRIES if _match(each, entries)), None)
     how = f"its entry {_match(row, entries)}" if row else ""
     if row is None:
-        names = sorted(_weight_names(payload))
-        row = _first(STATES, names)
+        row = _first(STATES, names := sorted(_weight_names(payload)))
         how = f"the weight {_match(row, names)}" if row.sign else f"its entries {', '.join(entries[:6]) or '(none)'}"
     raise CheckpointError(
         f"no entry {missing!r}, so not a checkpoint of Diffusion Policy's workspace {{cfg, state_dicts, pickles}}: this"

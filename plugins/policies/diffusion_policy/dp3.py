@@ -8,6 +8,7 @@ Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., ar
 (arXiv 1612.00593).
 """
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +19,7 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
 
-from .parts import COMMON_KEYS, Observed, Rebuilt, Saved, Weights, read_shape_meta, require_room
+from .parts import COMMON_KEYS, Observed, Rebuilt, Saved, Weights, affine, read_shape_meta, require_room
 from .unet import DEFAULTS, behind_encoder
 
 POINTS, STATE, ROBOT = "point_cloud", "agent_pos", "imagin_robot"
@@ -85,6 +86,7 @@ _CONDITIONS = {
     "add": {"cond_predict_scale": False},
     "mlp_film": {"cond_predict_scale": True, "condition_layer": True},
 }
+_READ = (POINTS, STATE, ROBOT)
 _MOST_POINTS = 2**16
 """Of a cloud, which the weights do not limit; in use are 512 to 4096."""
 _PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
@@ -117,20 +119,39 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
             " cross_attention_* cannot run: they put a timestep without an axis of observed steps beside observations"
             " with one"
         )
-    action_dim, every = read_shape_meta(settings, "low_dim", "point_cloud", "rgb", "depth")
-    observed = {key: each for key, each in every.items() if key in (POINTS, STATE, ROBOT)}
+    action_dim, every = read_shape_meta(settings)  # the original looks at no type, and some of its tasks say low_dimx
+    observed = {key: _as_given(key, *each, saved.weights) for key, each in every.items() if key in _READ}
     encoder = _encoder(settings, observed, saved.weights)
     network: dict[str, Any] = {name: saved.policy.get(name, default) for name, default in DEFAULTS.items()}
     network |= _CONDITIONS[condition]
     network |= {"blocks": blocks, "conditioned": tuple(settings.flag(name, True) for name in _PLACES)}
-    return behind_encoder(saved, encoder, encoder.width, observed, action_dim, network, _KNOWN)
+    rebuilt = behind_encoder(saved, encoder, encoder.width, observed, action_dim, network, _KNOWN)
+    scheduler = saved.policy["noise_scheduler"]
+    if scheduler.get("prediction_type") == "sample" and str(scheduler.get("_target_")).endswith("DDIMScheduler"):
+        warnings.warn(
+            "DDIM's steps are those of diffusers from 0.15 on. Up to 0.14, and the original asks for 0.11.1, it took a"
+            " predicted sample for noise, which gives other actions. Evaluate the compiled policy, or compare it with"
+            " the original under a later diffusers.",
+            stacklevel=2,
+        )
+    return rebuilt
+
+
+def _as_given(key: str, kind: str, shape: tuple[int, ...], weights: Weights) -> tuple[str, tuple[int, ...]]:
+    """Type and shape of an observation as it comes.
+
+    The original normalises whole points, and then takes the channels that its network reads. Its tasks say the shape of
+    those alone, [512, 3], where the points of their data sets, and of their normalisers, have colours as well.
+    """
+    channels = len(affine(weights, key, None).scale) if len(shape) == 2 else 1
+    return kind, (shape[0], channels) if channels > 1 else shape
 
 
 def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointCloudEncoder:
     coloured = settings.flag("use_pc_color", False)
     settings.choice("pointnet_type", "pointnet")
     cloud = settings.part("pointcloud_encoder_cfg")
-    for key, axes in ((POINTS, 2), (STATE, 1), (ROBOT, 2)):
+    for key, axes in zip(_READ, (2, 1, 2), strict=True):
         if key == ROBOT and key not in observed:
             continue
         shape = observed[key][1] if key in observed else ()

@@ -162,7 +162,8 @@ def read_shape_meta(settings: Settings, *types: str) -> tuple[int, Observed]:
 
     Args:
         settings: ``cfg.policy``.
-        types: of observations that the policy's encoder takes; the first is that of an entry without a type.
+        types: of observations that the policy's encoder takes; the first is that of an entry without a type. None of
+            them where it does not look at types.
     """
     meta = settings.values.get("shape_meta")
     if not isinstance(meta, dict) or not isinstance(meta.get("obs"), dict) or not isinstance(meta.get("action"), dict):
@@ -174,7 +175,7 @@ def read_shape_meta(settings: Settings, *types: str) -> tuple[int, Observed]:
         shape: Any = each.values.get("shape")
         if not is_shape(shape):
             raise each.refusal("shape", "positive whole numbers")
-        kind = types[0] if key == "action" else each.choice("type", *types)
+        kind = each.choice("type", *types) if types and key != "action" else "low_dim"
         if key == "action" and len(shape) != 1:
             raise each.refusal("shape", "one number")
         if kind == "rgb" and (len(shape) != 3 or max(shape) > MOST_PIXELS):
