@@ -46,16 +46,16 @@ class OneCamera:
                 self._lanes[streams] = self._of_camera(frames, name, obs)
         return self._values(frames, obs)
 
-    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
+    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int, int]:
         """See ``TokenTower``."""
         own = any(lane in lanes for lanes in self._lanes.values())
         known = lane in tower._lanes
         if not own:
             tower._lanes.pop(lane, None)
-        values, count = self._compute(tower, lane, row)
+        values, count, forward = self._compute(tower, lane, row)
         if own and known:
             self.computed += count, tower.tokens
-        return values, count
+        return values, count, forward
 
     def _of_camera(self, frames: FramePieces, name: str, obs: Mapping[str, Array]) -> set[Lane]:
         """The lanes whose rows change with the pictures of the camera."""

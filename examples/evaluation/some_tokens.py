@@ -48,13 +48,13 @@ class Counted:
         if self._kept:
             setattribute(TokenTower, "_similar", lambda tower, old, new, index, off: (index[:0], index[:0]))
 
-    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int]:
+    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int, int]:
         """See ``TokenTower``."""
         known = lane in tower._lanes
-        values, count = self._compute(tower, lane, row)
+        values, count, forward = self._compute(tower, lane, row)
         if known:
             self.computed.setdefault(tower._reuse.threshold, np.zeros(2, np.int64))[:] += count, tower.tokens
-        return values, count
+        return values, count, forward
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
