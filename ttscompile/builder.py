@@ -92,24 +92,24 @@ def build(
     require_rate(policy_hz)
     if isinstance(trajectories, str | os.PathLike):
         trajectories = (trajectories,)
-    given = tuple(trajectories)
+    named = tuple(trajectories)
 
-    def read(spec: PolicySpec) -> None:
-        if given and spec.instruction is None:  # else the artifact's tokenizer is needed
-            load_episodes(spec, given, observation)
+    def check(spec: PolicySpec) -> None:
+        if named and spec.instruction is None:  # else the artifact's tokenizer is needed
+            load_episodes(spec, named, observation)
 
     if not trajectories:
         trajectories = (recordings_of(checkpoint),)
         explain("recordings", (f"no recordings were given: {trajectories[0]}, which the policy was trained on",))
-    how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, "read": read}
+    how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, "read": check}
     how |= of_checkpoint
     target = Path(os.path.realpath(directory))
     with replacing(target) as put, _beside(target) as made:
-        _converted(checkpoint, made, resume, explain, how)
+        _convert(checkpoint, made, resume, explain, how)
         if control_hz is not None:
             policy_hz = policy_hz or recorded_rate(trajectories)
             latency_ms = _deadline(made, control_hz, policy_hz)
-        artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))
+        artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))  # a goal that none of these reads
         rows = [row for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]
         result = calibrate(
             made,
@@ -140,18 +140,18 @@ def _beside(target: Path) -> Iterator[Path]:
         try:
             yield made
         except (ArtifactError, CalibrationFailedError) as error:
-            kept = f" What was done is in {made}, for --resume or as it is." if _of_worth(made) else ""
+            kept = f" What was done is in {made}, for --resume or as it is." if _worth_keeping(made) else ""
             raise type(error)(f"{error}{kept}") from error
         finally:
-            if not _of_worth(made):
+            if not _worth_keeping(made):
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def _of_worth(made: Path) -> bool:
+def _worth_keeping(made: Path) -> bool:
     return (made / STATE).is_file() or bool(learned_plans(made))
 
 
-def _converted(
+def _convert(
     checkpoint: str | os.PathLike[str], directory: Path, resume: bool, explain: Explain, how: Mapping[str, Any]
 ) -> None:
     """Convert; where an interrupted build has done that, see that it was of this checkpoint, and leave it."""

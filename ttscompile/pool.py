@@ -169,8 +169,8 @@ def artifact_elsewhere(path: str, identity: str) -> Artifact:
     return artifact
 
 
-def place_of(artifact: Artifact) -> tuple[str, str]:
-    """What ``artifact_elsewhere`` takes."""
+def artifact_arguments(artifact: Artifact) -> tuple[str, str]:
+    """The arguments of ``artifact_elsewhere``."""
     return str(artifact.path.resolve()), artifact.manifest.identity
 
 

@@ -92,7 +92,7 @@ class Kept(WholeSteps):
     """Compares schedules as calibration does, and keeps what they answer."""
 
     def __init__(self, executor: Executor, actions: Actions, fitted: Calls, learned: Calls, count: int, seed: int):
-        super().__init__(executor, actions, fitted, seed)
+        super().__init__(executor, fitted, seed)
         self.reading = self.reads(count)
         self._kept: dict[Steps, torch.Tensor] = {}
         self._actions_of, self._learned = actions, learned

@@ -19,7 +19,7 @@ from ttscompile.calibration.progress import Progress
 from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.strategies import strategy_of
-from ttscompile.calibration.targets import executor_elsewhere, where
+from ttscompile.calibration.targets import executor_arguments, executor_elsewhere
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.correction import FEATURES, Correction
@@ -194,7 +194,7 @@ class Searching:
             if missing:
                 progress("dense calls to learn from", 0, 1)
                 task = _of_schedules(trials.executor, trials.calls, trials.seed)
-                given = *where(trials.executor), trials.calls, trials.seed, self._how
+                given = *executor_arguments(trials.executor), trials.calls, trials.seed, self._how
                 outcomes = pool.map(Work(partial(_searched, task, self._how), _searched_elsewhere, given), missing)
                 for number, wish in enumerate(missing, len(names) - len(missing)):
                     progress(f"search: {names[wish]}", number, len(names))

@@ -50,7 +50,7 @@ def bac(task: Task) -> Found:
     similarity, change = (np.mean([one[part] for one in found], axis=0) for part in range(2))
     most = min(model.steps, task.budget // model.blocks + 1)
     schedules = [best_schedules(one, most) for one in similarity]
-    followed = bubbling(change, task.kinds)
+    followed = bubbling(change, [block.kind for block in run.view.manifest.blocks])
     counts = spend(schedules, followed, task.budget)
     computed = union([one[n - 1].computed for one, n in zip(schedules, counts, strict=True)], followed)
     plan: PlanArray = np.where(computed, Source.COMPUTE, Source.TIMESTEP).astype(np.int8)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.execute import Executor, State
+from ttscompile.calibration.execute import Executor, StreamCaches
 from ttscompile.calibration.task import Task
 from ttscompile.core.lattice import dense_plan
 
@@ -25,11 +25,11 @@ def some_calls(task: Task, count: int) -> Calls:
 def dense_steps(executor: Executor, calls: Calls) -> Iterator[tuple[Tensor, list[Tensor]]]:
     """Step by step, the stream after the stem of dense calls, and what each block adds to it."""
     plan = dense_plan(executor.model.steps, executor.model.blocks)[None]
-    state, stems = State(), list[Tensor]()
+    caches, stems = StreamCaches(), list[Tensor]()
 
     def blocks(k: int, stem: Tensor) -> Tensor:
         stems.append(stem)
-        return executor.step(plan[:, k], k, stem, calls, state)
+        return executor.step(plan[:, k], k, stem, calls, caches)
 
     for _ in executor.corrected(None).samples(calls, blocks):
-        yield stems.pop(), [state.timestep[b] for b in range(executor.model.blocks)]
+        yield stems.pop(), [caches.timestep[b] for b in range(executor.model.blocks)]

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.calibration.calls import Calls, FloatArray
-from ttscompile.calibration.execute import Executor, State, last
+from ttscompile.calibration.execute import Executor, StreamCaches, last
 from ttscompile.calibration.task import Array, Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
@@ -189,17 +189,17 @@ class Decided:
 
 def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
     """Run calls with plans that the criterion decides step by step."""
-    model, state = executor.model, State()
+    model, caches = executor.model, StreamCaches()
     decisions = Decisions(criterion, model.steps, model.blocks, calls.count)
     first, others = range(criterion.always), range(criterion.always, model.blocks)
     computed = np.full((1, model.blocks), Source.COMPUTE, np.int8)
     rows: list[PlanArray] = []
 
     def blocks(k: int, stem: Tensor) -> Tensor:
-        stream = executor.step(computed, k, stem, calls, state, first)
-        feature = torch.stack([state.timestep[b] for b in first]).sum(0) if first else stem
+        stream = executor.step(computed, k, stem, calls, caches, first)
+        feature = torch.stack([caches.timestep[b] for b in first]).sum(0) if first else stem
         rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(executor.axes[0], 0).cpu().numpy())))
-        return executor.step(rows[-1], k, stream, calls, state, others)
+        return executor.step(rows[-1], k, stream, calls, caches, others)
 
     with torch.no_grad():
         sample = last(executor.samples(calls, blocks))

@@ -1,15 +1,15 @@
 """The asynchronous executor: a control loop always has the action for now, while the next chunk is computed.
 
-Everything that decides is a state machine without clock or thread, driven by ``executor``, which has the one thread:
+Everything that decides is a state machine without clock or thread. ``executor`` and the thread of ``worker`` drive it:
 
 - ``window``: frames in, observation windows out.
-- ``schedule``: actions by control tick, and how chunks join.
-- ``feasibility``: whether a policy keeps up, when its next call must start, and which plan runs under pressure.
-- ``guard``: what a chunk must be before it is executed.
-- ``stall``: whether the policy has stopped moving.
-- ``state``: all of these together.
-- ``statistics``, ``trace``: what happened.
-- ``shadow``: a compiled policy beside the original that acts.
+- ``timeline``: actions by control tick, and how chunks join; ``schedule``: those of one episode.
+- ``feasibility``: whether a policy keeps up, and which plan runs under pressure.
+- ``guard``: what a chunk must be before it is executed, and whether the policy has stopped moving.
+- ``state``: all of these together, and when the next call starts.
+
+``settings`` and ``measure`` are what they begin with, ``statistics`` what happened; ``shadow`` is a compiled policy
+beside the original that acts.
 """
 
 from .executor import AsyncExecutor

@@ -79,7 +79,7 @@ class Feasibility:
 
     @property
     def needed(self) -> float:
-        """How long they have to last."""
+        """How long the actions of a chunk have to last for calls to follow each other without a gap."""
         return self.frame_period + 2 * self.latency + self.margin
 
     @property

@@ -64,7 +64,7 @@ def _require_prefix(policy: Policy, settings: Resolved, plan: str) -> None:
     """Raise unless ``predict_action`` has a parameter of the name ``prefix``, and the policy has nothing against it."""
     takes = "prefix" in inspect.signature(policy.predict_action).parameters
     refusal_of = getattr(policy, "prefix_refusal", lambda plan=None: getattr(policy.info, "prefix_refusal", None))
-    refusal = refusal_of(**settings.asked(plan)) if takes else None
+    refusal = refusal_of(**settings.plan_argument(plan)) if takes else None
     if not takes or refusal is not None:
         why = f"plan {plan!r} of this one does not: {refusal}" if takes else f"{type(policy).__name__} does not."
         needed = "seam='prefix' needs a policy whose predict_action takes prefix= and inpaints it"
@@ -99,5 +99,5 @@ def measure_latencies(policy: Policy, clock: Clock, settings: Resolved) -> dict[
             forget()
             if number % 3 == 0:
                 follow(NO_CHUNK)
-            timer.time(i, partial(policy.predict_action, obs, **settings.asked(plans[i]), **known))
+            timer.time(i, partial(policy.predict_action, obs, **settings.plan_argument(plans[i]), **known))
     return dict(zip(plans, timer.times, strict=True))

@@ -43,7 +43,7 @@ class Schedule:
         return self._played[-1] if self._played else None
 
     def tick(self, time: float, now: float) -> int:
-        """The tick of a time for which an action is asked.
+        """The tick of a time for which an action is asked now; takes note of how far ahead of it that is.
 
         Raises:
             ExecutorError: an action for a later time was given out before, or the time is of another clock.
@@ -70,6 +70,9 @@ class Schedule:
         Args:
             actions: ``[horizon + reserve, Da]``; the reserve is left out where the guard refuses that alone.
             alone: whether no mean of it and others is made.
+
+        Returns:
+            What became of it: ``scheduled``, ``refused`` (``refusal`` says why) or ``overdue``.
         """
         settings = self._settings
         self.refusal = self._guard.refuse(actions[: settings.horizon])
@@ -149,7 +152,7 @@ class Schedule:
         return np.stack(played) if played else np.empty((0, self._settings.channels), np.float32)
 
     @property
-    def executed(self) -> float:
+    def executed_at(self) -> float:
         """When the policy would have executed the newest chunk, of which there must be one, and so observes again."""
         assert self.timeline is not None
         begun = max(float(self.timeline.observed.max()), self.grid.time(self._first))

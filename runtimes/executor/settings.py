@@ -218,8 +218,8 @@ class Resolved(ExecutorSettings):
     poses: tuple[Pose, ...]
     unnamed: str | None
 
-    def asked(self, plan: str) -> dict[str, str]:
-        """The words that ask ``predict_action`` for a plan."""
+    def plan_argument(self, plan: str) -> dict[str, str]:
+        """What asks ``predict_action`` for a plan, by keyword; nothing where it is called without one."""
         return {} if plan == self.unnamed else {"plan": plan}
 
     def possible(self, row: FloatArray, before: FloatArray | None) -> FloatArray:

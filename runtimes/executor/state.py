@@ -76,7 +76,7 @@ class ExecutorState:
         self._window = ObservationWindow(settings.frames.steps, period, settings.rate_tolerance, settings.max_age)
         self._schedule = Schedule(settings, self._guard)
         self._watchdog = Watchdog(settings.stall)
-        self._early: deque[Frame] = deque(maxlen=2 * settings.frames.steps)  # handed out
+        self._prepared: deque[Frame] = deque(maxlen=2 * settings.frames.steps)  # handed out
         self._used = float("-inf")  # time of the newest frame that a call was made from
         self._outcome: str | None = None  # what became of the last chunk
         self._holds = 0
@@ -228,23 +228,23 @@ class ExecutorState:
         if window is None or window.time <= self._used or now - window.time > self._settings.max_age:
             return None
         runs_out = schedule.runs_out(now)
-        if runs_out is None or window.time + self._window.interval / 2 > schedule.executed:
+        if runs_out is None or window.time + self._window.interval / 2 > schedule.executed_at:
             return now
-        latest = runs_out - self._takes
+        latest = runs_out - self._lead
         comes = window.time + self._window.interval + self._window.delay
         return max(latest, now) if comes < latest - SAME_TIME else now
 
-    def early(self, now: float) -> Frame | None:
-        """A frame that has come and that the next call will read, but as its newest; None if that was handed out.
+    def frame_to_prepare(self, now: float) -> Frame | None:
+        """A frame that has come and the next call will read, but not as its newest; None if all were handed out.
 
         There is none once the call is due: it computes what is left of its frames itself.
         """
-        wanted = (frame for frame in self._awaited(now) if not any(frame is other for other in self._early))
+        wanted = (frame for frame in self._awaited(now) if not any(frame is other for other in self._prepared))
         return next(wanted, None)
 
-    def begin_early(self, frame: Frame) -> None:
-        """Hand out a frame that ``early`` gave."""
-        self._early.append(frame)
+    def begin_preparing(self, frame: Frame) -> None:
+        """Hand out a frame that ``frame_to_prepare`` gave."""
+        self._prepared.append(frame)
         self.recorder.counts.frames_early += 1
 
     def awaits(self, frame: Frame, now: float) -> bool:
@@ -259,11 +259,11 @@ class ExecutorState:
         interval, runs_out = window.interval, schedule.runs_out(now)
         expected = window.newest + interval
         if runs_out is not None:
-            latest = runs_out - self._takes - interval - window.delay
-            if latest < schedule.executed - interval / 2:  # with the last frame that comes early enough
+            latest = runs_out - self._lead - interval - window.delay
+            if latest < schedule.executed_at - interval / 2:  # with the last frame that comes early enough
                 expected = window.newest + interval * max(ceil((latest - window.newest) / interval - SAME_TIME), 1)
-            elif window.newest < schedule.executed - interval / 2:
-                expected = schedule.executed
+            elif window.newest < schedule.executed_at - interval / 2:
+                expected = schedule.executed_at
         return window.before(expected)
 
     def begin(self, now: float) -> Job:
@@ -336,7 +336,7 @@ class ExecutorState:
         return self._latencies[self.plan].reckoned(self._coverable)
 
     @property
-    def _takes(self) -> float:
+    def _lead(self) -> float:
         """Seconds that the next call has to start before its chunk is needed."""
         return self._latency + self._settings.margin_ticks / self._settings.control_hz
 
@@ -346,4 +346,4 @@ class ExecutorState:
         At least half a tick is left between the two, so that a frame which comes so late still starts its call.
         """
         if self.ready:
-            self._schedule.need_by(self._schedule.executed + self._window.delay + self._takes)
+            self._schedule.need_by(self._schedule.executed_at + self._window.delay + self._lead)

@@ -171,10 +171,10 @@ class ObservationWindow:
     @property
     def trouble(self) -> str:
         """Why there is no complete window, where frames came for longer than one takes; else empty."""
-        return self.why_incomplete() if self.complete is None and self._waited else ""
+        return self.why_incomplete() if self.complete is None and self._overdue else ""
 
     @property
-    def _waited(self) -> bool:
+    def _overdue(self) -> bool:
         """Whether frames came for longer than a window takes, or more than it has were thrown away."""
         lasts = (self._steps - 1) * self._period + self._slack
         newest = self._first if self.newest is None else self.newest
@@ -206,7 +206,7 @@ class ObservationWindow:
             told = f"the last one {self._behind:.4g} s after it was taken, and {self._keep:.2g} s is the most"
             remedy = "Stamp frames with time.monotonic(), or with the executor's clock, and give them sooner"
             return f"frames came too late and were thrown away, {self._late} in a row; {told}. {remedy}"
-        if found < self._steps and not self._waited:
+        if found < self._steps and not self._overdue:
             return f"{found} of {self._steps} frames came"
         gaps = np.diff([time for time, _ in self._frames[-self._steps :]])
         apart = ", ".join(f"{gap:.4g}" for gap in gaps) or f"more than {self._keep:.2g}"

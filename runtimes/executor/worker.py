@@ -83,7 +83,7 @@ class Worker:
         if self.failure is not None:
             self._thread.join()
             raise self.failure
-        return self._opened
+        return self._opened_state
 
     def look_again(self, now: float) -> None:
         """Have the thread see a new observation, if that starts a call sooner than it looks by itself.
@@ -93,7 +93,7 @@ class Worker:
         if self._waiting and self._state is not None:
             start = self._state.next_start(now)
             sooner = start is not None and (start == now or not self._timed)
-            if sooner or (self._seeing and self._state.early(now) is not None):
+            if sooner or (self._seeing and self._state.frame_to_prepare(now) is not None):
                 self._work.notify()
 
     def reset(self, seed: int | None) -> None:
@@ -176,7 +176,7 @@ class Worker:
     def _next(self) -> Callable[[], object] | None:
         """Wait for what to do: a call, a frame to prepare, a reset of the policy with a seed, or (None) the end."""
         with self.lock:
-            state = self._opened
+            state = self._opened_state
             while not self._ending:
                 if self._reset_due:
                     seed, self._reset_due, self._reset_seed = self._reset_seed, False, None
@@ -185,8 +185,8 @@ class Worker:
                 start = state.next_start(now)
                 if start is not None and start <= now:
                     return partial(self._call, state.begin(now))
-                if self._seeing and (frame := state.early(now)) is not None:
-                    state.begin_early(frame)
+                if self._seeing and (frame := state.frame_to_prepare(now)) is not None:
+                    state.begin_preparing(frame)
                     return partial(self._prepare, frame)
                 self._waiting, self._timed = True, start is not None
                 self._clock.wait(self._work, None if start is None else start - now)
@@ -199,7 +199,7 @@ class Worker:
         def useless() -> bool:
             with self.lock:
                 now = self._clock.now()
-                return self._ending or self._reset_due or not self._opened.awaits(frame, now)
+                return self._ending or self._reset_due or not self._opened_state.awaits(frame, now)
 
         start = self._clock.now()
         assert self._seeing is not None  # or there was none to prepare
@@ -210,14 +210,15 @@ class Worker:
     def _call(self, job: Job) -> None:
         settings = self._settings
         obs = settings.frames.observation(job.frames)
-        words: dict[str, Any] = settings.asked(job.plan) | ({} if job.prefix is None else {"prefix": job.prefix[None]})
+        prefix = {} if job.prefix is None else {"prefix": job.prefix[None]}
+        arguments: dict[str, Any] = {**settings.plan_argument(job.plan), **prefix}
         last = settings.first + settings.horizon + settings.reserve
         if job.stalled:  # all but the sequence of its noise is forgotten
             self._policy.reset()
         elif (follow := getattr(self._policy, "follow", None)) is not None and job.executed is not None:
             follow(job.executed)
         try:
-            predicted = np.asarray(self._policy.predict_action(obs, **words)["action_pred"])
+            predicted = np.asarray(self._policy.predict_action(obs, **arguments)["action_pred"])
         except NonFiniteActionsError:  # the guard refuses them, as it does those of a policy that gives them out
             predicted = np.full((1, last, settings.channels), np.nan, np.float32)
         streams, steps, channels = predicted.shape if predicted.ndim == 3 else (0, 0, 0)
@@ -229,7 +230,7 @@ class Worker:
         far = bool(getattr(report, "far", False))
         with self.lock:
             now = self._clock.now()
-            outcome = self._opened.finish(job, actions, now, far)
+            outcome = self._opened_state.finish(job, actions, now, far)
             self.news.notify_all()
         if self._trace.on:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
@@ -241,7 +242,7 @@ class Worker:
             self._trace.call(job.started, now, args, None if report is None else report.timings)
 
     @property
-    def _opened(self) -> ExecutorState:
+    def _opened_state(self) -> ExecutorState:
         assert self._state is not None  # ``_open`` made it
         return self._state
 

@@ -125,7 +125,7 @@ def test_a_loop_that_ends_in_no_numbers_gets_no_correction(make_task: MakeTask, 
     task = make_task(calls=40)
     assert task.calls.path is not None
     calls = replace(task.calls, path=task.calls.path * float("nan"))
-    assert WholeSteps(task.executor, task.actions, calls, 0).correction_of(plan) is None
+    assert WholeSteps(task.executor, calls, 0).correction_of(plan) is None
 
 
 def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, plan: PlanArray) -> None:
@@ -142,16 +142,16 @@ def test_calls_of_one_episode_do_not_tell_whether_reading_helps(make_task: MakeT
 def test_a_small_network_is_asked_on_every_quarter_of_the_episodes(
     make_task: MakeTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task, errors, asked = make_task(calls=80, episodes=range(4)), WholeSteps._errors, list[frozenset[int]]()
+    task, errors, asked = make_task(calls=80, episodes=range(4)), WholeSteps._errors_of, list[frozenset[int]]()
 
     def told(self: WholeSteps, samples: torch.Tensor, of: Calls) -> Errors:
         asked.append(frozenset(of.episodes.tolist()))
         return errors(self, samples, of)
 
-    monkeypatch.setattr(WholeSteps, "_errors", told)
+    monkeypatch.setattr(WholeSteps, "_errors_of", told)
     for small, parts in ((False, 1), (True, 4)):
         asked.clear()
-        WholeSteps(task.executor, task.actions, task.calls, 0, small=small).reads(2)
+        WholeSteps(task.executor, task.calls, 0, small=small).reads(2)
         assert len(set(asked)) == parts
     assert sorted(episode for quarter in set(asked) for episode in quarter) == list(range(4))
 

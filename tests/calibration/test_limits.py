@@ -31,7 +31,7 @@ from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
 from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
-from ttscompile.calibration.trials import SHARE
+from ttscompile.calibration.trials import ANSWERED_BY
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
@@ -55,7 +55,7 @@ class _Hand(Clock):
 class _Slow:
     """A search whose intervals take 10 s, and whose plan takes 25 s more to be finished."""
 
-    intervals, settling, done = 50, 25.0, False
+    intervals, seconds_to_finish, done = 50, 25.0, False
 
     def __init__(self, clock: _Hand) -> None:
         self._clock = clock
@@ -64,7 +64,7 @@ class _Slow:
         self._clock.now += 10
 
     def found(self) -> str:
-        self._clock.now += self.settling
+        self._clock.now += self.seconds_to_finish
         return "found"
 
 
@@ -128,17 +128,16 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
     artifact = load_artifact(compiled)
     executor, spec = Executor(view_of(artifact, "dense")), artifact.manifest.spec
     episodes = load_trajectories([recording], spec.observations, 4)
-    calls = draw_calls(executor, spec, episodes, split_episodes(6, 0.25, 0), 16, 0)
+    calls = draw_calls(executor, episodes, split_episodes(6, 0.25, 0), 16, 0)
     state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)
     clock.now = 51.0
     with Bar(shown=False) as bar:
-        few = with_targets(executor, "calibration", calls, 3, state, clock.until(SHARE), bar)
+        few = with_targets(executor, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
         assert few.count == min(max(4, 2 * torch.get_num_threads()), 16)  # whole rounds, a worker's part is two calls
         clock.now = 0.0
-        again = with_targets(
-            executor, "calibration", calls, 3, state, clock.until(SHARE), bar
-        )  # as after an interruption
-        whole = with_targets(executor, "calibration", calls, 3, fresh, clock.until(SHARE), bar)
+        # As after an interruption.
+        again = with_targets(executor, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
+        whole = with_targets(executor, "calibration", calls, 3, fresh, clock.until(ANSWERED_BY), bar)
     assert (again.count, whole.count) == (few.count, calls.count)
     assert few.path is not None
     assert whole.path is not None

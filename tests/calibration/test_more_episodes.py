@@ -36,7 +36,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Told:
 
         monkeypatch.setattr(whole_steps, "SparseLoop", loop)
         monkeypatch.setattr(task.whole, "reads", lambda count: False)
-        monkeypatch.setattr(task.whole, "_errors", lambda samples, of: Errors(float(samples), 0.0))
+        monkeypatch.setattr(task.whole, "_errors_of", lambda samples, of: Errors(float(samples), 0.0))
         made = task.whole.told_of_episodes(STEPS)
         if made:
             few, many = ({int(one) for one in each.episodes} for each in seen)

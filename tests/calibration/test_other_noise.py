@@ -16,7 +16,7 @@ import ttscompile
 from tests.once import Once
 from ttscompile.artifact.ceiling import FARTHEST
 from ttscompile.calibration.judge import Score, other_noise, other_observations
-from ttscompile.calibration.pipeline import UNHEARD, CalibrationResult, heeds
+from ttscompile.calibration.pipeline import UNHEARD, CalibrationResult, warn_if_noisy
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.trials import DRAWS
 from ttscompile.report import facts
@@ -135,7 +135,7 @@ def test_a_policy_that_hardly_heeds_what_was_recorded_is_told_of(
     held: Any = SimpleNamespace(artifact=SimpleNamespace(manifest=SimpleNamespace(spec=spec)), held_out=sample)
     held.bar = Bar(shown=True)
     assert (other_noise(held) < UNHEARD * other_observations(held)) == (calls > 1 and not warned)
-    heeds(held)
+    warn_if_noisy(held)
     assert ("hardly heeds what was recorded" in capsys.readouterr().err) == warned
 
 

@@ -23,7 +23,7 @@ from ttscompile.cli import main
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.errors import ReportError
 from ttscompile.measure.units import plain
-from ttscompile.report import Given, build, facts, pictures, render, verified
+from ttscompile.report import Extras, build, facts, pictures, render, verified
 from ttscompile.report.page import Table
 from ttscompile.report.timing import Measurement
 from ttscompile.report.usage import run_episode
@@ -191,7 +191,7 @@ def test_hostile_names_stay_text(calibrated: Path) -> None:
     rung = Rung(HOSTILE, "failed", HOSTILE, unit=HOSTILE, remedy=HOSTILE, step=3, blocks=(1, 2))
     errors = ErrorMap(np.arange(2), np.full((2, 5), 1e-3), 1e-5, (HOSTILE,) * 5, HOSTILE, np.eye(2, 5, dtype=np.bool_))
     found = Verification(HOSTILE, None, None, (rung,), 1.0, errors)
-    given = Given(Episode(HOSTILE, obs), verified(found), calls=1)
+    given = Extras(Episode(HOSTILE, obs), verified(found), calls=1)
     page = render(build(artifact, policy, given))
     reader = Reader(page)
     assert "script" not in {tag for tag, _ in reader.tags}

@@ -13,7 +13,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.plan import DENSE, TokenReuse
-from ttscompile.report import Given, build
+from ttscompile.report import Extras, build
 from ttscompile.report.usage import SEEN_CALLS, run_episode
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
@@ -51,7 +51,7 @@ def test_a_camera_without_a_new_picture_has_no_computed_patch(policy: CompiledPo
 
 def test_the_page_shows_it(once: Once, policy: CompiledPolicy) -> None:
     artifact = load_artifact(cameras.compiled_tokens(once) / "artifact")
-    page = build(artifact, policy, Given(episode(), calls=1))
+    page = build(artifact, policy, Extras(episode(), calls=1))
     (section,) = (one for one in page.sections if one.title == "Episode")
     _, shown = section.pictures
     work = run_episode(policy, episode()).frames

@@ -11,6 +11,7 @@ import numpy as np
 from ..artifact.load import load_artifact
 from ..artifact.manifest import Manifest
 from ..core.correction import FEATURES, may_jump
+from ..core.plan import SCHEDULE
 from ..errors import CalibrationError
 from ..ir.program import Binding
 from .strategies import DEFAULT
@@ -65,7 +66,7 @@ def require_rate(policy_hz: float | None) -> None:
 
 def require_alone(learn: Sequence[str], strategy: str, *budgets: float | None) -> None:
     """Raise where loops are learned, and something that they cannot keep is asked for."""
-    if "schedule" in learn:
+    if SCHEDULE in learn:
         raise CalibrationError("learn: expected a schedule or loops; found both. Leave one of them out.")
     if strategy != DEFAULT:
         raise CalibrationError(f"learn: loops need the strategy {DEFAULT!r}; found {strategy!r}. Leave it out.")

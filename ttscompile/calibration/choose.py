@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ..core.plan import DENSE, FULL, Plan
+from ..core.plan import DENSE, FULL, SCHEDULE, Plan
 from ..errors import CalibrationFailedError
 from ..measure.points import ALIKE, Point, best_plan, efficient, fastest
 from ..measure.timer import Times
@@ -12,7 +12,6 @@ from .judge import Score, judge, timed
 from .kept import Kept
 from .proposer import SAFER, Request, near
 from .proposers.loops import too_far
-from .schedule import SCHEDULE
 from .step_counts import FAST, SAFE
 
 

@@ -133,13 +133,13 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
             sparsity=score.sparsity,
             outside=score.outside,
             flops=(1 - score.flops_saved) * one.trials.artifact.manifest.flops.dense,
-            **_apart(one.trials, score),
+            **_details(one.trials, score),
         )
         for one, score, took in zip(entrants, scores, times, strict=True)
     )
 
 
-def _apart(trials: Trials, score: Score) -> dict[str, Any]:
+def _details(trials: Trials, score: Score) -> dict[str, Any]:
     """``by_number``, ``errors`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
     spec, sample = trials.artifact.manifest.spec, trials.held_out
     x, y = score.answers, spec.chunk.executed(sample.answers)
@@ -173,8 +173,8 @@ def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None
     )
     # Masks and position tables are shorter where fewer steps are predicted; the weights proper are not.
     narrower = specs[0].sample != specs[1].sample
-    pairs = [(value, other.weights[key]) for key, value in artifact.weights.items() if key in other.weights]
-    same = [np.array_equal(*pair) for pair in pairs if not narrower or pair[0].shape == pair[1].shape]
+    both = [(value, other.weights[key]) for key, value in artifact.weights.items() if key in other.weights]
+    same = [np.array_equal(*pair) for pair in both if not narrower or pair[0].shape == pair[1].shape]
     if ours != theirs or not (same and all(same)):
         what = f"{theirs} instead of {ours}" if ours != theirs else "other weights"
         raise CalibrationError(

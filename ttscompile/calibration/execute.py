@@ -123,7 +123,7 @@ class Executor:
 
     def _samples(self, plans: PlanArray, calls: Calls) -> Iterator[Tensor]:
         """The same with one plan for all calls, or one for each: ``[1 or N, K, blocks]``."""
-        state = State()
+        caches = StreamCaches()
         total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
         previous: PlanArray | None = None
 
@@ -132,7 +132,7 @@ class Executor:
             row = plans[:, k]
             if total is not None and previous is not None and np.array_equal(row, previous):
                 return stem + total
-            stream = self.step(row, k, stem, calls, state)
+            stream = self.step(row, k, stem, calls, caches)
             computes = bool((row == Source.COMPUTE).any())
             total = None if computes or not self.alike else stream - stem
             previous = None if computes else row
@@ -141,25 +141,25 @@ class Executor:
         return self.samples(calls, blocks)
 
     def step(
-        self, row: PlanArray, k: int, stream: Tensor, calls: Calls, state: State, blocks: range | None = None
+        self, row: PlanArray, k: int, stream: Tensor, calls: Calls, caches: StreamCaches, blocks: range | None = None
     ) -> Tensor:
         """The stream after the blocks of step k, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do.
 
-        ``stream`` is that before the blocks, all of them or those that are given; ``state`` is changed.
+        ``stream`` is that before the blocks, all of them or those that are given; ``caches`` are changed.
         """
         for b in range(self.model.blocks) if blocks is None else blocks:
             group, column, axis = self.model.groups[b], row[:, b], self.axes[b]
             computing, forwarding = column == Source.COMPUTE, column == Source.FORWARD
             if computing.all():
                 residual = self.model.block(b, k, stream, calls.contexts)
-                state.timestep[b] = state.forward[group] = residual
+                caches.timestep[b] = caches.forward[group] = residual
             else:
-                residual = state.reused(b, group, forwarding, axis)
+                residual = caches.reused(b, group, forwarding, axis)
                 if computing.any():
                     streams = _numbers(computing, stream)
                     part = self.model.block(b, k, stream, calls.contexts, streams.tolist())
                     residual = residual.index_copy(axis, streams, part)
-                    state.write(b, group, axis, streams, part)
+                    caches.write(b, group, axis, streams, part)
                     reading, read = rollout_reads(column, calls.window)
                     if len(reading):
                         there = torch.from_numpy(np.stack([reading, read])).to(stream.device)
@@ -168,16 +168,16 @@ class Executor:
         return stream
 
 
-class State:
+class StreamCaches:
     """Caches of all streams; what step 0 has to write is there after it, since it is dense."""
 
     def __init__(self) -> None:
         self.forward: dict[int, Tensor] = {}  # by group
         self.timestep: dict[int, Tensor] = {}  # by block
 
-    def copy(self) -> State:
+    def copy(self) -> StreamCaches:
         """Another one with the same residuals; what is written to one of the two is not written to the other."""
-        other = State()
+        other = StreamCaches()
         other.forward, other.timestep = dict(self.forward), dict(self.timestep)
         return other
 

@@ -23,8 +23,8 @@ import torch
 
 from ..artifact.view import view_of
 from ..core.lattice import Source, plan_flops, sparsity
-from ..core.plan import Plan
-from ..core.spec import FloatArray
+from ..core.plan import ORIGINAL, Plan
+from ..core.spec import FloatArray, PolicySpec
 from ..errors import CalibrationError
 from ..measure.points import SAME, Numbers, pairs, rooted, signed_root
 from ..measure.timer import Timer, Times
@@ -208,10 +208,10 @@ def _filed(trials: Trials, plan: Plan) -> Plan:
     if not trials.fresh:
         return plan
     otherwise = None if plan.otherwise is None else _filed(trials, plan.otherwise)
-    return replace(plan, weights="original", otherwise=otherwise)
+    return replace(plan, weights=ORIGINAL, otherwise=otherwise)
 
 
-def _loop_spec(trials: Trials, plan: Plan) -> Any:
+def _loop_spec(trials: Trials, plan: Plan) -> PolicySpec:
     """The specification with the whole loop that the noise of a plan's calls is for."""
     return view_of(trials.artifact, plan.otherwise or plan).manifest.spec
 
@@ -266,12 +266,12 @@ class _Answers:
             if any(first == last for _, first, last in in_order):
                 told = "a plan that begins with the chunk of the call before is judged on episodes of two calls at"
                 raise CalibrationError(f"{told} least; one that was recorded has one call. Record longer ones.")
-            yield self._of(in_order)
-            yield self._of(apart, after_another=True)
+            yield self._along(in_order)
+            yield self._along(apart, after_another=True)
         else:
             # Whether what a call of it answers depends on the calls before.
             goes_on = plan.tokens is not None or plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
-            yield self._of(in_order if goes_on else apart)
+            yield self._along(in_order if goes_on else apart)
 
     def _call_elsewhere(self, some: Sequence[tuple[int, int]], draw: np.random.Generator) -> None:
         """A call of another episode before each of these calls, by number and draw of noise."""
@@ -283,22 +283,22 @@ class _Answers:
         keys = [(2, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
         self._runtime.predict(trials.observation(others), trials.noise(self._spec, keys), self._plan)
 
-    def _of(self, parts: Sequence[tuple[int, int, int]], after_another: bool = False) -> FloatArray:
-        """All calls of parts of stretches, from a row to another, one after the other; those of several parts together.
+    def _along(self, runs: Sequence[tuple[int, int, int]], after_another: bool = False) -> FloatArray:
+        """The answers along runs of consecutive calls: of each its stretch, its first row and its last.
 
-        A part's first call is the first of an episode, or comes after one of another, drawn at random: as if the world
-        had changed.
+        Several runs are the streams of a batch. A run's first call is the first of an episode, or comes after one of
+        another, drawn at random: as if the world had changed.
         """
         sample, draws = self._sample, np.random.default_rng((self._trials.seed, 6))
         made = np.empty((len(sample.calls), sample.draws, *self._spec.sample), np.float32)
         numbers = {(stretch, row): n for n, (stretch, row) in enumerate(sample.calls.tolist())}
-        asked = [(*part, draw) for part in parts for draw in range(sample.draws)]
+        asked = [(*run, draw) for run in runs for draw in range(sample.draws)]
         for some in (asked[i : i + self._streams] for i in range(0, len(asked), self._streams)):
             self._runtime.reset()
             if after_another:
                 self._call_elsewhere([(numbers[stretch, row], draw) for stretch, row, _, draw in some], draws)
             for step in range(max(last - first for _, first, last, _ in some) + 1):
-                # A part that is over goes on with its last call, for nobody.
+                # A run that is over goes on with its last call, whose answer nobody reads.
                 calls = [(stretch, min(first + step, last), draw) for stretch, first, last, draw in some]
                 going = [i for i, (_, first, last, _) in enumerate(some) if first + step <= last]
                 wanted = [i for i in going if calls[i][:2] in numbers]

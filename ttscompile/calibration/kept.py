@@ -26,8 +26,11 @@ class Kept:
         farthest: how far from the original a plan may be that takes the place of a nearer default.
 
     Attributes:
+        plans: that the artifact will have, by name, and ``default``, the name of the best so far.
         trials: of the artifact with all that is kept.
+        scores: of the plans that were judged, and ``notes`` on how they were found, by name.
         judged: the plans that these scores are of, by name.
+        weights, starts: what plans name that the artifact had not, by name.
         pruner: constants, and the loop whose pruner has them; None where they stay.
         refused: why plans, or all that a proposer proposed, are left out, by name; begins with a verb.
         told: by proposer, a sentence on what became of it.
@@ -89,8 +92,8 @@ class Kept:
             if name != DENSE and self.judged.get(name, before.get(name)) is not plan:
                 self.scores[name] = judge(self.trials, plan)
 
-    def leave(self, plans: Mapping[str, Plan], scores: Mapping[str, Score], default: str) -> None:
-        """Leave these plans alone, and tell of what was given to all plans that none of these has."""
+    def keep_only(self, plans: Mapping[str, Plan], scores: Mapping[str, Score], default: str) -> None:
+        """Have no other plans than these, and tell of what was given to all plans that none of these has."""
         self.plans, self.scores, self.default = dict(plans), dict(scores), default
         for name, fields in self.shared.items():
             if fields and not any(getattr(plan, key) == fields[key] for plan in plans.values() for key in fields):
@@ -119,14 +122,14 @@ class Kept:
             self._share(proposal)
         if not proposal.beside:
             self.learned = True
-            if not self._demotes(proposal, score):
+            if not self._default_stays(proposal, score):
                 self.default = proposal.name
         if self.plan.loop in trials.artifact.manifest.spec.all_loops:
             trials = trials.of_loop(self.plan.loop)  # so that who trains weights learns from its calls
         self.trials = replace(trials, name=self.default)
         return None
 
-    def _demotes(self, proposal: Proposal, score: Score) -> bool:
+    def _default_stays(self, proposal: Proposal, score: Score) -> bool:
         """Whether scores may fall with a plan, and not with the default: then that stays what it is.
 
         A plan that was asked for whatever it costs (a margin without end) becomes the default, with a warning.

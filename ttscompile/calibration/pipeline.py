@@ -14,7 +14,7 @@ from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
 from ..artifact.write import update_plans
 from ..core.coercion import integer
-from ..core.plan import ORIGINAL
+from ..core.plan import ORIGINAL, SCHEDULE
 from ..errors import CalibrationError, CalibrationFailedError
 from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
@@ -29,7 +29,7 @@ from .judge import Score, other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
 from .proposer import LOOPS, Request, Row, rows_of
-from .schedule import FINISHED, SCHEDULE, TIME_LIMIT, Schedule
+from .schedule import FINISHED, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, strategy_of
@@ -199,8 +199,8 @@ def calibrate(
         RuntimeUnavailableError: torch does not have the device.
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
     """
-    elsewhere = ray is not None or device not in (None, "cpu")
-    begun = Clock(wall=elsewhere)
+    wall = ray is not None or device not in (None, "cpu")
+    begun = Clock(wall=wall)
     seed = integer(seed, "seed", CalibrationError)
     rank, updates = integer(rank, "rank", CalibrationError, 1), integer(updates, "updates", CalibrationError, 1)
     if max_intervals is not None:
@@ -213,23 +213,25 @@ def calibrate(
             f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
             " their processors. Leave one of the two out."
         )
-    there = None if device is None else device_of(device)
+    torch_device = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
-    rows, chosen = rows_of(tuple(learn)), strategy_of(strategy)
+    rows, strategy_row = rows_of(tuple(learn)), strategy_of(strategy)
     chooses, anew = LOOPS in learn, any(row.anew for row in rows)
     if chooses:
         require_alone(learn, strategy, target_sparsity, target_flops, max_action_error)
     require_limits(validation_fraction, max_minutes)
     require_directory(Path(path))
     # All the while: a second calibration would undo the first.
-    with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(there):
+    with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(torch_device):
         artifact = load_artifact(Path(path))
         if anew:  # that of an earlier calibration would judge this one's plans
             artifact = replace(artifact, envelope=None)
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
-        request = Request(goal, strategy, correct, max_intervals, rank, updates, max_distance)
+        request = Request(
+            goal, strategy, correct, intervals=max_intervals, rank=rank, updates=updates, margin=max_distance
+        )
         if chooses:  # its bound is of what is chosen in the end, and not of each that learns
             request = replace(request, margin=None, deadline_ms=latency_ms, threads=goal.threads)
             if max_distance is not None:
@@ -240,7 +242,7 @@ def calibrate(
                 raise CalibrationError(reason)
         episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
         corrects = correct or any(row.corrects for row in rows if row.name != SCHEDULE)
-        corrects |= chosen.fits_correction and SCHEDULE in learn
+        corrects |= strategy_row.fits_correction and SCHEDULE in learn
         rate = policy_hz or recorded_rate(trajectories) or (artifact.manifest.calibration or {}).get("policy_hz")
         limits = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
         settings = {
@@ -255,7 +257,7 @@ def calibrate(
             "validation_fraction": validation_fraction,
             "max_distance": max_distance,
             "correct": correct,
-            "device": "cpu" if there is None else str(there),
+            "device": "cpu" if torch_device is None else str(torch_device),
             "max_intervals": max_intervals,
             "rank": rank,
             "updates": updates,
@@ -266,11 +268,11 @@ def calibrate(
         # The number stays whatever time there is to go on.
         limits = limits._replace(usual=state.progress.setdefault("calls", limits.usual))
         before = float(state.progress.get("seconds", 0.0)) + begun.elapsed()
-        clock = Clock(60 * max_minutes, before, elsewhere)
+        clock = Clock(60 * max_minutes, before, wall)
         with Bar(progress) as bar:
-            opened = {"clock": clock, "bar": bar, "pool": pool, "device": there, "limits": limits}
+            opened = {"clock": clock, "bar": bar, "pool": pool, "device": torch_device, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
-            _warn(trials, rows, chosen, corrects)
+            _warn(trials, rows, strategy_row, corrects)
             kept = Kept(trials, anew, FARTHEST if max_distance is None else np.inf)
             takes = np.cumsum([row.takes for row in rows])
             for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
@@ -282,11 +284,11 @@ def calibrate(
                 bar.warn(f"{name!r} is left out: it {reason}")
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
-                kept.leave(frontier.plans, frontier.scores, SCHEDULE)
+                kept.keep_only(frontier.plans, frontier.scores, SCHEDULE)
             else:
                 kept.judge_changed(artifact.plans)
         schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
-        chosen_within = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
+        asked_of_default = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),
             strategy=strategy,
@@ -302,7 +304,7 @@ def calibrate(
             intervals=schedule.intervals,
             stopped=schedule.stopped or (TIME_LIMIT if clock.left() < 0 else FINISHED),
             seconds=clock.elapsed(),
-            budget=chosen_within if chooses else schedule.budget.record(),
+            budget=asked_of_default if chooses else schedule.budget.record(),
             told=kept.told,
             held_out=digest_of([episodes[n] for n in trials.split.validation]),
             frontier=() if frontier is None else frontier.tried,
@@ -333,7 +335,7 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
             f"{short} of {len(trials.episodes)} episodes have fewer than {window} calls, and are left out where"
             f" {window} consecutive ones are learned from."
         )
-    heeds(trials)
+    warn_if_noisy(trials)
     rows_recorded = sum(trials.episodes[n].calls for n in trials.split.calibration)
     if corrects and (count := REPEATS * rows_recorded) < fewest:
         bar.warn(
@@ -342,7 +344,7 @@ def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: boo
         )
 
 
-def heeds(trials: Trials) -> None:
+def warn_if_noisy(trials: Trials) -> None:
     """Warn where the original's answers depend on the noise about as much as on the observation."""
     noise, observed = other_noise(trials), other_observations(trials)
     if len(trials.held_out.answers) > 1 and not noise < UNHEARD * observed:  # of one there is no other
@@ -358,12 +360,11 @@ def _write(path: Path, artifact: Artifact, result: CalibrationResult, kept: Kept
     record = {} if anew else dict(artifact.manifest.calibration or {})
     own = result.record()
     own["plans"] = {**record.get("plans", {}), **own["plans"]}
-    notes = dict(kept.notes)
-    steps = {name: notes[name]["steps"] for name in (SAFE, FAST) if name in notes}
+    steps = {name: kept.notes[name]["steps"] for name in (SAFE, FAST) if name in kept.notes}
     own["learned"] = list(dict.fromkeys([*record.get("learned", []), *own["learned"]]))
     own["told"] = {**record.get("told", {}), **own["told"]}
     more: dict[str, Any] = {key: own[key] for key in ("plans", "learned", "told", "policy_hz") if key in own}
-    record |= {**notes.pop(SCHEDULE, {}), **own, "named_steps": steps} if anew else more
+    record |= {**kept.notes.get(SCHEDULE, {}), **own, "named_steps": steps} if anew else more
     pruner, loop = (None, ORIGINAL) if kept.pruner is None else kept.pruner
     update_plans(
         path,

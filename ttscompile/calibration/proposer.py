@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy.typing as npt
 
 from ..artifact.ceiling import BOUND, FARTHEST
+from ..core.plan import SCHEDULE, Plan
 from ..errors import CalibrationError
 
 if TYPE_CHECKING:
     from ..artifact.load import Artifact
     from ..artifact.manifest import StartRecord
     from ..artifact.stores import BlockWeights
-    from ..core.plan import Plan
     from .budget import Goal
     from .clock import Clock
     from .judge import Score
@@ -176,10 +176,10 @@ LOOPS = "loops"
 
 PROPOSERS = (
     Row(
-        "schedule",
+        SCHEDULE,
         "which steps are computed, with corrections and jumps",
         "calibration.schedule:Schedule",
-        True,
+        corrects=True,
         anew=True,
     ),
     Row(

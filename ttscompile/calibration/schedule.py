@@ -6,7 +6,7 @@ from dataclasses import replace
 from ..artifact.load import Artifact
 from ..artifact.view import View, view_of
 from ..core.lattice import sparsity, uniform_plan
-from ..core.plan import UNIFORM, Plan
+from ..core.plan import SCHEDULE, UNIFORM, Plan
 from ..errors import CalibrationError
 from ..ir.pieces import PRUNER
 from ..ir.plan_head import has_head
@@ -14,7 +14,7 @@ from .budget import ERROR, FLOPS, LATENCY, Goal, cells_of, measure_budget
 from .clock import Clock
 from .judge import Score
 from .proposer import Proposal, Proposals, Proposer, Request
-from .step_counts import SAFE, SHARE, SpacedSchedules, budget_of_error, named_plans
+from .step_counts import BESIDE_SHARE, SAFE, SpacedSchedules, budget_of_error, plans_beside
 from .strategies import FITTED, strategy_of
 from .task import Found, Search, Task
 from .trials import Trials, base_of
@@ -52,7 +52,7 @@ def search_plan(
     number, longest = first, 0.0
     while number < count and not search.done:
         start = clock.elapsed()
-        if number > 0 and not clock.has(longest + search.settling):
+        if number > 0 and not clock.has(longest + search.seconds_to_finish):
             break
         search.advance(number)
         number += 1
@@ -61,7 +61,7 @@ def search_plan(
     return search.found(), number, TIME_LIMIT if clock.cut else FINISHED
 
 
-def searched(
+def resumed_search(
     trials: Trials, search: Search, clock: Clock, most: int | None, name: str = "search"
 ) -> tuple[Found, int, str]:
     """``search_plan`` from where the state is; saved after every interval, under a name."""
@@ -81,9 +81,6 @@ def searched(
 
     return search_plan(search, clock, most, first, save)
 
-
-SCHEDULE = "schedule"
-"""Name in the artifact of the best plan that does not depend on the observation."""
 
 FINISHED, TIME_LIMIT = "finished", "time limit"
 """Why a search stopped."""
@@ -143,10 +140,10 @@ class Schedule(Proposer):
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)
-        share = 1 - SHARE if self._strategy.fits_correction else 1.0
+        share = 1 - BESIDE_SHARE if self._strategy.fits_correction else 1.0
         task = replace(task, budget=budget.cells, clock=clock.until(share))
         search = open_search(request.strategy, task)
-        found, self.intervals, self.stopped = searched(trials, search, task.clock, request.intervals)
+        found, self.intervals, self.stopped = resumed_search(trials, search, task.clock, request.intervals)
         if request.correct:
             found = task.corrected(found)
         while True:
@@ -172,7 +169,7 @@ class Schedule(Proposer):
             self.told += f"; {heard}"
         if found.pruner is not None:
             yield self._of_pruner(plan, found)
-        named, self.skipped = named_plans(crowded, task, self._strategy, budget.cells)
+        named, self.skipped = plans_beside(crowded, task, self._strategy, budget.cells)
         self.stopped = TIME_LIMIT if clock.cut else self.stopped
         for name, one in named.items():
             made = replace(plan, cells=one.schedule, correction=one.correction)
@@ -204,7 +201,7 @@ class Schedule(Proposer):
         made = replace(plan, cells=None, correction=found.pruner_correction)
 
         def refusal(score: Score, others: Mapping[str, Score]) -> str | None:
-            return one_plan(score, self.intervals) or self._refusal(score, others)
+            return learned_nothing(score, self.intervals) or self._refusal(score, others)
 
         return Proposal(PRUNER, made, found.notes, pruner=found.pruner, refusal=refusal)
 
@@ -239,7 +236,7 @@ class Schedule(Proposer):
         return None
 
 
-def one_plan(score: Score, intervals: int) -> str | None:
+def learned_nothing(score: Score, intervals: int) -> str | None:
     """Why a head is left out that makes the same plan for every observation: it has learned nothing."""
     if score.plans > 1:
         return None

@@ -20,7 +20,7 @@ from ..core.lattice import BoolArray, PlanArray, Source
 from ..pool import workers
 from ..runtimes.reference.sampler import correct, features, through
 from .calls import Calls
-from .execute import Executor, State
+from .execute import Executor, StreamCaches
 from .regression import Components, Layers, Solved, fit_jump, solve
 
 STREAMS = 64
@@ -194,7 +194,7 @@ class _Batch:
 
     def __init__(self, executor: Executor, calls: Calls, sums: bool) -> None:
         self._executor, self._calls, self._sums = executor, calls, sums
-        self._state, self._total = State(), calls.initial
+        self._caches, self._total = StreamCaches(), calls.initial
         self._carried = self._before = executor.model.sampler.begin(calls.initial)
         self._k, self._prediction = 0, calls.initial
 
@@ -206,12 +206,12 @@ class _Batch:
     @property
     def held(self) -> list[Tensor]:
         """See ``Place``."""
-        return [*self._carried, self._total, *self._state.timestep.values()]
+        return [*self._carried, self._total, *self._caches.timestep.values()]
 
     def fork(self) -> _Batch:
         """Another one at the same place; what happens to one of the two does not happen to the other."""
         other = copy(self)
-        other._state = self._state.copy()
+        other._caches = self._caches.copy()
         return other
 
     def predict(self, rows: PlanArray, k: int) -> None:
@@ -221,9 +221,9 @@ class _Batch:
         def blocks(k: int, stem: Tensor) -> Tensor:
             if self._sums and rows[0, 0] != Source.COMPUTE:
                 return stem + self._total
-            stream = self._executor.step(rows, k, stem, calls, self._state)
+            stream = self._executor.step(rows, k, stem, calls, self._caches)
             if self._sums:
-                self._total, self._state = stream - stem, State()
+                self._total, self._caches = stream - stem, StreamCaches()
             return stream
 
         self._k, self._prediction = k, model.predict(self._before.sample, k, calls.contexts, blocks)

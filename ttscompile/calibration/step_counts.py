@@ -61,7 +61,7 @@ TRIED = (1.0, 2.0, 3.0, 4.0)
 SAFE, FAST = "safe", "fast"
 """Plans beside the target: one computes twice as many cells, the other half as many; the robot chooses."""
 
-SHARE = 0.2
+BESIDE_SHARE = 0.2
 """Share of the time limit that is kept from the search for these plans."""
 
 
@@ -155,7 +155,7 @@ def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: in
     return replace(goal, cells=high * blocks, measured={"errors": errors})
 
 
-def named_plans(
+def plans_beside(
     crowded: SpacedSchedules, task: Task, strategy: Strategy, cells: int
 ) -> tuple[dict[str, Found], dict[str, str]]:
     """Make ``safe`` and ``fast``, where they can be made: whole steps with a correction fitted on all calls.

@@ -8,8 +8,7 @@ import torch
 
 from ..artifact.view import view_of
 from ..core.plan import Plan
-from ..core.spec import PolicySpec
-from ..pool import Here, Pool, Work, artifact_elsewhere, place_of, workers
+from ..pool import Here, Pool, Work, artifact_arguments, artifact_elsewhere, workers
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
 from .clock import Clock
@@ -68,7 +67,7 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | 
     """
     pool = pool or Here()
     at_once = max(pool.count, torch.get_num_threads()) * TARGETS_AT_ONCE
-    work = Work(executor.run_dense, _dense_elsewhere, where(executor), threads=True)
+    work = Work(executor.run_dense, _dense_elsewhere, executor_arguments(executor), threads=True)
     while begin < calls.count:
         end = min(begin + at_once, calls.count)
         parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
@@ -77,9 +76,9 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | 
         yield torch.cat(found)
 
 
-def where(executor: Executor) -> tuple[str, str, str]:
-    """What ``executor_elsewhere`` takes."""
-    return *place_of(executor.view.artifact), executor.view.variant.loop
+def executor_arguments(executor: Executor) -> tuple[str, str, str]:
+    """The arguments of ``executor_elsewhere``."""
+    return *artifact_arguments(executor.view.artifact), executor.view.variant.loop
 
 
 def executor_elsewhere(path: str, identity: str, loop: str) -> Executor:
@@ -98,17 +97,11 @@ def _dense_elsewhere(path: str, identity: str, loop: str) -> Callable[[Calls], t
 
 
 def draw_calls(
-    executor: Executor,
-    spec: PolicySpec,
-    episodes: Sequence[Episode],
-    split: Split,
-    limit: int,
-    seed: int,
-    window: int = 1,
+    executor: Executor, episodes: Sequence[Episode], split: Split, limit: int, seed: int, window: int = 1
 ) -> Calls:
     """The calls to learn from, without targets: at most ``limit`` of them, in windows of so many.
 
     The seed is that of their choice and of their noise.
     """
     chosen = sample_calls(episodes, split.calibration, limit, seed, REPEATS, window)
-    return prepare_calls(executor.model, spec, episodes, chosen, (seed, 2, 0), window)
+    return prepare_calls(executor.model, executor.view.manifest.spec, episodes, chosen, (seed, 2, 0), window)

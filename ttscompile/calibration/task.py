@@ -62,7 +62,6 @@ class Task:
     budget: int
     seed: int
     pruner: Mapping[str, Array]
-    kinds: tuple[str, ...]
     whole: WholeSteps
     clock: Clock = field(default_factory=Clock)
 
@@ -71,10 +70,8 @@ class Task:
         cls, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None, small: bool = False
     ) -> Task:
         """The task of finding a plan; ``pool`` and ``small`` are those of ``WholeSteps``."""
-        view = executor.view
-        actions, kinds = Actions(view.manifest.spec), tuple(block.kind for block in view.manifest.blocks)
-        whole = WholeSteps(executor, actions, calls, seed, pool, small)
-        return cls(executor, actions, calls, budget, seed, view.pruner, kinds, whole)
+        actions, whole = Actions(executor.view.manifest.spec), WholeSteps(executor, calls, seed, pool, small)
+        return cls(executor, actions, calls, budget, seed, executor.view.pruner, whole)
 
     def draw(self, *stage: int) -> np.random.Generator:
         """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
@@ -129,7 +126,7 @@ class Search(Protocol):
     intervals: int
 
     @property
-    def settling(self) -> float:
+    def seconds_to_finish(self) -> float:
         """Seconds that ``found`` takes, about."""
 
     def advance(self, interval: int) -> None:
@@ -161,7 +158,7 @@ class NothingAfter:
     """What a ``Search`` says that has nothing left to do after its intervals: it keeps its best plan throughout."""
 
     intervals = 1
-    settling = 0.0
+    seconds_to_finish = 0.0
     _interval = 0  # how many were done
 
     @property

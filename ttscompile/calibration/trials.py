@@ -35,13 +35,13 @@ from .regression import envelope_of
 from .state import StateFile
 from .targets import dense_rounds, draw_calls, with_targets
 
-SHARE = 0.5
+ANSWERED_BY = 0.5
 """Share of the time limit after which no more calls to learn from are answered than there have to be."""
 
 DRAWS, MANY_DRAWS, MOST_DRAWS = 4, 16, 64
-"""Of noise for each observation; the second where the artifact has further loops, with half as many observations. Noise
-cannot be paired between samplers. Where two plans answer alike the error of an energy distance falls as the number of
-draws, and only as the root of that of observations. So a small network is asked more often, up to the third."""
+"""Of noise for each observation; the second where the artifact has further loops, with whose samplers no noise can be
+paired. Where two plans answer alike the error of an energy distance falls as the number of draws, and only as the root
+of that of observations. So a small network is asked more often, up to the third."""
 
 OBSERVATIONS = 32
 """That the original answers, at most, of either part."""
@@ -111,9 +111,10 @@ class Trials:
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the number of calls to learn from.
         observations: that the original answers, at most, of either part.
+        name: of the best plan so far.
         draws: of noise for each of them, at least.
-        begun: seconds on the clock from which on calls to learn from are answered.
-        until: share of the clock's limit after which no more of them are answered than there have to be.
+        begun_at: seconds on the clock from which on calls to learn from are answered.
+        until_share: share of the clock's limit after which no more of them are answered than there have to be.
         fresh: whether the artifact holds in memory what it has not in its files.
         state: of the calibration; what the original answers is kept there.
         device: where the network computes; None for the CPU.
@@ -137,8 +138,8 @@ class Trials:
     observations: int = OBSERVATIONS
     name: str = DENSE
     draws: int = DRAWS
-    begun: float = 0.0
-    until: float = SHARE
+    begun_at: float = 0.0
+    until_share: float = ANSWERED_BY
     _calls: dict[int, Calls] = field(default_factory=dict)
     _loops: dict[str, tuple[Plan, Executor, dict[int, Calls]]] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
@@ -193,11 +194,11 @@ class Trials:
 
     def _to_learn_from(self, window: int) -> Calls:
         if window not in self._calls:
-            spec, fewest, loop = self.executor.view.manifest.spec, self.limits.fewest, self.base.loop
+            fewest, loop = self.limits.fewest, self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
             most = self._affordable(name)
-            calls = draw_calls(self.executor, spec, self.episodes, self.split, most, self.seed, window)
-            work = self.state, self.clock.until(self.until), self.bar, self.pool
+            calls = draw_calls(self.executor, self.episodes, self.split, most, self.seed, window)
+            work = self.state, self.clock.until(self.until_share), self.bar, self.pool
             self._calls[window] = with_targets(self.executor, name, calls, fewest, *work)
             if self.clock.left() < 0:
                 self.bar.warn(
@@ -213,7 +214,7 @@ class Trials:
         """
         key = f"{name} drawn"
         if key not in self.state.progress:
-            found = QUICKLY * (self.until * self.clock.limit - self.begun) / _seconds(self.executor.view)
+            found = QUICKLY * (self.until_share * self.clock.limit - self.begun_at) / _seconds(self.executor.view)
             known = name in self.state.get("targets")
             usual, most = self.limits.usual, self.limits.most
             self.state.progress[key] = usual if known else int(np.clip(found, usual, most))

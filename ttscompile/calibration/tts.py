@@ -37,7 +37,7 @@ class Tts:
         self._family = [*spacings(model.steps, self._full), *(others or ())]
         self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)] if others is None else []
         self.intervals = len(self._family) + len(self._moves)
-        self._settled: Found | None = None
+        self._found: Found | None = None
 
     @property
     def plan(self) -> PlanArray:
@@ -47,12 +47,12 @@ class Tts:
     @property
     def done(self) -> bool:
         """Whether the schedule is settled."""
-        return self._settled is not None
+        return self._found is not None
 
     @property
-    def settling(self) -> float:
+    def seconds_to_finish(self) -> float:
         """The correction, if it is not fitted yet."""
-        return 0.0 if self._settled is not None else self._whole.correcting(self._full)
+        return 0.0 if self._found is not None else self._whole.correcting(self._full)
 
     def advance(self, interval: int) -> None:
         """Try a schedule of the family, or two moves of a step."""
@@ -63,7 +63,7 @@ class Tts:
             moves = self._moves[interval - len(self._family) :]
             self._whole.expect(steps for move in moves for steps in self._candidates(*move))  # if none of them helps
             self._try(self._candidates(*moves[0]))
-        if interval + 1 >= len(self._family) + len(self._moves):
+        if interval + 1 >= self.intervals:
             self.found()
 
     def state(self) -> dict[str, Array]:
@@ -71,7 +71,7 @@ class Tts:
         return {
             "steps": np.array(self._steps, np.int64),
             "loss": np.array(self.loss),
-            "settled": np.array(int(self._settled is not None)),
+            "settled": np.array(int(self._found is not None)),
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
@@ -82,9 +82,9 @@ class Tts:
 
     def found(self) -> Found:
         """The schedule with its correction, which is fitted to all calls."""
-        if self._settled is None:
-            self._settled = self._task.whole_steps(self._steps)
-        return self._settled
+        if self._found is None:
+            self._found = self._task.whole_steps(self._steps)
+        return self._found
 
     def _candidates(self, distance: int, i: int) -> list[tuple[int, ...]]:
         """The schedules with the i-th step moved in either direction, where it can be."""

@@ -15,7 +15,7 @@ from .calls import Actions, Calls, IntArray, calls_of
 from .clock import Clock
 from .execute import Executor
 from .sparse_loop import Place, SparseLoop, anchors_of, fit_correction
-from .targets import executor_elsewhere, where
+from .targets import executor_arguments, executor_elsewhere
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -60,20 +60,14 @@ class WholeSteps:
     """Seconds that a comparison took, for each step that its schedule computes; the most so far."""
 
     def __init__(
-        self,
-        executor: Executor,
-        actions: Actions,
-        calls: Calls,
-        seed: int,
-        pool: Pool | None = None,
-        small: bool = False,
+        self, executor: Executor, calls: Calls, seed: int, pool: Pool | None = None, small: bool = False
     ) -> None:
-        self._executor, self._actions, self._calls = executor, actions, calls
+        self._executor, self._actions, self._calls = executor, Actions(executor.view.manifest.spec), calls
         self._reading: dict[int, bool] = {}
         self._known: dict[tuple[int, ...], Errors] = {}
         self._runs: dict[bool | None, ScheduleRuns] = {}
         self._pool = pool or Here()
-        self._work = Work(self.measured, _measured_elsewhere, (*where(executor), calls, seed, small))
+        self._work = Work(self.measured, _measured_elsewhere, (*executor_arguments(executor), calls, seed, small))
         self._seed, self._small = seed, small
         self._fitted, self._compared = self._divided(0, SMALL_SHARE if small else FITTED_SHARE)
 
@@ -123,7 +117,7 @@ class WholeSteps:
         """The errors of a schedule, and ``_pace``: what is done for a candidate, wherever that is."""
         reads = self.reads(len(steps))
         clock = Clock()
-        errors = min((self._error_of(steps, with_) for with_ in (reads, None)), key=lambda found: found.normalised)
+        errors = min((self._error_with(steps, with_) for with_ in (reads, None)), key=lambda found: found.normalised)
         self._pace = max(self._pace, clock.elapsed() / len(steps))
         return errors, self._pace
 
@@ -139,7 +133,7 @@ class WholeSteps:
         tried = (
             self._executor.corrected(one).run(_plans(plan, self._compared), self._compared) for one in (fitted, None)
         )
-        corrected, plain = (self._errors(samples, self._compared) for samples in tried)
+        corrected, plain = (self._errors_of(samples, self._compared) for samples in tried)
         if plain.normalised <= corrected.normalised:
             return None
         return fit_correction(self._executor, plans, self._calls, reads)
@@ -157,7 +151,7 @@ class WholeSteps:
             more = max(0, min(count - 1, len(halving)))
             tried = [(0, *some) for some in (halving[:more], halving[len(halving) - more :])]
             best = {
-                reads: min(self._error_of(steps, reads).normalised for steps in tried) + self._on_others(tried, reads)
+                reads: min(self._error_with(steps, reads).normalised for steps in tried) + self._on_others(tried, reads)
                 for reads in (True, False)
                 if len(np.unique(self._fitted.episodes)) > 1
             }
@@ -171,16 +165,16 @@ class WholeSteps:
             fitted, compared = self._divided(part, FITTED_SHARE)
             loop = SparseLoop(self._executor, fitted, compared, reads=reads, whole=True)
             runs = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
-            total += min(self._errors(runs.end(steps).samples, compared).normalised for steps in tried)
+            total += min(self._errors_of(runs.end(steps).samples, compared).normalised for steps in tried)
         return total
 
-    def _error_of(self, steps: Sequence[int], reads: bool | None) -> Errors:
+    def _error_with(self, steps: Sequence[int], reads: bool | None) -> Errors:
         """Errors of a schedule with a correction that may, or may not, read the observation; None: without one."""
         if reads not in self._runs:
             fitted = None if reads is None else self._fitted
             loop = SparseLoop(self._executor, fitted, self._compared, reads=bool(reads), whole=True)
             self._runs[reads] = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
-        return self._errors(self._runs[reads].end(steps).samples, self._compared)
+        return self._errors_of(self._runs[reads].end(steps).samples, self._compared)
 
     def told_of_episodes(self, steps: Sequence[int]) -> str:
         """Whether more recorded episodes may pay for a schedule: a clause; empty where too few say nothing.
@@ -194,7 +188,7 @@ class WholeSteps:
         count, reads = min(len(half), self._fitted.count), self.reads(len(steps))
         parts = (self._executor.select(self._calls, some[:count]) for some in (half, every))
         loops = (SparseLoop(self._executor, part, self._compared, reads=reads, whole=True) for part in parts)
-        before, now = (self._errors(one.end(self.plan(steps)).samples, self._compared).normalised for one in loops)
+        before, now = (self._errors_of(one.end(self.plan(steps)).samples, self._compared).normalised for one in loops)
         gain = max(before - now, 0.0) / max(before, 1e-30)  # 0 where nothing is left
         told = f"learned from {len(episodes)} it is {gain:.0%} nearer than learned from half of them"
         return f"more episodes {'may' if gain >= WORTH else 'would hardly'} pay: {told}"
@@ -208,7 +202,7 @@ class WholeSteps:
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + 2 * share) * self.comparing(full_steps)  # without jumps, and with them
 
-    def _errors(self, samples: Tensor, of: Calls) -> Errors:
+    def _errors_of(self, samples: Tensor, of: Calls) -> Errors:
         normalised, units = (float(self._actions.errors(samples, of.targets, units=u).mean()) for u in (False, True))
         return Errors(normalised, units)
 
@@ -217,7 +211,7 @@ def _measured_elsewhere(
     path: str, identity: str, loop: str, calls: Calls, seed: int, small: bool
 ) -> Callable[[Sequence[int]], tuple[Errors, float]]:
     executor = executor_elsewhere(path, identity, loop)
-    return WholeSteps(executor, Actions(executor.view.manifest.spec), calls, seed, small=small).measured
+    return WholeSteps(executor, calls, seed, small=small).measured
 
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:

@@ -15,6 +15,7 @@ from ttscompile.cli.output import manifest_of, only_results_on_stdout
 from ttscompile.cli.sections import Recordings, SectionedCommand, Sources, require_recordings, trajectories_options
 from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
+from ttscompile.core.plan import SCHEDULE
 
 
 @click.command(cls=SectionedCommand)
@@ -23,7 +24,7 @@ from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, SHARE, TEXT
 @options.names_option(
     "--learn",
     LEARNED,
-    default="schedule",
+    default=SCHEDULE,
     help=f"Learn these, in this order: {'; '.join(f'{one.name}: {one.what}' for one in PROPOSERS)}.",
 )
 @options.number_option(

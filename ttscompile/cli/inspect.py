@@ -16,19 +16,17 @@ from ttscompile.cli.sections import Recordings, Section, SectionedCommand, Sourc
 from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import PAGE_OR_PICTURE, PAGES, TEXT
 from ttscompile.core.lattice import PlanArray
+from ttscompile.core.plan import SCHEDULE
 from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
 from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
-from ttscompile.report import Given, Section as OfPage, build, render, verified
+from ttscompile.report import Extras, Section as OfPage, build, render, verified
 from ttscompile.report.build import NOT_RUN
 from ttscompile.report.page import require_packages
 from ttscompile.report.usage import run_episode
 from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode, episodes_of
-
-SCHEDULE = "schedule"
-"""Name that calibration gives to its best plan that does not depend on the observation."""
 
 SECTIONS = (
     Section("What a page or a picture shows of an episode", ("trajectories", "sources"), ("output",)),
@@ -85,7 +83,7 @@ def inspect(
             if verifies:
                 passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
             policy = open_policy(artifact, seed=0)
-            told = write_page(page, artifact, policy, Given(episode, section), status.update)
+            told = write_page(page, artifact, policy, Extras(episode, section), status.update)
         say(console, told)
     if picture is not None:
         name = name or _drawn_by_default(artifact, episode)
@@ -134,14 +132,14 @@ def require_page(path: Path) -> None:
 
 
 def write_page(
-    path: Path, artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None]
+    path: Path, artifact: Artifact, policy: CompiledPolicy, extras: Extras, progress: Callable[[str], None]
 ) -> str:
     """Write the page; it replaces another one only when it is whole.
 
     Args:
         path: see ``require_page``.
         policy: the same, with a seed; its calls are timed now.
-        given: what the page shows beside the artifact.
+        extras: what the page shows beside the artifact.
 
     Returns:
         What was written, for people.
@@ -149,7 +147,7 @@ def write_page(
     Raises:
         OutputError: it cannot be written.
     """
-    page = render(build(artifact, policy, given, progress))
+    page = render(build(artifact, policy, extras, progress))
     try:
         replace_file(path, page.encode())
     except OSError as error:

@@ -23,6 +23,8 @@ DENSE = "dense"
 """The plan that is the original policy: its loop, its weights, every cell computed. Every artifact has it."""
 FULL = "full"
 """The plan that computes every cell of the loop, and in the precision, that ``convert`` was asked for."""
+SCHEDULE = "schedule"
+"""The best plan of a calibration that does not depend on the observation; and the proposer that finds such plans."""
 UNIFORM = "uniform"
 """The plan that calibration adds for comparisons alone: as many steps computed, evenly spaced. Not for a robot."""
 

@@ -3,7 +3,7 @@
 A document that is not what it should be is a ``ReportError``; without matplotlib and Jinja2 there is no page.
 """
 
-from .build import Given, build, verified
+from .build import Extras, build, verified
 from .page import Page, Picture, Section, Table, render
 
-__all__ = ["Given", "Page", "Picture", "Section", "Table", "build", "render", "verified"]
+__all__ = ["Extras", "Page", "Picture", "Section", "Table", "build", "render", "verified"]

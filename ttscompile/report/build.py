@@ -15,10 +15,10 @@ from ..measure.units import ms, share
 from ..plots.figure import encoded
 from ..plots.frontier import plot_frontier
 from ..plots.maps import plot_errors
-from ..report import facts, pictures, usage
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
 from ..verification import Verification
+from . import facts, pictures, usage
 from .page import Page, Picture, Section, Table, require_packages
 from .pictures import plain
 from .timing import Measurement, latency, measure_plans
@@ -31,7 +31,7 @@ MOST_PICTURES = 6
 
 
 @dataclass(frozen=True)
-class Given:
+class Extras:
     """What a report shows beside the artifact.
 
     Attributes:
@@ -45,13 +45,13 @@ class Given:
 
 
 def build(
-    artifact: Artifact, policy: CompiledPolicy, given: Given, progress: Callable[[str], None] = lambda what: None
+    artifact: Artifact, policy: CompiledPolicy, extras: Extras, progress: Callable[[str], None] = lambda what: None
 ) -> Page:
     """Measure what has to be measured, draw, and put the page together.
 
     Args:
         policy: the same, with its default runtime and a seed.
-        given: what the report shows beside the artifact.
+        extras: what the report shows beside the artifact.
 
     Raises:
         RuntimeUnavailableError: matplotlib or Jinja2 is not installed.
@@ -59,11 +59,11 @@ def build(
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")
-    measured = measure_plans(policy, manifest.spec, (DENSE, *manifest.plans), given.calls)
+    measured = measure_plans(policy, manifest.spec, (DENSE, *manifest.plans), extras.calls)
     course = None
-    if given.episode is not None:
+    if extras.episode is not None:
         progress("running an episode")
-        course = run_episode(policy, given.episode)
+        course = run_episode(policy, extras.episode)
     progress("drawing")
     frontier = _frontier(artifact, measured)
     chosen = facts.chosen(manifest.calibration or {})  # of a build, whose page begins with what it tried
@@ -78,7 +78,7 @@ def build(
         _latency(measured, manifest.default_plan),
         *[frontier] * (not chosen),
         _calibration(manifest),
-        given.verification,
+        extras.verification,
         facts.limits(artifact),
     )
     machine = fingerprint()
@@ -89,7 +89,7 @@ def build(
         figures=_figures(artifact, measured),
         sections=sections,
         foot=f"Made by ttscompile {machine.get('ttscompile', '')} from identity {manifest.identity}. Times: medians of"
-        f" {given.calls} calls on {one_line(machine)}.",
+        f" {extras.calls} calls on {one_line(machine)}.",
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.manifest import MANIFEST, Manifest
 from ..core.paths import HUB
-from ..core.plan import DENSE
+from ..core.plan import DENSE, SCHEDULE
 from ..core.spec import WITHOUT
 from ..core.untrusted_json import parse_json
 from ..errors import ReportError
@@ -187,7 +187,7 @@ def _made(manifest: Manifest, base: HubName | None) -> Section:
         goals = ("target_sparsity", "target_flops", "latency_ms", "max_action_error", "max_distance")
         asked = {key: budget[key] for key in goals if budget.get(key) is not None}
         words = " ".join(f"--{k.replace('_', '-')} {_word(v)}" for k, v in (asked | told).items())
-        if (learned := record.get("learned", [])) not in ([], ["schedule"]):
+        if (learned := record.get("learned", [])) not in ([], [SCHEDULE]):
             words += f" --learn {','.join(map(_word, learned[:8]))}"
         lines.append(f"ttscompile calibrate DIR --trajectories CALLS {words}")
     lines.append("ttscompile verify DIR")

@@ -181,9 +181,9 @@ def timing_remarks(measured: Sequence[Measurement]) -> str:
     return " ".join(told)
 
 
-def latency(measured: Sequence[Measurement], default: str, threads: int = 1) -> Section:
-    """What calls take on this machine."""
-    on = f"{threads} thread{'s' * (threads != 1)}; {one_line(fingerprint())}"
+def latency(measured: Sequence[Measurement], default: str) -> Section:
+    """What calls of a policy with one thread take on this machine."""
+    on = f"1 thread; {one_line(fingerprint())}"
     return Section("Latency", (timing_remarks(measured), on), (timing_table(measured, default),))
 
 

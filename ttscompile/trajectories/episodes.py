@@ -126,22 +126,21 @@ def local_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _read(
-    given_path: str | os.PathLike[str],
+    recording: str | os.PathLike[str],
     observations: Mapping[str, ObservationSpec],
     action_steps: int,
-    given: Mapping[str, Sequence[str]],
+    sources: Mapping[str, Sequence[str]],
     instruction: Instruction | None,
-    read: ReadTokenizer | None,
+    tokenizer: ReadTokenizer | None,
 ) -> list[Episode]:
-    path, limits = local_path(given_path), {"most": MOST_EPISODES} if on_hub(given_path) else {}
-    sources = {key: parts for key, parts in given.items() if key != TASK}
-    asked = TASK in given
-    if asked and instruction is None:
-        told = f"{given[TASK][0]}: this policy takes no text that alone would give its tokens. Leave the tokenizer out"
+    path, limits = local_path(recording), {"most": MOST_EPISODES} if on_hub(recording) else {}
+    folder, sources = sources.get(TASK), {key: parts for key, parts in sources.items() if key != TASK}
+    if folder is not None and instruction is None:
+        told = f"{folder[0]}: this policy takes no text that alone would give its tokens. Leave the tokenizer out"
         raise TrajectoryError(f"{told}, and record tokens if it observes any.")
-    read = partial(Tokenizer, given[TASK][0]) if asked else read
-    other, held, frames = _opened(path, limits, sorted({*array_names(observations, sources), TASK}))
-    words = instruction if asked or (read and _in_text_alone(held, instruction, sources)) else None
+    tokenizer = tokenizer if folder is None else partial(Tokenizer, folder[0])
+    kind, held, frames = _opened(path, limits, sorted({*array_names(observations, sources), TASK}))
+    words = instruction if folder is not None or (tokenizer and _in_text_alone(held, instruction, sources)) else None
     seen = {key: spec for key, spec in observations.items() if words is None or key not in (words.tokens, words.mask)}
     used = array_names(seen, sources) | ({TASK} if words else set())
     if sources and not frames:
@@ -150,13 +149,13 @@ def _read(
     if unknown := sorted(set(sources) - set(observations)):
         raise TrajectoryError(f"the policy observes {sorted(observations)}; found arrays for {unknown}.")
     ends = _ends(path, held.ends)
-    if other == "lerobot" and all((spec.frames or 1) == 1 for spec in observations.values()):
+    if kind == "lerobot" and all((spec.frames or 1) == 1 for spec in observations.values()):
         held, action_steps = frames_of_calls(held, action_steps), 1
         ends = _ends(path, held.ends)
     arrays = observation_frames(path, held, seen, sources)
-    if words and read:
-        arrays |= instruction_rows(path, held, words, observations, read, arrays)
-    if other is None and (extra := sorted(set(held.names) - used)):
+    if words and tokenizer:
+        arrays |= instruction_rows(path, held, words, observations, tokenizer, arrays)
+    if kind is None and (extra := sorted(set(held.names) - used)):
         warnings.warn(f"{path}: arrays {extra} are no keys of the observation, and are not used.", stacklevel=4)
     rows = {len(arrays[key]) if arrays[key].ndim else 0 for key in observations}
     if len(rows) != 1:
@@ -183,9 +182,10 @@ def array_names(keys: Iterable[str], sources: Mapping[str, Sequence[str]]) -> se
     return {part.partition(":")[0] for key in keys for part in sources.get(key, (key,))}
 
 
-def _in_text_alone(held: Frames, told: Instruction | None, sources: Mapping[str, Sequence[str]]) -> bool:
+def _in_text_alone(held: Frames, instruction: Instruction | None, sources: Mapping[str, Sequence[str]]) -> bool:
     """Whether a recording says the task in words, and has no tokens of them, nor what they are to be made of."""
-    return told is not None and TASK in held.names and {told.tokens, told.mask}.isdisjoint({*held.names, *sources})
+    names = {*held.names, *sources}
+    return instruction is not None and TASK in held.names and names.isdisjoint((instruction.tokens, instruction.mask))
 
 
 def recorded_names(path: Path) -> tuple[list[str], bool]:
@@ -195,10 +195,10 @@ def recorded_names(path: Path) -> tuple[list[str], bool]:
 
 
 def _opened(path: Path, limits: Mapping[str, int], wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
-    """What a file is that is no ``.npz``, what it holds, and whether that is frames."""
+    """What a recording is (None for an ``.npz``), what it holds, and whether its rows are frames."""
     require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
-    other = other_format(path)
-    return other, *(_npz(path) if other is None else (sandboxed_frames(path, other, wanted, **limits), True))
+    kind = other_format(path)
+    return kind, *(_npz(path) if kind is None else (sandboxed_frames(path, kind, wanted, **limits), True))
 
 
 def _npz(path: Path) -> tuple[Frames, bool]:
@@ -251,7 +251,7 @@ def read_npz(path: Path, only: str = "") -> dict[str, Array]:
 
 
 def other_format(path: Path) -> str | None:
-    """What a recording is that is no ``.npz``."""
+    """``zarr``, ``hdf5`` or ``lerobot``; None for what can only be an ``.npz``."""
     name = path.name.lower()
     if not path.exists():
         return None

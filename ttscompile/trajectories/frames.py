@@ -209,16 +209,16 @@ def one_error(what: str, hint: str = "") -> Iterator[None]:
 def instruction_rows(
     path: Path,
     held: Frames,
-    told: Instruction,
+    instruction: Instruction,
     observations: Mapping[str, ObservationSpec],
-    read: ReadTokenizer,
+    tokenizer: ReadTokenizer,
     others: Mapping[str, Array],
 ) -> dict[str, Array]:
     """Tokens and mask of every row, from its text.
 
     Args:
         held: what it holds: ``task``, texts ``[F]`` or their bytes ``[F, L]``.
-        read: gives the policy's tokenizer.
+        tokenizer: gives the policy's tokenizer.
         others: by key the other observations, ``[F, ...]``, of which the instruction may hold the state.
 
     Returns:
@@ -232,15 +232,16 @@ def instruction_rows(
         texts = np.ascontiguousarray(texts).view(f"S{texts.shape[1]}")[:, 0]
     if texts.dtype.kind not in "US" or texts.ndim != 1:
         raise TrajectoryError(f"{path}: {TASK!r} is {texts.dtype}{list(texts.shape)}; expected texts [F].")
-    made, length = read(TrajectoryError), observations[told.tokens].shape[-1]
+    made, length = tokenizer(TrajectoryError), observations[instruction.tokens].shape[-1]
     lines = [each.decode(errors="replace") if isinstance(each, bytes) else each for each in texts.tolist()]
     states = [""] * len(lines)
-    if told.state is not None:
-        rows, numbers = _flat(path, told.state.key, others[told.state.key]), len(told.state.first)
+    if instruction.state is not None:
+        rows, numbers = _flat(path, instruction.state.key, others[instruction.state.key]), len(instruction.state.first)
         if rows.shape != (len(lines), numbers):
             expected = f"expected {[len(lines), numbers]}, a state for each text"
-            raise TrajectoryError(f"{path}: {told.state.key!r} is {list(rows.shape)}; {expected}.")
-        states = list(map(told.state, rows.astype(np.float32)))
-    known = {one: made.of_task(one[0], told, length, one[1]) for one in dict.fromkeys(zip(lines, states, strict=True))}
-    tokens, mask = padded([known[one] for one in zip(lines, states, strict=True)], length)
-    return {told.tokens: tokens, told.mask: mask}
+            raise TrajectoryError(f"{path}: {instruction.state.key!r} is {list(rows.shape)}; {expected}.")
+        states = list(map(instruction.state, rows.astype(np.float32)))
+    pairs = list(zip(lines, states, strict=True))
+    known = {(text, state): made.of_task(text, instruction, length, state) for text, state in dict.fromkeys(pairs)}
+    tokens, mask = padded([known[one] for one in pairs], length)
+    return {instruction.tokens: tokens, instruction.mask: mask}

@@ -33,12 +33,12 @@ def recorded_rate(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str
 
 def rate_of(path: Path) -> float | None:
     """The same of one recording, which is on this machine."""
-    said, name, other = dict[str, Any](), "policy_hz", other_format(path)
-    if other == "lerobot":
+    said, name, kind = dict[str, Any](), "policy_hz", other_format(path)
+    if kind == "lerobot":
         name = "fps"
         with one_error(f"{path}: meta/info.json cannot be read"):
             said = dict(parse_json((path / "meta" / "info.json").read_bytes(), MAX_INFO))
-    elif other is None:
+    elif kind is None:
         said = meta_of(path, read_npz(path, META).get(META))
     rate = said.get(name)
     if rate is not None and (type(rate) not in (int, float) or not 0 < rate < 1e6):

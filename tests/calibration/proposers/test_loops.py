@@ -35,7 +35,7 @@ from ttscompile.core.plan import DENSE, ORIGINAL, Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.measure.timer import Times
 from ttscompile.pool import Pool
-from ttscompile.report import Given, build
+from ttscompile.report import Extras, build
 from ttscompile.report.facts import chosen as chosen_of
 
 from .trying import request, trials_of
@@ -221,7 +221,7 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     assert chosen_of({}) == ()
     policy = ttscompile.load(directory)
     assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
-    page = build(artifact, policy, Given(calls=1))
+    page = build(artifact, policy, Extras(calls=1))
     assert told in page.lead
     first = page.sections[0]
     assert len(first.pictures) == 1 and "The plans that the build chose among" in first.text[0]

@@ -19,7 +19,7 @@ from ttscompile.calibration.kept import Kept, holding
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers import start
-from ttscompile.calibration.proposers.start import NAME, Start, begun, candidates
+from ttscompile.calibration.proposers.start import NAME, Start, candidates, warm_proposal
 from ttscompile.calibration.trials import LEARNED, Trials
 from ttscompile.core.lattice import Source, dense_plan, whole_steps_plan
 from ttscompile.core.plan import FULL, Plan
@@ -115,13 +115,13 @@ def test_the_fewest_cells_within_the_margin_are_taken(trials: Trials, monkeypatc
 
 
 def test_a_later_start_keeps_more_of_the_chunk(trials: Trials) -> None:
-    few, many = (begun(trials.base, n, dense_plan(n, len(trials.artifact.manifest.blocks))) for n in (1, 4))
+    few, many = (warm_proposal(trials.base, n, dense_plan(n, len(trials.artifact.manifest.blocks))) for n in (1, 4))
     scores = [judge(holding(trials, one), one.plan, LEARNED) for one in (few, many)]
     assert scores[0].distance > max(scores[1].distance, 0.1)
 
 
 def test_a_plan_that_begins_so_already_is_made_anew(trials: Trials) -> None:
-    warm = begun(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
+    warm = warm_proposal(trials.base, 3, dense_plan(3, len(trials.artifact.manifest.blocks)))
     found = first(Start(request(margin=1e6)), holding(trials, warm), warm.plan)
     assert found.plan.otherwise is trials.base
     assert described(found) == (1, [0])

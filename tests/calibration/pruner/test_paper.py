@@ -141,7 +141,7 @@ def test_an_artifact_executes_it(
     """This is about what is executed: no head learns in so few updates, so every one is kept."""
     monkeypatch.setattr(Paper, "intervals", 8)
     monkeypatch.setattr(schedule, "BETTER", 10.0)
-    monkeypatch.setattr(schedule, "one_plan", lambda score, intervals: None)
+    monkeypatch.setattr(schedule, "learned_nothing", lambda score, intervals: None)
     monkeypatch.setattr(Kept, "_no_better", lambda *_: None)
     directory = Path(shutil.copytree(compiled, tmp_path / "compiled"))
     recording = record(tmp_path / "calls.npz", episodes=24)

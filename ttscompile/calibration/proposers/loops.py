@@ -33,7 +33,7 @@ from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
-from ..schedule import open_search, searched
+from ..schedule import open_search, resumed_search
 from ..step_counts import COUNTS, TRIED, SpacedSchedules
 from ..task import Found, Task
 from ..trials import Trials
@@ -146,17 +146,17 @@ class Loops(Proposer):
         if small and clock.left() > 0:
             task = replace(Task.of(own.executor, calls, 0, own.seed, own.pool, small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
-        further = False
+        reached = False  # what is wanted; then one number of steps more is tried
         for number, count in enumerate(counts):
             if number and clock.left() <= 0:
                 clock.cut = True
                 break
             share = _ending(clock, clock.left() / (len(counts) - number))
             search = open_search("tts", replace(task, clock=share, budget=count * own.executor.model.blocks))
-            found = searched(own, search, share, None, f"search, {loop}, {count} steps")[0]
+            found = resumed_search(own, search, share, None, f"search, {loop}, {count} steps")[0]
             yield from self._judged(self._proposal(task, loop, count, found), cost.of(count))
-            further, enough = self._reached(loop, count, wanted), further
-            if enough or (further and wanted < self._bound):
+            before, reached = reached, self._reached(loop, count, wanted)
+            if before or (reached and wanted < self._bound):
                 break
 
     def _crowded(
@@ -168,8 +168,8 @@ class Loops(Proposer):
         crowded = SpacedSchedules(task.whole, own.state, task.clock, own.bar, f"crowded, {loop}")
         counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
         apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
-        hopeless, further = HOPELESS * (wanted if safer else self._farthest) * apart, False
-        hopeful: list[int] = []
+        hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
+        hopeful, reached = list[int](), False
         for number, count in enumerate(counts):
             if number and (task.clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
                 break
@@ -181,8 +181,8 @@ class Loops(Proposer):
                 continue
             hopeful.append(count)
             yield from self._judged(self._proposal(task, loop, count, task.whole_steps(quick.steps)), cost.of(count))
-            further, enough = self._reached(loop, count, wanted), further
-            if enough or (further and safer):
+            before, reached = reached, self._reached(loop, count, wanted)
+            if before or (reached and safer):
                 break
         return hopeful
 
@@ -216,8 +216,8 @@ class Loops(Proposer):
 
     def _opened(self, trials: Trials, loop: str, seconds: float) -> Trials:
         limit, now = trials.clock.limit, trials.clock.elapsed()
-        until = (now + ANSWERING * seconds) / limit if np.isfinite(limit) else 1.0
-        own = replace(trials.of_loop(loop), begun=now, until=until)
+        until_share = (now + ANSWERING * seconds) / limit if np.isfinite(limit) else 1.0
+        own = replace(trials.of_loop(loop), begun_at=now, until_share=until_share)
         minutes = max(seconds, 1.0) / 60 if np.isfinite(seconds) else 1e3
         limits = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
         usual = own.state.progress.setdefault(f"most of {loop}", limits.usual)

@@ -16,7 +16,7 @@ from ..clock import Clock
 from ..judge import Score
 from ..proposer import Proposal, Proposals, Proposer
 from ..pruner.paper import Paper
-from ..schedule import one_plan, searched
+from ..schedule import learned_nothing, resumed_search
 from ..task import Task
 from ..trials import Trials, base_of
 
@@ -40,14 +40,14 @@ class Pruner(Proposer):
         computed = int((cells == Source.COMPUTE).sum())
         task = Task.of(trials.executor, trials.windows, computed, trials.seed, trials.pool)
         search = Paper(replace(task, clock=clock))
-        found, updates, _ = searched(trials, search, clock, self.request.intervals, PRUNER)
+        found, updates, _ = resumed_search(trials, search, clock, self.request.intervals, PRUNER)
         self.told = f"{updates} updates; its best head is {found.error:.4g} off on calls that it was not trained on"
         share = float(np.mean(cells != Source.COMPUTE))
 
         def refusal(score: Score, others: Mapping[str, Score]) -> str | None:
             if score.sparsity < share - 1e-9:
                 return f"reuses {score.sparsity:.4f} of the cells on held-out calls; the schedule reuses {share:.4f}."
-            return one_plan(score, updates)
+            return learned_nothing(score, updates)
 
         made = replace(plan, cells=None, correction=None)
         yield Proposal(PRUNER, made, {**found.notes, "updates": updates}, pruner=found.pruner, refusal=refusal)

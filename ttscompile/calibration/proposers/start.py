@@ -77,11 +77,11 @@ def candidates(artifact: Artifact, plan: Plan) -> list[Proposal]:
         if plan.cells is not None:
             rests.append(plan.cells[-last:].copy())
             rests[-1][0] = Source.COMPUTE
-        found |= {rest.tobytes(): begun(plan, last, rest) for rest in rests}
+        found |= {rest.tobytes(): warm_proposal(plan, last, rest) for rest in rests}
     return sorted(found.values(), key=lambda one: np.count_nonzero(one.plan.cells == Source.COMPUTE))
 
 
-def begun(plan: Plan, last: int, cells: PlanArray) -> Proposal:
+def warm_proposal(plan: Plan, last: int, cells: PlanArray) -> Proposal:
     """A plan whose calls begin with the chunk before, and compute these cells of the last steps of the plan's loop."""
     loop = f"{plan.loop}-last-{last}"
     warm = replace(plan, loop=loop, cells=cells, correction=None, otherwise=plan)

@@ -32,7 +32,7 @@ from ...pool import workers
 from ...runtimes.reference.sampler import Carried
 from ..calls import Actions, Calls, IntArray
 from ..clock import Clock
-from ..execute import Executor, State, last
+from ..execute import Executor, StreamCaches, last
 from ..kept import holding
 from ..proposer import Proposal, Proposals, Proposer
 from ..sparse_loop import fit_correction
@@ -209,13 +209,13 @@ class Student:
 
     def _loop(self, calls: Calls, since: tuple[int, Carried] | None = None) -> Iterator[Carried]:
         """The sparse loop, whole or from a step on; idle steps add what the last computed one did."""
-        state, total = State(), calls.initial
+        caches, total = StreamCaches(), calls.initial
 
         def blocks(k: int, stem: Tensor) -> Tensor:
             nonlocal total
             if not self._computed[k]:
                 return stem + total
-            stream = self.executor.step(self._cells[k][None], k, stem, calls, state)
+            stream = self.executor.step(self._cells[k][None], k, stem, calls, caches)
             total = stream - stem
             return stream
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...core.lattice import BoolArray, PlanArray, Source
 from ...runtimes.reference.reuse import Caches, Cell, reuse
 from ..calls import Calls, IntArray
-from ..execute import Executor, State, latest_before
+from ..execute import Executor, StreamCaches, latest_before
 
 BYTES = 2**28
 """Memory for what the blocks compute in the dense calls, as bfloat16. It decides how many calls are learned from."""
@@ -31,11 +31,11 @@ class Practice:
         self._executor = executor
         self.calls = executor.select(calls, np.arange(windows * calls.window))
         self._dense: list[list[Tensor]] = []
-        state, whole = State(), np.full((1, model.blocks), Source.COMPUTE, np.int8)
+        caches, whole = StreamCaches(), np.full((1, model.blocks), Source.COMPUTE, np.int8)
 
         def blocks(k: int, stem: Tensor) -> Tensor:
-            stream = executor.step(whole, k, stem, self.calls, state)
-            self._dense.append([state.timestep[b].to(torch.bfloat16) for b in range(model.blocks)])
+            stream = executor.step(whole, k, stem, self.calls, caches)
+            self._dense.append([caches.timestep[b].to(torch.bfloat16) for b in range(model.blocks)])
             return stream
 
         with torch.no_grad():
