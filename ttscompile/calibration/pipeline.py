@@ -233,7 +233,7 @@ def calibrate(
             goal, strategy, correct, intervals=max_intervals, rank=rank, updates=updates, margin=max_distance
         )
         if chooses:  # its bound is of what is chosen in the end, and not of each that learns
-            request = replace(request, margin=None, deadline_ms=latency_ms, threads=goal.threads)
+            request = replace(request, margin=None, deadline_ms=latency_ms, by_time=True, threads=goal.threads)
             if max_distance is not None:
                 request = replace(request, bound=max_distance, farthest=max_distance)
         made = [(row, row.make(request)) for row in rows]

@@ -85,6 +85,7 @@ class Request:
         bound: distance from the original that the default may have, see ``near``; for who chooses among loops.
         farthest: that any plan may have, and the default where none is within ``bound``.
         deadline_ms: of a call, for the same; None for the fastest that is near enough.
+        by_time: whether plans are chosen by what they take, so that what makes no call faster need not be tried.
     """
 
     goal: Goal
@@ -97,6 +98,7 @@ class Request:
     bound: float = BOUND
     farthest: float = FARTHEST
     deadline_ms: float | None = None
+    by_time: bool = False
     threads: int = 1
 
 

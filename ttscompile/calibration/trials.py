@@ -44,7 +44,8 @@ paired. Where two plans answer alike the error of an energy distance falls as th
 of that of observations. So a small network is asked more often, up to the third."""
 
 OBSERVATIONS = 32
-"""That the original answers, at most, of either part."""
+"""That the original answers, at most, of either part; with further loops half as many of what is learned from, since
+only precisions and tokens are chosen on that."""
 
 FEWEST_OBSERVATIONS = 4
 """That it answers whatever the time."""
@@ -157,7 +158,7 @@ class Trials:
     ) -> Trials:
         """Divide the episodes, and open the policy; ``others`` are further fields."""
         if artifact.manifest.spec.loops:
-            others |= {"observations": max(others.get("observations", OBSERVATIONS) // 2, 1), "draws": MANY_DRAWS}
+            others |= {"draws": MANY_DRAWS}
         base = base_of(artifact)
         executor = Executor(view_of(artifact, base.exact), others.get("device"))
         split = split_episodes(len(episodes), fraction, seed)
@@ -244,7 +245,9 @@ class Trials:
         """The answered calls of a part; answered when they are first asked for."""
         if part not in self._samples:
             numbers = self.split.calibration if part == LEARNED else self.split.validation
-            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), self.observations)
+            half = part == LEARNED and bool(self.artifact.manifest.spec.loops)
+            most = max(self.observations // (1 + half), 1)
+            stretches, calls = _places(self.episodes, numbers, (self.seed, 4, _NUMBERS[part]), most)
             draws = self._draws(part, len(calls))
             calls = self._in_time(part, stretches, calls, draws)
             self._samples[part] = Sample(part, stretches, calls, self._answers(part, stretches, calls, draws))

@@ -15,6 +15,7 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
+from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import TIMED, WARM_UP, Score, further, judge, timed
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
@@ -94,17 +95,45 @@ def test_what_is_proposed_saves_and_is_near_on_other_episodes(trials: Trials, fo
 def test_tokens_that_no_chosen_plan_reuses_are_said_to_be_of_no_use(
     folder: Path, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Looking for changes takes longer than a small encoder, so that no plan may take what was learned."""
+    """Looking for changes may take longer than a call showed at first, so that no plan may take what was learned."""
 
     def timed(entrants: Any, threads: int) -> list[Times]:
         return [Times((10.0 if plan.tokens is None else slower,)) for _, plan in entrants]
 
     monkeypatch.setattr("ttscompile.calibration.choose.timed", timed)
+    monkeypatch.setattr(tokens, "timed", lambda entrants, threads: [Times((10.0,)), Times((5.0,))])
     for slower, ends in ((20.0, "are computed, and no chosen plan is faster by it"), (5.0, "are computed")):
         own = shutil.copytree(folder, tmp_path / f"{slower}")
         result = calibrate(own, files, learn=("loops", "tokens"), progress=False, max_distance=0.9)
         assert result.told["tokens"].endswith(ends)
         assert any(plan.tokens for plan in load_artifact(own).plans.values()) is (slower == 5.0)
+
+
+def test_a_build_tries_no_setting_where_none_makes_a_call_faster(
+    trials: Trials, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What takes up to a fifth longer counts as equally fast, and is nearer with all tokens."""
+    told = "a call takes 10 ms with all tokens, and 9 with the fewest"
+    monkeypatch.setattr(tokens, "timed", lambda entrants, threads: [Times((10.0,)), Times((9.0,))])
+    monkeypatch.setattr(tokens, "judge", None)
+    with pytest.raises(CalibrationFailedError, match=told):
+        tried(trials, by_time=True)
+
+
+def test_where_time_runs_out_the_settings_that_were_tried_count(
+    trials: Trials, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is tried at least; it has no tolerance and is rarely whole."""
+    count = list[Plan]()
+
+    def counted(trials: Trials, plan: Plan, part: str) -> Score:
+        count.append(plan)
+        return judge(trials, plan, part)
+
+    monkeypatch.setattr(tokens, "judge", counted)
+    (proposal,) = Tokens(request()).propose(trials, trials.base, Clock(0.0))
+    assert [plan.tokens for plan in count] == [None, TokenReuse(0.0, 6)]
+    assert proposal.plan.tokens == TokenReuse(0.0, 6)
 
 
 def test_a_call_is_timed_after_another_picture(
@@ -148,6 +177,7 @@ def test_what_does_not_hold_on_other_episodes_is_told(
         return "is no better." if score.tokens < 1 else None
 
     monkeypatch.setattr(Kept, "_no_better", no_better)
+    monkeypatch.setattr(tokens, "timed", lambda entrants, threads: [Times((10.0,)), Times((5.0,))])
     result = calibrate(folder, files, learn=("loops", "tokens"), max_distance=0.9)
     assert result.told["tokens"] == "" and result.skipped["tokens"] == "is no better."
     assert "'tokens' is left out: it is no better." in " ".join(capsys.readouterr().err.split())

@@ -3,11 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 
+import numpy as np
+
 from ...artifact.load import Artifact
 from ...core.plan import Plan, TokenReuse
 from ...errors import CalibrationFailedError
+from ...measure.points import ALIKE
 from ..clock import Clock
-from ..judge import Score, further, judge
+from ..judge import Score, further, judge, timed
 from ..proposer import Proposal, Proposals, Proposer
 from ..trials import LEARNED, Trials
 
@@ -38,20 +41,25 @@ class Tokens(Proposer):
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """The plan, with the setting that computes the fewest tokens."""
-        whole = judge(trials, replace(plan, tokens=None), LEARNED)
-        tried = list[tuple[float, Score, Plan]]()
         seen = max(last - first + 1 for _, first, last in trials.learned.stretches.tolist())
         refreshes = sorted({min(refresh, seen) for refresh in REFRESHES}, reverse=True)
-        trials.bar.stage("settings of tokens", len(refreshes) * len(THRESHOLDS))
-        for number, refresh in enumerate(refreshes):
-            for more, threshold in enumerate(THRESHOLDS):
-                one = replace(plan, tokens=TokenReuse(threshold, refresh))
-                score = judge(trials, one, LEARNED)
-                off, limit = further(score, whole)
-                tried.append((limit, score, one))
-                trials.bar.update(number * len(THRESHOLDS) + more + 1, f"{score.tokens:.0%} computed", clock.left())
-                if off > self.margin:
-                    break  # a larger threshold changes more
+        settings = [TokenReuse(threshold, refresh) for refresh in refreshes for threshold in THRESHOLDS]
+        exact = replace(plan, tokens=None)
+        if self.request.by_time:
+            self._require_faster(trials, exact, replace(plan, tokens=settings[len(THRESHOLDS) - 1]))
+        whole, tried = judge(trials, exact, LEARNED), list[tuple[float, Score, Plan]]()
+        trials.bar.stage("settings of tokens", len(settings))
+        too_far = dict[int, float]()
+        for number, setting in enumerate(clock.in_time(settings), 1):
+            if setting.threshold > too_far.get(setting.refresh, np.inf):
+                continue  # a larger threshold changes more
+            one = replace(plan, tokens=setting)
+            score = judge(trials, one, LEARNED)
+            off, limit = further(score, whole)
+            tried.append((limit, score, one))
+            if off > self.margin:
+                too_far[setting.refresh] = setting.threshold
+            trials.bar.update(number, f"{score.tokens:.0%} computed", clock.left())
         good = [(score, one) for limit, score, one in tried if limit <= self.margin]
         if not good:
             least = min(limit for limit, _, _ in tried)
@@ -63,6 +71,18 @@ class Tokens(Proposer):
         self.told = f"{score.tokens:.0%} of the tokens of new frames are computed"
         notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
         yield Proposal(trials.changed_name, best, notes, margin=self.margin, shared=shared, refusal=_too_many)
+
+    def _require_faster(self, trials: Trials, whole: Plan, fewest: Plan) -> None:
+        """Raise unless a plan with the setting that computes the fewest tokens may be chosen for its time.
+
+        Of a small encoder it may not, and judging all settings took longer than all else that a build does.
+        """
+        all_tokens, few = (times.median for times in timed([(trials, whole), (trials, fewest)], self.request.threads))
+        if ALIKE * few >= all_tokens:
+            raise CalibrationFailedError(
+                f"looking for changes saves too little: a call takes {all_tokens:.3g} ms with all tokens, and"
+                f" {few:.3g} with the fewest"
+            )
 
 
 def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:
