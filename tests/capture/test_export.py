@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -69,7 +70,8 @@ def test_the_users_module_is_not_touched() -> None:
         (lambda y, t, o: y.double(), "returns float64"),
         (lambda y, t, o: (y.bfloat16() + 1).float(), r"_to_copy \(test_export.py:\d+ in \S+\) computes in bfloat16"),
         (lambda y, t, o: torch.cat([y, y, y[:1]])[: y.shape[0]], "not a multiple of the batch size"),
-        (lambda y, t, o: y[o[:, 0] > 0], r"size u\d at %index .* is not a multiple of the batch size"),
+        (lambda y, t, o: y[o[:, 0] > 0], r"%index \(.*\) has the size u\d: .* by a mask that picks entries"),
+        (lambda y, t, o: y + torch.tensor([t[0].item()]), r"has the size u\d: .*a number taken out of one \(.item"),
     ],
 )
 def test_what_cannot_be_compiled_is_refused(then: Callable[..., object], message: str) -> None:
@@ -153,6 +155,22 @@ def test_a_module_that_cannot_be_copied_is_refused() -> None:
     module.scale = nn.Parameter(torch.rand(2)).exp()
     with pytest.raises(CaptureError, match="Denoiser cannot be copied: .*call torch.nn.utils.remove_weight_norm"):
         capture(module, toy_spec())
+
+
+def test_what_an_attribute_raises_is_told() -> None:
+    """A lock, an open file or a logger's stream makes copying raise a TypeError."""
+    module: Any = Denoiser(lambda y, t, o: y)
+    module.lock = threading.Lock()
+    with pytest.raises(CaptureError, match="Denoiser cannot be copied: .*lock.* object .*take locks and files out"):
+        ttscompile.compile_denoiser(module, toy_spec())
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace:DeprecationWarning")
+def test_torchscript_is_refused() -> None:
+    module = Denoiser(lambda y, t, o: y)
+    module.linear = torch.jit.trace(module.linear, torch.zeros(1, 4, 2))
+    with pytest.raises(CaptureError, match="Denoiser holds TorchScript.* Pass the module that was scripted or traced"):
+        ttscompile.compile_denoiser(module, toy_spec())
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from onnx import helper
 
 from tests.lower.modules import ALL, TOKENS, WIDTH, captured, random_values, spec, table
 from tests.lower.sessions import run, session
@@ -19,6 +20,7 @@ from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType
 from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Pieces, Program
 from ttscompile.lower.advance import fuse_advance
+from ttscompile.lower.onnx_model import live_nodes
 from ttscompile.lower.program import OPSET, lower_graph, lower_program, structural_key
 
 B = Batch()
@@ -176,6 +178,13 @@ def test_program(monkeypatch: pytest.MonkeyPatch) -> None:
             wanted = evaluate(graph, weights, inputs)
         for result, expected in zip(run(models[name], weights, inputs), wanted, strict=True):
             assert_equal_but_for_rounding(result, expected, counted.terms)
+
+
+def test_what_an_operation_leaves_out_is_no_value_of_another() -> None:
+    """All pieces are exported as one model; the last state of a GRU in one is not what a Clip in another reads."""
+    last_state = helper.make_node("GRU", ["frames", "inner", "outer"], ["", "state"])
+    clamped = helper.make_node("Clip", ["values", "", "most"], ["result"])
+    assert live_nodes([last_state, clamped], {"result"}) == [clamped]
 
 
 def test_structure_is_all_but_names() -> None:

@@ -7,9 +7,9 @@ from pathlib import PurePath
 import torch
 
 ON_VALUES = (
-    "what it does depends on the values of a tensor: by an if, a while or an assert on one, or by a number taken out of"
-    " one (.item(), .tolist(), float(), int()). In place of an if write torch.where, compute with tensors, and leave"
-    " checks out."
+    "what it does depends on the values of a tensor: by an if, a while or an assert on one, by a number taken out of"
+    " one (.item(), .tolist(), float(), int()), or by a mask that picks entries (x[mask]). In place of an if or a mask"
+    " write torch.where, compute with tensors, and leave checks out."
 )
 KEEPS = (
     " It keeps something of one call for the next, and a denoiser must not. Compute it in every call: what depends on"

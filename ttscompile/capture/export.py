@@ -229,8 +229,7 @@ class _Converter:
     def _size(self, fx_node: torch.fx.Node, size: Any) -> int:
         if isinstance(size, int):
             return size
-        what = f"size {size} at %{fx_node.name} ({_source(fx_node)}) is not a multiple of the batch size."
-        raise CaptureError(f"{what} Only the batch may vary; write the other sizes as numbers.")
+        raise CaptureError(f"%{fx_node.name} ({_source(fx_node)}) has the size {size}: {ON_VALUES}")
 
     def _type(self, fx_node: torch.fx.Node, value: Any) -> TensorType:
         return TensorType(tuple(self._size(fx_node, n) for n in value.shape), str(value.dtype).removeprefix("torch."))
@@ -307,8 +306,7 @@ class _Converter:
         results = output.args[0]
         if len(results) != 1 or not isinstance(results[0], torch.fx.Node):
             raise CaptureError(f"the module returns {len(results)} values; expected one tensor, the prediction.")
-        result: torch.fx.Node = results[0]
-        return self.names[result]
+        return self.names[results[0]]
 
 
 def _source(fx_node: torch.fx.Node) -> str:

@@ -61,10 +61,12 @@ def own_copy(module: nn.Module, shared: Mapping[int, nn.Parameter] = MappingProx
         raise CaptureError(f"expected an nn.Module; found {type(module).__name__}. {remedy}")
     if isinstance(module, nn.DataParallel | nn.parallel.DistributedDataParallel):
         raise CaptureError(f"expected the network itself; found {type(module).__name__} around it. Pass module.module.")
+    if any(isinstance(each, torch.jit.ScriptModule) for each in module.modules()):
+        raise CaptureError(f"{type(module).__name__} holds TorchScript. Pass the module that was scripted or traced.")
     try:
         return copy.deepcopy(module, dict[int, object](shared))
-    except RuntimeError as error:
+    except Exception as error:  # whatever its attributes raise
         raise CaptureError(
             f"{type(module).__name__} cannot be copied: {error} Of a weight that is computed from others, call"
-            " torch.nn.utils.remove_weight_norm or parametrize.remove_parametrizations first."
+            " torch.nn.utils.remove_weight_norm or parametrize.remove_parametrizations first; take locks and files out."
         ) from error

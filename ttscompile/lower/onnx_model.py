@@ -108,7 +108,7 @@ def live_nodes(nodes: Sequence[NodeProto], outputs: set[str]) -> list[NodeProto]
     for node in reversed(nodes):
         if needed.intersection(node.output):
             live.append(node)
-            needed.update(node.input)
+            needed.update(filter(None, node.input))  # one that is left out has no name
     return live[::-1]
 
 
