@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.calibration import calls, execute
@@ -80,6 +81,17 @@ def test_calls_are_selected_in_the_order_given(make_task: MakeTask) -> None:
         some = task.executor.run_dense(task.executor.select(task.calls, [2, 0, 2]))
     assert task.calls.path is not None
     assert_equal_but_for_rounding(some, task.calls.path[[2, 0, 2]], counted.terms)
+
+
+def test_of_consecutive_calls_nothing_is_copied_that_the_prologue_gave(make_task: MakeTask) -> None:
+    task = make_task(calls=4)
+    views, copies = (task.executor.select(task.calls, [1, 2], consecutive=one).contexts for one in (True, False))
+    given = task.calls.contexts
+    of_all = zip(*((one.condition, *one.steps) for one in (views, copies, given)), strict=True)
+    memory = [[one[name].untyped_storage().data_ptr() for one in each] for each in of_all for name in each[0]]
+    assert memory and all(own == whole for own, _, whole in memory)
+    assert any(copied != whole for _, copied, whole in memory)
+    assert all(torch.equal(view, copies.condition[name]) for name, view in views.condition.items())
 
 
 def test_a_plan_that_needs_an_earlier_call_is_refused(make_task: MakeTask) -> None:

@@ -62,17 +62,22 @@ class Executor:
         other.correction = correction
         return other
 
-    def select(self, calls: Calls, streams: Sequence[int] | IntArray) -> Calls:
+    def select(self, calls: Calls, streams: Sequence[int] | IntArray, *, consecutive: bool = False) -> Calls:
         """These calls, in this order; a call may be taken several times.
 
-        They are windows still if whole windows were taken; else they are independent of each other.
+        They are windows still if whole windows were taken; else they are independent of each other. Of consecutive ones
+        nothing is copied that the prologue gave, which for a network modulated at every step is a megabyte a call.
         """
         chosen_calls = np.asarray(streams, dtype=np.int64)
         index, contexts = torch.as_tensor(chosen_calls), calls.contexts
         there = index.to(self.model.device)
 
         def take(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            chosen = {name: values[name].index_select(self._axes[name], there) for name in self._axes.keys() & values}
+            names, begin = self._axes.keys() & values, int(chosen_calls[0])
+            if consecutive:
+                chosen = {n: values[n].narrow(self._axes[n], begin, len(chosen_calls)) for n in names}
+            else:
+                chosen = {n: values[n].index_select(self._axes[n], there) for n in names}
             return {**values, **chosen}
 
         steps = tuple(map(take, contexts.steps)) if contexts.steps[0] else contexts.steps

@@ -106,7 +106,7 @@ class SparseLoop:
             if calls is None:
                 return ()
             parts, sums = calls.parts(STREAMS), whole and executor.alike
-            return tuple(_Batch(executor, executor.select(calls, part), sums) for part in parts)
+            return tuple(_Batch(executor, executor.select(calls, part, consecutive=True), sums) for part in parts)
 
         self.begin = Place(0, batches(fitted), batches(judged))
 
