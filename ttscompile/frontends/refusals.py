@@ -124,7 +124,9 @@ STATES = (
     Refusal(r"^qwen_vl_interface\.", "a VLA-JEPA or another of starVLA as it is saved", _TRAIN.format("vla_jepa")),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
-    Refusal(r"^(joint_cmps|gating_network)\.", "a policy of VDD, experts of one evaluation each", _NO_LOOP),
+    Refusal(
+        r"^(joint_cmps|gating_network)\.", "a policy of VDD, a mixture of experts of one evaluation each", _NO_LOOP
+    ),
     Refusal(r"^(actor_ft|network)\.(time_embedding|time_mlp|mlp_mean)\.", "a policy of DPPO", _DPPO),
     Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
