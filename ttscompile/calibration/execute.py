@@ -65,17 +65,18 @@ class Executor:
     def select(self, calls: Calls, streams: Sequence[int] | IntArray, *, consecutive: bool = False) -> Calls:
         """These calls, in this order; a call may be taken several times.
 
-        They are windows still if whole windows were taken; else they are independent of each other. Of consecutive ones
-        nothing is copied that the prologue gave, which for a network modulated at every step is a megabyte a call.
+        They are windows still if whole windows were taken; else they are independent of each other. If they follow each
+        other, ``consecutive`` makes them views of what the prologue gave: a U-Net's is a megabyte a call. Views are for
+        this process alone, since to pickle one is to pickle all.
         """
         chosen_calls = np.asarray(streams, dtype=np.int64)
         index, contexts = torch.as_tensor(chosen_calls), calls.contexts
         there = index.to(self.model.device)
 
         def take(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            names, begin = self._axes.keys() & values, int(chosen_calls[0])
+            names = self._axes.keys() & values
             if consecutive:
-                chosen = {n: values[n].narrow(self._axes[n], begin, len(chosen_calls)) for n in names}
+                chosen = {n: values[n].narrow(self._axes[n], int(chosen_calls[0]), len(index)) for n in names}
             else:
                 chosen = {n: values[n].index_select(self._axes[n], there) for n in names}
             return {**values, **chosen}

@@ -111,7 +111,7 @@ class Trials:
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
         executor: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the number of calls to learn from.
-        observations: that the original answers, at most, of either part.
+        observations: that the original answers, at most; see ``OBSERVATIONS``.
         name: of the best plan so far.
         draws: of noise for each of them, at least.
         begun_at: seconds on the clock from which on calls to learn from are answered.

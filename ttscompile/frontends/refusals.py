@@ -170,7 +170,8 @@ def refuse_payload(payload: Mapping[str, Any]) -> None:
     row = next((each for each in ENTRIES if _match(each, entries)), None)
     how = f"its entry {_match(row, entries)}" if row else ""
     if row is None:
-        row = _first(STATES, names := sorted(_weight_names(payload)))
+        names = sorted(_weight_names(payload))
+        row = _first(STATES, names)
         how = f"the weight {_match(row, names)}" if row.sign else f"its entries {', '.join(entries[:6]) or '(none)'}"
     raise CheckpointError(
         f"no entry {missing!r}, so not a checkpoint of Diffusion Policy's workspace {{cfg, state_dicts, pickles}}: this"

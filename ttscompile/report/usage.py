@@ -133,7 +133,7 @@ class Course:
     Attributes:
         plans: int8 ``[R, K, blocks]``, as executed; without a first call in another loop.
         legalised: cells of each call that were replaced because they were never computed.
-        frames: what was done for them in all calls, and for their tokens.
+        frames: what was done for those of all calls, and for their tokens.
         seen: of some calls, by number, what each camera showed; nothing where no tokens are reused.
     """
 

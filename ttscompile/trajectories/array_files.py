@@ -17,7 +17,7 @@ from .frames import AS_NPZ, Array, Recording, blocks, bytes_of, one_error, requi
 
 CODECS = frozenset({"blosc", "bz2", "delta", "gzip", "lz4", "lzma", "shuffle", "zlib", "zstd", "bytes", "crc32c"})
 """Compression that only computes. zarr also knows codecs that unpickle what they read."""
-_COMPRESSED = f"compressed by one of {', '.join(sorted(CODECS))}. Write it again with such a compressor, or {AS_NPZ}"
+_READABLE = f"compressed by one of {', '.join(sorted(CODECS))}. Write it again with such a compressor, or {AS_NPZ}"
 
 
 def zarr_recording(path: Path) -> Recording:
@@ -29,7 +29,7 @@ def zarr_recording(path: Path) -> Recording:
     import zarr
 
     require_files(path)
-    hint = f"; expected a zarr group with data/NAME [F, ...] and meta/episode_ends [E], {_COMPRESSED.removesuffix('.')}"
+    hint = f"; expected a zarr group with data/NAME [F, ...] and meta/episode_ends [E], {_READABLE[:-1]}"
     with one_error(f"{path}: cannot be read as a replay buffer of Diffusion Policy", hint):
         store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
         group = zarr.open_group(store, mode="r")
@@ -55,7 +55,7 @@ def _require_plain_zarr(path: Path, array: Any, size: int) -> None:
     kind, codecs = np.dtype(array.dtype).kind, _codecs(array.metadata)
     if kind not in "biuf" or not codecs <= CODECS or not array.shape:
         what = f"compressed by {', '.join(sorted(codecs - CODECS))}" if kind in "biuf" else f"of dtype {array.dtype}"
-        told = f"{what if array.shape else 'a single value'}; expected rows of numbers, {_COMPRESSED}"
+        told = f"{what if array.shape else 'a single value'}; expected rows of numbers, {_READABLE}"
         raise TrajectoryError(f"{path}: {array.path!r} is {told}")
     require_proportion(path, math.prod(array.shape) * array.dtype.itemsize, size)
 

@@ -118,6 +118,7 @@ def test_a_build_tries_no_setting_where_none_makes_a_call_faster(
     monkeypatch.setattr(tokens, "judge", None)
     with pytest.raises(CalibrationFailedError, match=told):
         tried(trials, by_time=True)
+    Tokens(request(by_time=True, deadline_ms=9.5))._require_faster(trials, trials.base, trials.base)  # a tenth may do
 
 
 def test_where_time_runs_out_the_settings_that_were_tried_count(

@@ -44,10 +44,10 @@ class Tokens(Proposer):
         seen = max(last - first + 1 for _, first, last in trials.learned.stretches.tolist())
         refreshes = sorted({min(refresh, seen) for refresh in REFRESHES}, reverse=True)
         settings = [TokenReuse(threshold, refresh) for refresh in refreshes for threshold in THRESHOLDS]
-        exact = replace(plan, tokens=None)
+        all_tokens = replace(plan, tokens=None)
         if self.request.by_time:
-            self._require_faster(trials, exact, replace(plan, tokens=settings[len(THRESHOLDS) - 1]))
-        whole, tried = judge(trials, exact, LEARNED), list[tuple[float, Score, Plan]]()
+            self._require_faster(trials, all_tokens, replace(plan, tokens=TokenReuse(THRESHOLDS[-1], refreshes[0])))
+        whole, tried = judge(trials, all_tokens, LEARNED), list[tuple[float, Score, Plan]]()
         trials.bar.stage("settings of tokens", len(settings))
         too_far = dict[int, float]()
         for number, setting in enumerate(clock.in_time(settings), 1):
@@ -72,17 +72,15 @@ class Tokens(Proposer):
         notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
         yield Proposal(trials.changed_name, best, notes, margin=self.margin, shared=shared, refusal=_too_many)
 
-    def _require_faster(self, trials: Trials, whole: Plan, fewest: Plan) -> None:
-        """Raise unless a plan with the setting that computes the fewest tokens may be chosen for its time.
+    def _require_faster(self, trials: Trials, all_tokens: Plan, fewest: Plan) -> None:
+        """Raise unless a plan with the fewest tokens may be chosen for its time, as that of a small encoder may not.
 
-        Of a small encoder it may not, and judging all settings took longer than all else that a build does.
+        Then nothing is judged: of many settings that takes longer than all else that a build does.
         """
-        all_tokens, few = (times.median for times in timed([(trials, whole), (trials, fewest)], self.request.threads))
-        if ALIKE * few >= all_tokens:
-            raise CalibrationFailedError(
-                f"looking for changes saves too little: a call takes {all_tokens:.3g} ms with all tokens, and"
-                f" {few:.3g} with the fewest"
-            )
+        whole, few = (one.median for one in timed([(trials, all_tokens), (trials, fewest)], self.request.threads))
+        if (ALIKE if self.request.deadline_ms is None else 1) * few >= whole:
+            told = f"a call takes {whole:.3g} ms with all tokens, and {few:.3g} with the fewest"
+            raise CalibrationFailedError(f"looking for changes saves too little: {told}")
 
 
 def _too_many(score: Score, others: Mapping[str, Score]) -> str | None:
