@@ -86,7 +86,8 @@ _CONDITIONS = {
     "add": {"cond_predict_scale": False},
     "mlp_film": {"cond_predict_scale": True, "condition_layer": True},
 }
-_READ = (POINTS, STATE, ROBOT)
+_AXES = {POINTS: 2, STATE: 1, ROBOT: 2}
+"""What the network reads of an observation, and how many axes each has."""
 _MOST_POINTS = 2**16
 """Of a cloud, which the weights do not limit; in use are 512 to 4096."""
 _PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
@@ -120,7 +121,7 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
             " with one"
         )
     action_dim, every = read_shape_meta(settings)  # the original looks at no type, and some of its tasks say low_dimx
-    observed = {key: _as_given(key, *each, saved.weights) for key, each in every.items() if key in _READ}
+    observed = {key: _as_given(key, *each, saved.weights) for key, each in every.items() if key in _AXES}
     encoder = _encoder(settings, observed, saved.weights)
     network: dict[str, Any] = {name: saved.policy.get(name, default) for name, default in DEFAULTS.items()}
     network |= _CONDITIONS[condition]
@@ -151,7 +152,7 @@ def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointC
     coloured = settings.flag("use_pc_color", False)
     settings.choice("pointnet_type", "pointnet")
     cloud = settings.part("pointcloud_encoder_cfg")
-    for key, axes in zip(_READ, (2, 1, 2), strict=True):
+    for key, axes in _AXES.items():
         if key == ROBOT and key not in observed:
             continue
         shape = observed[key][1] if key in observed else ()
