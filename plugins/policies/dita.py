@@ -26,17 +26,11 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import (
-    NAME_FOLDER,
-    encoder_folders,
-    find_encoder,
-    language_model_folder,
-    task_tokens,
-)
 from ttscompile.frontends.refusals import MERGE
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.settings import Settings
 
+from .instruction import NAME_FOLDER, encoder_folders, find_encoder, language_model_folder, task_tokens
 from .loops import ddim_loops
 from .networks.clip import ClipText, TextConfig, encoder_config
 from .networks.dinov2 import DinoConfig, own_names

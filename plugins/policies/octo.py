@@ -22,13 +22,13 @@ from ttscompile.core.tokenizer import find_tokenizer, padded
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, task_tokens
 from ttscompile.frontends.loops import loops_of
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.scheduler import MOST_STEPS
 from ttscompile.frontends.settings import Settings, read_json
 
 from .flax_files import Tree, for_torch, leaves, read_tree
+from .instruction import encoder_folders, task_tokens
 from .networks.octo_network import MASK, PADDING, TOKENS, Head, Octo, OctoConfig, OctoDenoiser, OctoObserved, Stem
 from .networks.t5 import Words
 from .octo_loop import loop_table, schedule

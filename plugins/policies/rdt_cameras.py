@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import NAME_FOLDER, encoder_folders, find_encoder, language_model_folder
 from ttscompile.frontends.saved_weights import as_float32, filled
 from ttscompile.frontends.settings import Settings, read_json
 
+from .instruction import NAME_FOLDER, encoder_folders, find_encoder, language_model_folder
 from .networks.siglip import Siglip, SiglipConfig
 from .shards import read_part
 

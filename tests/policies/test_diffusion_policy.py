@@ -72,6 +72,29 @@ def test_pred_action_steps_only(payload: Build, save: Save) -> None:
     assert module(torch.randn(2, 3, 3), torch.tensor([1, 2]), torch.randn(2, 2, 5)).shape == (2, 3, 3)
 
 
+@pytest.mark.parametrize(
+    ("data_set", "given", "recorded"),
+    [
+        ("pusht_dataset.PushTLowdimDataset", {"zarr_path": "???"}, ("keypoint", "state:2")),
+        ("pusht_dataset.PushTLowdimDataset", {"obs_key": "points", "state_key": "pose"}, ("points", "pose:2")),
+        ("blockpush_lowdim_dataset.BlockPushLowdimDataset", {"obs_eef_target": True}, ("obs",)),
+        ("robomimic.RobomimicReplayLowdimDataset", {"obs_keys": "${task.obs_keys}"}, ("object", "robot0_eef_pos")),
+        ("robomimic.RobomimicReplayLowdimDataset", {"obs_keys": [1]}, ()),
+        ("my.OwnDataset", {}, ()),
+    ],
+)
+def test_the_data_set_says_what_is_recorded(
+    payload: Build, save: Save, data_set: str, given: dict[str, Any], recorded: tuple[str, ...]
+) -> None:
+    """As the classes of the original put the observation together."""
+    built = payload()
+    built["cfg"]["task"] = {
+        "obs_keys": ["object", "robot0_eef_pos"],
+        "dataset": {"_target_": f"diffusion_policy.dataset.{data_set}", **given},
+    }
+    assert load_checkpoint_policy(save(built))[1].observations["obs"].recorded == recorded
+
+
 def test_chunk_ends_with_the_horizon(payload: Build, save: Save) -> None:
     """More action steps than are left after the observations: the original's slice is cut, and so is ours."""
     built = payload()

@@ -62,6 +62,26 @@ def test_an_observation_is_joined_from_the_arrays_of_a_recording(format: str, tm
     require_equal(episodes, "obs", windows(frames, 3))
 
 
+@pytest.mark.parametrize("format", WRITERS)
+def test_a_policy_knows_what_its_observation_was_made_of(format: str, tmp_path: Path) -> None:
+    knows = {"obs": ObservationSpec((2, 8), recorded=SOURCES["obs"])}
+    recording = WRITERS[format](tmp_path)
+    made, said = (load_trajectories([recording], *how) for how in ((knows, 3), (LOW, 3, SOURCES)))
+    require_equal(made, "obs", [each.observations["obs"] for each in said])
+    lacks = {"obs": ObservationSpec((2, 8), recorded=("keypoint", "pose"))}
+    with pytest.raises(TrajectoryError, match=r"no array 'obs' .*--observation obs=NAME"):
+        load_trajectories([recording], lacks, 3)
+
+
+def test_an_array_of_its_own_name_is_taken_unless_others_are_said(tmp_path: Path) -> None:
+    knows = {"obs": ObservationSpec((2, 8), recorded=SOURCES["obs"])}
+    own = np.arange(72, dtype=np.float32).reshape(9, 8)
+    recording = as_zarr(tmp_path, obs=own)
+    require_equal(load_trajectories([recording], knows, 3), "obs", windows(own, 3))
+    said = load_trajectories([recording], LOW, 3, SOURCES)
+    require_equal(load_trajectories([recording], knows, 3, SOURCES), "obs", [each.observations["obs"] for each in said])
+
+
 @pytest.mark.parametrize("format", ["zarr 2", "zarr 3", "hdf5", "lerobot"])
 def test_images_come_as_the_policy_takes_them(format: str, tmp_path: Path) -> None:
     episodes = load_trajectories([WRITERS[format](tmp_path)], IMAGES, 2, {"image": ("img",)})

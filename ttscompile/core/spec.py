@@ -56,6 +56,8 @@ class ObservationSpec:
             shape, and is rounded to 256 steps, whatever its size. With ``average`` it fills the shape, too, each pixel
             the mean of those that it touches. None: no other size is taken.
         fill: of an image that keeps its proportions: what is beside it in place of black, a number for each channel.
+        recorded: the arrays of a recording of frames that it is made of, in order, where none has its name: ``NAME``,
+            or ``NAME:N``, the first N numbers of one (``trajectories.load_trajectories``).
     """
 
     shape: Shape
@@ -65,6 +67,7 @@ class ObservationSpec:
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
     fit: Literal["start", "centre", "stretch", "average"] | None = None
     fill: tuple[float, ...] = field(default=(), metadata=OMITTED)
+    recorded: tuple[str, ...] = field(default=(), metadata=OMITTED)
 
     def __post_init__(self) -> None:
         sizes = tuple(integer(n, "a size in an observation's shape", SpecError, 1) for n in self.shape)

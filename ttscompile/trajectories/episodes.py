@@ -139,7 +139,9 @@ def _read(
         told = f"{folder[0]}: this policy takes no text that alone would give its tokens. Leave the tokenizer out"
         raise TrajectoryError(f"{told}, and record tokens if it observes any.")
     tokenizer = tokenizer if folder is None else partial(Tokenizer, folder[0])
-    kind, held, frames = _opened(path, limits, sorted({*array_names(observations, sources), TASK}))
+    recorded = array_names(observations, {key: (key, *spec.recorded) for key, spec in observations.items()})
+    kind, held, frames = _opened(path, limits, sorted({*recorded, *array_names(observations, sources), TASK}))
+    sources = default_sources(observations, held.names, frames) | sources
     words = instruction if folder is not None or (tokenizer and _in_text_alone(held, instruction, sources)) else None
     seen = {key: spec for key, spec in observations.items() if words is None or key not in (words.tokens, words.mask)}
     used = array_names(seen, sources) | ({TASK} if words else set())
@@ -180,6 +182,14 @@ def _read(
 def array_names(keys: Iterable[str], sources: Mapping[str, Sequence[str]]) -> set[str]:
     """Names of the arrays of a recording that these keys of the observation are made of."""
     return {part.partition(":")[0] for key in keys for part in sources.get(key, (key,))}
+
+
+def default_sources(
+    observations: Mapping[str, ObservationSpec], names: Sequence[str], frames: bool
+) -> dict[str, Sequence[str]]:
+    """By key the arrays that training made it of, where a recording of frames has them and none of the key's name."""
+    made = {key: spec.recorded for key, spec in observations.items() if frames and key not in names}
+    return {key: parts for key, parts in made.items() if parts and array_names([key], made) <= {*names}}
 
 
 def _in_text_alone(held: Frames, instruction: Instruction | None, sources: Mapping[str, Sequence[str]]) -> bool:

@@ -14,7 +14,7 @@ from ..core.finding import Finding, Level
 from ..core.spec import Affine, PolicySpec
 from ..core.tokenizer import TASK, ReadTokenizer
 from ..errors import TrajectoryError
-from .episodes import Episode, array_names, episodes_of, local_path, recorded_names
+from .episodes import Episode, array_names, default_sources, episodes_of, local_path, recorded_names
 from .frames import few
 from .rate import rate_of
 
@@ -155,10 +155,11 @@ def examine_recordings(
 def _names(path: Path, spec: PolicySpec, renamed: dict[str, Sequence[str]], reads_text: bool) -> list[Finding]:
     """Keys that a recording lacks; a name that may stand for one is added to ``renamed``, and said."""
     names, frames = recorded_names(path)
-    used = array_names(spec.observations, renamed)
+    made = default_sources(spec.observations, names, frames) | renamed
+    used = array_names(spec.observations, made)
     worded = TASK in renamed or (reads_text and TASK in names)
     text = {spec.instruction.tokens, spec.instruction.mask} if worded and spec.instruction else set[str]()
-    missing = [key for key in spec.observations if key not in renamed and key not in names and key not in text]
+    missing = [key for key in spec.observations if key not in made and key not in names and key not in text]
     free = [name for name in names if name not in used]
     if not missing:
         return [Finding(PART, path.name, "what the policy observes" + f"; not read: {few(free)}" * bool(free))]

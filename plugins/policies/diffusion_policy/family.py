@@ -23,6 +23,7 @@ from ttscompile.frontends.settings import Settings
 
 from .interpolation import Config
 from .parts import COMMON_KEYS, Rebuilt, Saved, affine, choose_weights
+from .recorded import with_recorded
 
 _STUDENT = "CTMPPUnetHybridImagePolicy"
 
@@ -90,7 +91,7 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     source = {"format": "diffusion_policy", "policy": name, "variant": rebuilt.variant, "weights": which}
     spec = PolicySpec(
         sample=rebuilt.sample,
-        observations=rebuilt.observations,
+        observations=with_recorded(rebuilt.observations, config),
         sampler=loops.original,
         loops=loops.others,
         chunk=ChunkSpec(

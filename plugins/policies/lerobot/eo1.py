@@ -16,10 +16,10 @@ from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, language_model_folder
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings
 
+from ..instruction import encoder_folders, language_model_folder
 from ..networks.eo1 import ACTIVATIONS, EO1, Denoiser, EO1Config, Prefix
 from ..networks.qwen25_vl import Piece, Qwen25VLConfig, rebuilt_weights
 from . import vla

@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from ttscompile.core.spec import LARGEST, Affine, ChunkSpec, Instruction, PolicySpec, Switch
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings, read_json
 
+from ..instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from ..networks.clip import ACTIVATIONS
 from ..networks.evo1 import TIMES, Denoiser, Evo1, Evo1Config, Prefix
 from ..networks.internvl import InternVitConfig, InternVLConfig, Prompt

@@ -18,10 +18,10 @@ from ttscompile.core.spec import Instruction, PolicySpec, Switch
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings, read_json
 
+from ..instruction import encoder_folders, language_model_folder, task_tokens, told_after
 from ..networks.clip import TowerConfig
 from ..networks.groot import Denoiser, Groot, GrootConfig, Prefix
 from ..networks.internvl import Prompt

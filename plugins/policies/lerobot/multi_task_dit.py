@@ -21,12 +21,12 @@ from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.image_geometry import ResizeCrop
-from ttscompile.frontends.instruction import NO_TASK, encoder_folders, find_encoder, task_tokens
 from ttscompile.frontends.loops import Loops, loops_of
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
 from ttscompile.samplers.flow import METHODS, flow_matching_table
 
+from ..instruction import NO_TASK, encoder_folders, find_encoder, task_tokens
 from ..networks.clip import TextConfig, VisionConfig, encoder_config
 from ..networks.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from . import policy as lerobot

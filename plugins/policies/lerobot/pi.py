@@ -18,9 +18,9 @@ from ttscompile.core.tokenizer import IN_WORDS, StateInWords
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, find_encoder, task_tokens
 from ttscompile.frontends.saved_weights import filled
 
+from ..instruction import encoder_folders, find_encoder, task_tokens
 from ..networks.language_layers import LanguageConfig
 from ..networks.pi import Expert, Pi, PiConfig, Prefix
 from ..networks.siglip import SiglipConfig

@@ -9,9 +9,9 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.instruction import language_model_folder
 from ttscompile.frontends.settings import Settings, read_json
 
+from ..instruction import language_model_folder
 from ..networks.clip import ACTIVATIONS
 from ..networks.qwen3_vl import Qwen3VLConfig, QwenVisionConfig
 from . import vla

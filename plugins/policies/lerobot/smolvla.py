@@ -16,10 +16,10 @@ from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, find_encoder, language_model_folder, task_tokens
 from ttscompile.frontends.saved_weights import filled
 from ttscompile.frontends.settings import Settings, read_json
 
+from ..instruction import encoder_folders, find_encoder, language_model_folder, task_tokens
 from ..networks.siglip import SiglipConfig
 from ..networks.smolvla import Expert, Prefix, SmolVLA, SmolVLAConfig, expert_of
 from . import vla

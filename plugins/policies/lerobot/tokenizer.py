@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from ttscompile.core.tokenizer import find_tokenizer
-from ttscompile.frontends.instruction import encoder_folders
 from ttscompile.frontends.settings import read_json
 
+from ..instruction import encoder_folders
 from .config import CONFIG, MOST_LETTERS
 from .groot_steps import read_groot_processors
 from .processors import READ, Features, Processors, read_processors

@@ -18,10 +18,10 @@ from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, language_model_folder
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings, is_shape, read_json
 
+from ..instruction import encoder_folders, language_model_folder
 from ..networks.language_layers import LanguageConfig
 from ..networks.qwen25_vl import Piece, Qwen25VLConfig, rebuilt_weights
 from ..networks.wall_x import Denoiser, Prefix, WallX, WallXConfig

@@ -16,11 +16,11 @@ from ttscompile.core.spec import PolicySpec, SamplerTable
 from ttscompile.errors import SpecError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.instruction import encoder_folders, find_encoder, task_tokens
 from ttscompile.frontends.saved_weights import filled, renamed, separated
 from ttscompile.frontends.settings import Settings
 from ttscompile.samplers.flow import remixed_table
 
+from ..instruction import encoder_folders, find_encoder, task_tokens
 from ..networks.clip import TowerConfig
 from ..networks.florence import FlorenceConfig
 from ..networks.internvl import MEAN

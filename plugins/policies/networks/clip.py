@@ -19,9 +19,9 @@ from torch import nn
 from torch.nn import functional
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.instruction import NAME_FOLDER, find_encoder
 from ttscompile.frontends.settings import Settings, read_json
 
+from ..instruction import NAME_FOLDER, find_encoder
 from .language_layers import Rotation, rotate
 
 _MOST = {"num_hidden_layers": 512, "image_size": 4096, "patch_size": 4096}

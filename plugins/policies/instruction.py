@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..core.spec import Instruction
-from ..core.tokenizer import Tokenizer, find_tokenizer
-from ..errors import CheckpointError
-from .settings import read_json
+from ttscompile.core.spec import Instruction
+from ttscompile.core.tokenizer import Tokenizer, find_tokenizer
+from ttscompile.errors import CheckpointError
+from ttscompile.frontends.settings import read_json
 
 NAME_FOLDER = "Name the folder that has it: encoders= in Python, --encoders on the command line."
 NO_TASK = "Or leave the task out: the policy then takes tokens as an observation."
