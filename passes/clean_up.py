@@ -91,10 +91,12 @@ def _without(graph: Graph, same_as: Callable[[Node], str | None]) -> Graph:
 
 
 def _is_identity(node: Node, types: dict[str, TensorType]) -> bool:
-    """Whether it moves or casts numbers, and leaves all of them where and what they are."""
+    """Whether it leaves all numbers where and what they are: ``sum([x, f])`` of Python begins with 0 + x."""
     source = node.args[0] if node.args else None
     if not isinstance(source, Ref) or len(node.types) != 1 or types.get(source.name) != node.type:
         return False
+    if node.op == "aten.add.Tensor":
+        return node.args[1:] == (0,) and not node.kwargs
     return node.op == _CAST or operation(node.op).movement not in (None, Movement.PERMUTE)
 
 

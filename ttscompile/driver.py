@@ -51,6 +51,7 @@ from .passes.split_frames import SplitFrames
 from .passes.split_tokens import SplitFeatures, SplitStem, SplitTokens
 from .passes.unfold_batch import UnfoldBatch
 from .passes.widen_attention import WidenAttention
+from .passes.write_sums import WriteSums
 from .verification.record_golden import record_original
 
 if TYPE_CHECKING:
@@ -284,7 +285,7 @@ def transform(module: nn.Module, spec: PolicySpec, *, explain: Explain = lambda 
     captured = Captured(spec, graph, weights, dense_flops=dense, once_flops=once)
     verify(captured)
     clean = CleanUp[Captured]()
-    for simplify in (clean, CutCopies(), WidenAttention(), SplitStem(), clean, RegroupSums()):
+    for simplify in (clean, CutCopies(), WidenAttention(), SplitStem(), clean, WriteSums(), RegroupSums()):
         captured = _run(simplify, captured, explain)
     captured, table = _find_blocks(captured, explain)
     cut = _run(Partition(table.blocks), captured, explain)

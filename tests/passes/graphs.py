@@ -21,9 +21,9 @@ class Builder:
         self.constants[name] = TensorType(shape, "float32")
         return Ref(name)
 
-    def op(self, name: str, op: str, shape: tuple[Size, ...], *args: Argument) -> Ref:
+    def op(self, name: str, op: str, shape: tuple[Size, ...], *args: Argument, **options: Argument) -> Ref:
         type_ = TensorType(shape, "float32")
-        self.nodes.append(Node(name, f"aten.{op}", args, (), (type_,), f"toy.py:{len(self.nodes)}"))
+        self.nodes.append(Node(name, f"aten.{op}", args, tuple(options.items()), (type_,), f"toy.py:{len(self.nodes)}"))
         return Ref(name)
 
     def graph(self, *outputs: Ref) -> Graph:

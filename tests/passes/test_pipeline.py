@@ -89,7 +89,7 @@ def test_the_record_of_a_network_that_reads_no_observation() -> None:
 def test_stages_are_explained() -> None:
     told = explained("tokens")[2]
     assert list(told) == [
-        "capture", "CleanUp", "CutCopies", "WidenAttention", "SplitStem", "RegroupSums",
+        "capture", "CleanUp", "CutCopies", "WidenAttention", "SplitStem", "WriteSums", "RegroupSums",
         "find_residual_blocks", "Partition",
         "UnfoldBatch", "SplitTokens", "SplitFeatures", "Hoist", "InsertPruner", "SplitFrames",
         "ReuseTokens",
