@@ -22,7 +22,7 @@ from ttscompile.core.lattice import Source, check_plan, require_legal
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.evaluate import Evaluator
-from ttscompile.ir.graph import TensorType
+from ttscompile.ir.graph import TensorType, backward_slice
 from ttscompile.ir.pieces import CONDITION, LoopPiece
 from ttscompile.ir.program import Binding, Pieces, frame_values
 from ttscompile.runtimes.inpainting import Known
@@ -33,15 +33,13 @@ from .sampler import Carried, TorchSampler, hold
 
 @dataclass(frozen=True)
 class Contexts:
-    """What the loop reads beside the stream, for one observation.
+    """What the observation gives the loop; what it gives each step is made of this when a piece reads it.
 
-    Attributes:
-        steps: step values by name, one mapping for each step k; empty mappings if the policy has none.
+    A modulated network reads megabytes a call at its hundred steps, which cost next to nothing to make.
     """
 
     streams: int
     condition: Mapping[str, Tensor]
-    steps: tuple[Mapping[str, Tensor], ...]
 
 
 Blocks = Callable[[int, Tensor], Tensor]
@@ -98,7 +96,11 @@ class ReferenceModel:
         self._tables = {name: _tensor(value).to(self.device) for name, value in self._pieces.tables.items()}
         evaluator = partial(Evaluator, weights=self.weights, device=self.device)
         self._once = {name: evaluator(graph) for name, graph in pieces.once().items()}
-        self._step = evaluator(pieces.step) if pieces.step is not None else None
+        self._steps: dict[tuple[str, ...], tuple[Mapping[str, TensorType], Evaluator]] = {}
+        for piece in (pieces.stem, *pieces.blocks, pieces.tail):
+            if pieces.step is not None and (made := self._of_steps(piece.contexts)):
+                graph = backward_slice(pieces.step, made, {})
+                self._steps[made] = graph.inputs, evaluator(graph)
         self._stem = evaluator(pieces.stem.graph)
         self._blocks = self._first = tuple(evaluator(piece.graph) for piece in pieces.blocks)
         if first:
@@ -134,36 +136,23 @@ class ReferenceModel:
         there = {key: value.to(self.device) for key, value in (uncommitted | dict(obs)).items()}
         there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
         condition = dict(zip(graph.outputs, self._once[CONDITION](there), strict=True))
-        contexts = Contexts(streams, condition, ({},) * self.steps)
-        if self._pieces.step is None or self._step is None:
-            return contexts
-        names = self._pieces.step.outputs
-        rows = [self._step(self._contexts(self._pieces.step.inputs, k, contexts)) for k in range(self.steps)]
-        return Contexts(streams, condition, tuple(dict(zip(names, row, strict=True)) for row in rows))
+        return Contexts(streams, condition)
 
     def joined(self, parts: Iterable[Contexts], streams: int) -> Contexts:
         """What the loop reads for several batches of streams, as for one batch of all of them."""
-        read = [graph for graph in (self._pieces.condition, self._pieces.step) if graph is not None]
-        axes = {name: one.batch_axis for graph in read for name, one in graph.types().items()}
-
-        def room(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            """For all streams, of what belongs to streams."""
-            shapes = {name: list(value.shape) for name, value in values.items()}
-            for name, shape in shapes.items():
-                if (axis := axes[name]) is not None:
-                    shape[axis] = streams
-            return {n: v if axes[n] is None else v.new_empty(shapes[n]) for n, v in values.items()}
-
-        whole, begin = None, 0
+        axes = {name: one.batch_axis for name, one in self._pieces.condition.types().items()}
+        whole, begin = dict[str, Tensor](), 0
         for part in parts:
-            whole = whole or Contexts(streams, room(part.condition), tuple(map(room, part.steps)))
-            for into, values in zip((whole.condition, *whole.steps), (part.condition, *part.steps), strict=True):
-                for name, value in values.items():
-                    if (axis := axes[name]) is not None:
-                        into[name].narrow(axis, begin, part.streams).copy_(value)
+            for name, value in part.condition.items():
+                if (axis := axes[name]) is None:
+                    whole[name] = value
+                    continue
+                if name not in whole:
+                    whole[name] = value.new_empty([streams if i == axis else n for i, n in enumerate(value.shape)])
+                whole[name].narrow(axis, begin, part.streams).copy_(value)
             begin += part.streams
-        assert whole is not None and begin == streams
-        return whole
+        assert begin == streams
+        return Contexts(streams, whole)
 
     def condition(self, contexts: Contexts) -> Tensor:
         """What a correction reads of the observation: the pruner's features, one row a stream, ``[B, N]``."""
@@ -295,15 +284,24 @@ class ReferenceModel:
         self, types: Mapping[str, TensorType], k: int, contexts: Contexts, streams: Sequence[int] | None = None
     ) -> dict[str, Tensor]:
         bound: dict[str, Tensor] = {}
+        if made := self._of_steps(types):
+            inputs, evaluator = self._steps[made]
+            bound |= zip(made, evaluator(self._contexts(inputs, k, contexts, streams)), strict=True)
         for name, kind in types.items():
-            binding = self._pieces.bindings[name]
-            if binding is Binding.TABLE:
-                row, axis = self._tables[name][k], kind.batch_axis
-                value = row.expand([contexts.streams if i == axis else n for i, n in enumerate(row.shape)])
-            else:
-                value = (contexts.steps[k] if binding is Binding.STEP else contexts.condition)[name]
+            match self._pieces.bindings[name]:
+                case Binding.TABLE:
+                    row, axis = self._tables[name][k], kind.batch_axis
+                    value = row.expand([contexts.streams if i == axis else n for i, n in enumerate(row.shape)])
+                case Binding.CONDITION:
+                    value = contexts.condition[name]
+                case Binding.STEP:
+                    continue
             bound[name] = _select(value, kind, streams)
         return bound
+
+    def _of_steps(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of a piece's contexts that are made at each step."""
+        return tuple(name for name in names if self._pieces.bindings[name] is Binding.STEP)
 
 
 def noise_tensors(noise: Noise, stochastic: bool) -> tuple[Tensor, Tensor | None]:

@@ -35,7 +35,7 @@ def test_an_interval_is_over_episodes() -> None:
 def test_pinned_calls_have_one_noise_a_window() -> None:
     draw = torch.Generator().manual_seed(0)
     noise = torch.randn(3, 8, 2, generator=draw)
-    fresh = Calls(Contexts(8, {}, ({},) * 3), torch.randn(8, 2, generator=draw), noise, np.zeros(8, np.int64), window=4)
+    fresh = Calls(Contexts(8, {}), torch.randn(8, 2, generator=draw), noise, np.zeros(8, np.int64), window=4)
     pinned = pin(fresh)
     for calls, same in ((pinned, True), (fresh, False)):
         assert calls.noise is not None

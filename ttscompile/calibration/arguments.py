@@ -99,7 +99,6 @@ def calls_to_learn_from(manifest: Manifest, max_minutes: float, corrects: bool, 
 
 
 def _context_bytes(manifest: Manifest) -> int:
-    """Of all that the loop of one call reads beside the stream."""
-    repeats = {Binding.CONDITION: 1, Binding.STEP: manifest.steps, Binding.TABLE: 0}
-    each = ((record.type, repeats[record.binding]) for record in manifest.contexts.values())
-    return max(1, sum(math.prod(kind.at(1)) * np.dtype(kind.dtype).itemsize * count for kind, count in each))
+    """Of what the prologue gives the loop of one call."""
+    types = [record.type for record in manifest.contexts.values() if record.binding is Binding.CONDITION]
+    return max(1, sum(math.prod(kind.at(1)) * np.dtype(kind.dtype).itemsize for kind in types))

@@ -47,8 +47,7 @@ class Executor:
         blocks, pieces = view.manifest.blocks, view.pieces
         self.view = view
         self.model = ReferenceModel.from_view(view, device)
-        read = [graph for graph in (pieces.condition, pieces.step) if graph is not None]
-        types = {name: graph.types()[name] for graph in read for name in graph.outputs}
+        types = {name: pieces.condition.types()[name] for name in pieces.condition.outputs}
         self._axes = {name: one.batch_axis for name, one in types.items() if one.batch_axis is not None}
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
@@ -66,24 +65,21 @@ class Executor:
         """These calls, in this order; a call may be taken several times.
 
         They are windows still if whole windows were taken; else they are independent of each other. If they follow each
-        other, ``consecutive`` makes them views of what the prologue gave: a U-Net's is a megabyte a call. Views are for
-        this process alone, since to pickle one is to pickle all.
+        other, ``consecutive`` makes them views of what the prologue gave: a language model's is megabytes a call. Views
+        are for this process alone, since to pickle one is to pickle all.
         """
         chosen_calls = np.asarray(streams, dtype=np.int64)
-        index, contexts = torch.as_tensor(chosen_calls), calls.contexts
+        index = torch.as_tensor(chosen_calls)
         there = index.to(self.model.device)
-
-        def take(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            names = self._axes.keys() & values
+        condition = dict(calls.contexts.condition)
+        for name in self._axes.keys() & condition:
+            own, axis = condition[name], self._axes[name]
             if consecutive:
-                chosen = {n: values[n].narrow(self._axes[n], int(chosen_calls[0]), len(index)) for n in names}
+                condition[name] = own.narrow(axis, int(chosen_calls[0]), len(index))
             else:
-                chosen = {n: values[n].index_select(self._axes[n], there) for n in names}
-            return {**values, **chosen}
-
-        steps = tuple(map(take, contexts.steps)) if contexts.steps[0] else contexts.steps
+                condition[name] = own.index_select(axis, there)
         return Calls(
-            contexts=Contexts(len(index), take(contexts.condition), steps),
+            contexts=Contexts(len(index), condition),
             initial=calls.initial[index],
             noise=None if calls.noise is None else calls.noise[:, index],
             episodes=calls.episodes[index.numpy()],
