@@ -10,6 +10,7 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.core.envelope import plain_cells
 from ttscompile.core.lattice import dense_plan
+from ttscompile.core.plan import DENSE, FULL
 from ttscompile.core.spec import FP32, ORIGINAL
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.pieces import USE_PRUNER
@@ -24,13 +25,13 @@ def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> di
 
     Args:
         path: the artifact that was written beside the file, or the same zipped; it may have been calibrated since.
-        plan: the name of a plan of the artifact, in the loop that the file was written for; None for its default plan.
+        plan: the name of a plan of the artifact; None for its default plan.
         streams: B, of the observation and the noise.
 
     Raises:
         ArtifactError: the artifact is missing, damaged or of another version.
         IllegalPlanError: there is no plan of this name; or it has weights of its own or begins with the chunk of the
-            call before, which a file cannot; or it is in another precision than the file.
+            call before, which a file cannot; or it is in another loop or precision than the file.
     """
     artifact = load_artifact(path)
     name = artifact.manifest.default_plan if plan is None else plan
@@ -39,6 +40,10 @@ def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> di
         if there:
             problem = f"plan {name!r} has {field}, and a single file has the original's weights and begins with noise"
             raise IllegalPlanError(f"{problem}. Give another plan, or use ttscompile.load.")
+    loop = artifact.plans.get(FULL, artifact.plans[DENSE]).loop  # which ``convert`` was asked for
+    if own.loop != loop:
+        problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact is of loop {loop!r}"
+        raise IllegalPlanError(f"{problem}. Give a plan of that loop, or use ttscompile.load.")
     record = artifact.manifest.precision
     bits, computed = (FP32, FP32) if record is None else (record.name, record.told)
     # The file computes in the precision of ``convert``, whatever a plan says.

@@ -134,7 +134,7 @@ class OnnxBackend:
         for cell in np.flatnonzero(self.keeps).tolist():
             work.entry(cell)
         spec = self._manifest.spec
-        obs = {key: np.zeros((streams, *one.shape), one.dtype) for key, one in spec.inputs.items()}
+        obs = {key: one.normalized(np.zeros((streams, *one.shape), one.dtype)) for key, one in spec.inputs.items()}
         with np.errstate(all="ignore"):  # zeros need not be in the range of the policy
             seen = self._open_frames().values(obs)  # none of these is to be remembered
             work.start({**obs, **seen}, Noise(np.zeros((streams, *spec.sample), np.float32)), None)

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ttscompile.artifact.corrections import require_fit
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import View, view_of
 from ttscompile.core.correction import Correction
@@ -63,19 +64,20 @@ def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | 
             the pruner's, and the artifact has no such plan.
     """
     artifact = load_artifact(path)
-    if plan == PRUNER and PRUNER not in artifact.plans:
-        known = [one for one, each in artifact.plans.items() if each.otherwise is None]
-        problem = f"{artifact.path}: no plan of it is made by a pruner; it has {known}"
-        raise IllegalPlanError(f"{problem}. Use one of these, or calibrate with a proposer that trains the pruner.")
     chosen = plan_of(artifact, plan)
     name, own = artifact.told(chosen) or GIVEN, chosen.exact
     if "@" in name and chosen.precision:
         problem = f"plan {name!r} has weights of {', '.join(sorted(set(chosen.precision.values())))}"
         raise IllegalPlanError(f"{problem}, and a module computes in fp32. Leave out what follows the @.")
-    if own.otherwise is not None:
+    if own.otherwise is not None or own.loop in artifact.manifest.starts:
         problem = f"plan {name!r} begins with the chunk of the call before, and a module keeps nothing between calls"
         raise IllegalPlanError(f"{problem}. Give another plan, or use load(..., runtime='torch').")
     view = view_of(artifact, own)
+    if own.correction is not None:
+        require_fit(own.correction, artifact.manifest, own.loop)
+    if own.cells is None and PRUNER not in view.manifest.pieces:
+        problem = f"plan {name!r} is made by a pruner, and loop {own.loop!r} has none"
+        raise IllegalPlanError(f"{problem}. Give a plan with cells, by its name, say: {list(artifact.plans)}.")
     with artifact.reading():
         if own.cells is None:
             return PrunedCall(view, own.correction).eval()
@@ -130,7 +132,7 @@ class SparseCall(CallModule):
 
         def some_plain() -> Tensor:
             made, _ = denoise(network, plain, (), uncorrected, initial, others.unbind(), {}, None)
-            return torch.where(far[:, None, None], made, sample).contiguous()
+            return torch.where(far[:, None, None], made, sample).clone(memory_format=torch.contiguous_format)
 
         if not torch.compiler.is_compiling():
             return self._actions(some_plain() if far.any() else sample, obs)

@@ -44,7 +44,8 @@ class PlainNetwork:
         self._pieces = pieces = module.pieces
         self._evaluators = evaluators = module.evaluators
         self._weights = weights = module.kept("weight")
-        self._first, self._tables = weights | module.kept("first weight"), module.kept("table")
+        self._others, self._tables = module.kept("first weight"), module.kept("table")
+        self._first = weights | self._others
         self.idle = None if module.idle is None else module.idle.on(module.kept("idle"))
         self._streams = streams
         self.stream_type = pieces.blocks[0].type
@@ -107,7 +108,8 @@ class PlainNetwork:
     def contexts(self, k: Tensor) -> dict[str, Tensor]:
         """All that the pieces of the loop read at a step that only the program knows, int64 ``[1]``; by name."""
         rows = {name: self._repeated(name, table.index_select(0, k)[0]) for name, table in self._tables.items()}
-        known = {**self._weights, **self._condition, **rows}
+        first = {name: torch.where((k > 0)[0], self._weights[name], other) for name, other in self._others.items()}
+        known = {**self._weights, **first, **self._condition, **rows}
         return known if self._pieces.step is None else {**known, **self._step_values(known)}
 
     def run(self, name: str, value: Tensor, contexts: Tensors) -> Tensor:
@@ -212,7 +214,7 @@ class CallModule(nn.Module):
                 found = "none" if value is None else f"a {type(value).__name__}, {value.dtype} {list(value.shape)}"
                 raise ObservationError(f"observation {key!r} must be a Tensor, {expected}; found {found}.")
             normalizer = self.kept(f"normalizer {key}")
-            given[key] = value * normalizer["scale"] + normalizer["offset"] if normalizer else value
+            given[key] = (value * normalizer["scale"] + normalizer["offset"]).float() if normalizer else value
         return PlainNetwork(self, given, len(initial))
 
     def _is_far(self, network: PlainNetwork) -> Tensor:

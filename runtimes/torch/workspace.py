@@ -53,7 +53,8 @@ class Workspace:
         self._parts, self.streams, self._sampler = parts, streams, spec.sampler
         (horizon, dimensions), steps = spec.sample, spec.sampler.steps
         self._horizon = horizon
-        self._obs = {key: Inlet((streams, *one.shape), one.dtype, device) for key, one in spec.inputs.items()}
+        types = {key: "float32" if one.normalizer else one.dtype for key, one in spec.inputs.items()}
+        self._obs = {key: Inlet((streams, *one.shape), types[key], device) for key, one in spec.inputs.items()}
         self._initial = Inlet((streams, horizon, dimensions), "float32", device)
         columns = (1 + spec.sampler.memories) * horizon
         self._offset = Inlet((steps, dimensions, streams, columns), "float32", device)

@@ -1,7 +1,5 @@
 """The pruner in the single file: the plans that it makes, executed, against the reference runtime."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +16,14 @@ from tests.lower.whole_call import Episode, inputs, lowered, make_toy, opened
 from tests.rounding import assert_equal_but_for_rounding
 from tests.runtimes.agreement import call_terms
 from tests.runtimes.pruners import calibrated, random_pruner
+from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
 from ttscompile.artifact.stores import BlockWeights
-from ttscompile.artifact.write import update_plans
+from ttscompile.artifact.write import update_plans, write_artifact
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import IllegalPlanError
+from ttscompile.lower.program import lower_program
 from ttscompile.runtimes.single_file import inputs_of
 
 
@@ -174,6 +174,26 @@ def test_a_plan_with_weights_of_its_own_is_refused(tmp_path: Path) -> None:
     with pytest.raises(IllegalPlanError, match="plan 'weights' has weights of its own"):
         inputs_of(tmp_path / "artifact")
     np.testing.assert_array_equal(inputs_of(tmp_path / "artifact", "evenly")["plan"], uniform_plan(5, 5, 2)[None])
+
+
+def test_a_plan_in_another_loop_than_the_file_is_refused(tmp_path: Path) -> None:
+    """Of as many steps, with which the file would compute something else."""
+    program = toy_program()
+    own, loops = program.spec.sampler, {"other-5": program.pieces.tables}
+    program = replace(program, spec=replace(program.spec, loops={"other-5": replace(own, timesteps=own.timesteps * 2)}))
+    program = replace(program, pieces=replace(program.pieces, loop_tables=loops))
+    for name, loop in (("asked", "other-5"), ("own", "original")):
+        write_artifact(program, lower_program(program), tmp_path / name, loop=loop)
+        plans = dict(load_artifact(tmp_path / name).plans)
+        plans["best"] = Plan("other-5", uniform_plan(5, 5, 2))
+        update_plans(tmp_path / name, plans, "best")
+    assert inputs_of(tmp_path / "asked")["plan"].shape == inputs_of(tmp_path / "own", "dense")["plan"].shape
+    with pytest.raises(
+        IllegalPlanError, match="is 2 of 5 steps of other-5, and a single file .* is of loop 'original'"
+    ):
+        inputs_of(tmp_path / "own")
+    with pytest.raises(IllegalPlanError, match="'dense' is 5 of 5 steps of original, and a single file .* 'other-5'"):
+        inputs_of(tmp_path / "asked", "dense")
 
 
 def graphs(graph: GraphProto) -> Iterator[GraphProto]:

@@ -1,7 +1,5 @@
 """Run runtimes side by side over random calls, and episodes of random legal plans."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -28,7 +26,7 @@ def random_inputs(artifact: Artifact, rng: np.random.Generator, streams: int) ->
     spec = artifact.manifest.spec
     shape = (streams, *spec.sample)
     obs = {
-        key: rng.standard_normal((streams, *o.shape)).astype(o.dtype)
+        key: rng.standard_normal((streams, *o.shape)).astype("float32" if o.normalizer else o.dtype)
         if o.bounds is None
         else np.concatenate([o.draw(rng) for _ in range(streams)])
         for key, o in spec.observations.items()

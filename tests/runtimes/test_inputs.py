@@ -1,10 +1,9 @@
 """What an unkind caller gives: every array is made plain, copied and judged before anything is executed."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,10 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 import ttscompile
+from tests.lower.whole_call import every_way, make
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Affine, ChunkSpec, Noise, ObservationSpec, Source
-from ttscompile.artifact import Artifact
+from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.core.lattice import check_plan, legalize, uniform_plan
 from ttscompile.core.spec import LARGEST
 from ttscompile.core.values import check_numbers, check_values
@@ -99,6 +99,18 @@ def layouts(array: np.ndarray) -> dict[str, Any]:
     }
 
 
+@pytest.mark.parametrize("dtype", ["float64", "uint8"])
+def test_what_is_normalised_is_float32_whatever_it_was(tmp_path: Path, dtype: str) -> None:
+    program = toy_program(steps=3, blocks=2, noise=0.0, pruner=False)
+    seen = {"obs": replace(program.spec.observations["obs"], dtype=dtype)}
+    _, model = make(replace(program, spec=replace(program.spec, observations=seen)), tmp_path)
+    noise = Noise(np.random.default_rng(0).standard_normal((2, 3, 2), dtype=np.float32), None)
+    made = every_way(tmp_path / "artifact", model, {"obs": np.array([[3, 1], [0, 2]], dtype)}, noise)
+    terms = 4 * call_terms(load_artifact(tmp_path / "artifact"))
+    for found in made.values():
+        assert_equal_but_for_rounding(found, made["reference"], terms)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", layouts(OBS))
 def test_how_numbers_lie_in_memory_changes_nothing(policy: CompiledPolicy, layout: str) -> None:
@@ -141,12 +153,14 @@ def test_plans_of_any_integers_are_the_same_plan(policy: CompiledPolicy, dtype: 
     assert (legal == PLAN).all() and changed == 0 and legal.dtype == np.int8
 
 
-@pytest.mark.parametrize(
-    "plan", [PLAN > 0, PLAN.astype(float), PLAN.astype(object), PLAN.astype("U1"), PLAN + np.int16(300)]
-)
+BFLOAT = torch.zeros(5, 5, dtype=torch.bfloat16)
+OTHER_TYPES = [PLAN.astype(dtype) for dtype in ("?", "f8", "O", "U1")]
+
+
+@pytest.mark.parametrize("plan", [*OTHER_TYPES, PLAN + np.int16(300), [[0], [0, 1]], BFLOAT, BFLOAT.float(), object()])
 def test_plans_of_anything_else_are_refused_everywhere(policy: CompiledPolicy, plan: Any) -> None:
     for call in (lambda: actions(policy, plan=plan), lambda: legalize(plan, range(5), np.zeros((5, 5), np.bool_))):
-        with pytest.raises(IllegalPlanError, match=r"plan (has dtype|holds values 300\.\.302)"):
+        with pytest.raises(IllegalPlanError, match=r"plan (has dtype|holds values 300\.\.302|is no array|is a tensor)"):
             call()
 
 

@@ -1,7 +1,5 @@
 """The module that makes its own plan: the actions of the policy, as it stands and exported, and what it skips."""
 
-from __future__ import annotations
-
 import shutil
 from collections import Counter
 from collections.abc import Iterator
@@ -18,8 +16,10 @@ from torch.fx import GraphModule
 import ttscompile
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile import Noise, Source
+from ttscompile import Noise, Plan, Source
 from ttscompile.artifact import load_artifact
+from ttscompile.artifact.stores import BlockWeights
+from ttscompile.artifact.write import update_plans
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError, ObservationError
 from ttscompile.ir.program import Program
@@ -121,6 +121,22 @@ def test_exported_it_computes_the_same(tmp_path: Path, name: str) -> None:
     reads, plans = episodes(program, exported.module(), policy, terms, empty, (0, 1, 2))
     assert (reads > 0).all()
     assert len(plans) > 12
+
+
+def test_exported_its_first_step_has_the_original_weights(tmp_path: Path) -> None:
+    program, rng = toy_program(steps=3, blocks=2), np.random.default_rng(0)
+    artifact = written_artifact(program, tmp_path / "artifact")
+    own = {name: rng.standard_normal((4, 4)).astype(np.float32) for name in ("block.0.w", "block.1.w")}
+    plans = {"pruner": Plan(cells=None, weights="trained", repair=True)}
+    weights = {"trained": BlockWeights(own, {})}
+    update_plans(artifact.path, plans, "pruner", weights=weights, pruner_weights=random_pruner(program, 2))
+    policy, module = ttscompile.load(artifact.path, "reference"), ttscompile.to_module(artifact.path, "pruner")
+    given = draw(program, 2, rng)
+    with torch.no_grad():
+        found, plan = torch.export.export(module, given).module()(*given)
+    wanted, executed = expected(policy, given)
+    np.testing.assert_array_equal(plan, executed)
+    assert_equal_but_for_rounding(found, wanted, 4 * call_terms(load_artifact(artifact.path)))
 
 
 @pytest.fixture(scope="module")
@@ -263,7 +279,7 @@ def test_it_is_the_module_of_a_default_plan_that_the_pruner_makes(tmp_path: Path
     program = toy_program()
     written_artifact(program, tmp_path / "artifact")
     schedules = {"evenly": uniform_plan(5, 5, 2)}
-    with pytest.raises(IllegalPlanError, match=r"no plan of it is made by a pruner; it has \['dense'\]"):
+    with pytest.raises(IllegalPlanError, match=r"no plan 'pruner'; it has \['dense'\]"):
         ttscompile.to_module(tmp_path / "artifact", "pruner")
     store_schedules(tmp_path / "artifact", random_pruner(program, 0), schedules, "made", {})
     assert isinstance(ttscompile.to_module(tmp_path / "artifact"), PrunedCall)

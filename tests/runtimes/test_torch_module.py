@@ -1,7 +1,5 @@
 """The sparse call as a module: the same actions as the policy, exported and compiled too."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +11,12 @@ import torch
 import ttscompile
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile import Noise, Source
+from ttscompile import Noise, Plan, Source
 from ttscompile.artifact import Artifact, load_artifact
+from ttscompile.artifact.manifest import StartRecord
+from ttscompile.artifact.write import update_plans
+from ttscompile.core.correction import no_correction
+from ttscompile.core.envelope import Envelope
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import IllegalPlanError, ObservationError, RuntimeUnavailableError
 
@@ -23,6 +25,7 @@ from .conftest import MakeArtifact
 from .plans import random_correction, random_plan
 from .toys import toy_program
 
+CELLS = np.zeros((5, 5), np.int8)
 NO_COMPILER = "NO C++ COMPILER: the exported module was not compiled; install g++"
 
 
@@ -113,6 +116,34 @@ def test_it_can_be_exported_and_what_is_exported_computes_the_same(artifact: Art
     assert_equal_but_for_rounding(found.detach(), expected(artifact, other, "mixed"), terms(artifact))
 
 
+class OneChannel(torch.nn.Module):
+    """Of a sample of one number a step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.into, self.block, self.out = torch.nn.Linear(1, 4), torch.nn.Linear(4, 4), torch.nn.Linear(4, 1)
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        stream = self.into(sample) + obs[:, None, :1]
+        return self.out(stream + torch.tanh(self.block(stream)))  # type: ignore[no-any-return]
+
+
+@pytest.mark.slow
+def test_one_channel_with_an_envelope_can_be_exported(tmp_path: Path) -> None:
+    """The branches for near and far give tensors of the same strides, which a size of one leaves open."""
+    loop = ttscompile.flow_matching_table(3)
+    spec = ttscompile.PolicySpec((3, 1), {"obs": ttscompile.ObservationSpec((2,))}, loop, ttscompile.ChunkSpec(1, 0, 2))
+    ttscompile.compile_denoiser(OneChannel().eval(), spec, tmp_path / "artifact")
+    made = load_artifact(tmp_path / "artifact")
+    plan = Plan(cells=uniform_plan(3, 1, 2), correction=random_correction(made, np.random.default_rng(0)), repair=True)
+    near = Envelope(np.ones((made.manifest.condition_numbers, 1), np.float32), np.zeros(1, np.float32))
+    update_plans(made.path, {"p": plan}, "p", envelope=near)
+    module, given = ttscompile.to_module(made.path), ({"obs": torch.ones(1, 2)}, torch.ones(1, 3, 1))
+    with torch.no_grad():
+        exported = torch.export.export(module, given).module()
+        assert torch.equal(exported(*given), module(*given))
+
+
 @pytest.mark.soak
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # of torch's compiler, about itself
 def test_what_is_exported_can_be_compiled_and_run_without_python(artifact: Artifact, tmp_path: Path) -> None:
@@ -141,9 +172,28 @@ def test_a_schedule_that_a_module_cannot_have_is_refused(artifact: Artifact) -> 
         ttscompile.to_module(artifact.path, "rollout")
 
 
-def test_an_unknown_plan_is_refused(artifact: Artifact) -> None:
-    with pytest.raises(IllegalPlanError, match="no plan 'best'"):
-        ttscompile.to_module(artifact.path, "best")
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (
+            Plan(),
+            r"plan 'given' is made by a pruner, and loop 'original' has none.*by its name, say: \['dense', 'warm'",
+        ),
+        (
+            Plan(cells=CELLS, correction=no_correction(4, (3, 2))),
+            r"has weights \[4, 2, 18, 3\]; this policy needs \[5, 2",
+        ),
+        (Plan("last-2", CELLS[:2]), "plan 'given' begins with the chunk of the call before"),
+    ],
+)
+def test_a_plan_of_ones_own_that_does_not_fit_is_refused(make_artifact: MakeArtifact, plan: Plan, message: str) -> None:
+    """As a runtime refuses it."""
+    made = make_artifact(toy_program(pruner=False))
+    dense = made.plans["dense"]
+    plans = {"dense": dense, "warm": Plan("last-2", CELLS[:2], otherwise=dense, repair=True)}
+    update_plans(made.path, plans, "dense", starts={"last-2": StartRecord("original", 2)})
+    with pytest.raises(IllegalPlanError, match=message):
+        ttscompile.to_module(made.path, plan)
 
 
 @pytest.mark.parametrize(
