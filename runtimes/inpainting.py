@@ -86,7 +86,7 @@ def noise_levels(sampler: SamplerTable) -> Levels | None:
         None if they do not follow.
     """
     levels = _levels(sampler)
-    return levels if levels is not None else _levels(sampler.without_skip())
+    return levels if levels is not None else _levels(sampler.with_skip(-1))
 
 
 def _levels(sampler: SamplerTable) -> Levels | None:
@@ -187,7 +187,7 @@ def with_prefix(sample: FloatArray, known: Known | None) -> FloatArray:
 def _keeps_variance(signal: npt.NDArray[np.float64], deviation: npt.NDArray[np.float64]) -> bool:
     """Whether these are the levels of a process that adds noise and keeps the variance, seen backwards."""
     one = np.abs(signal**2 + deviation**2 - 1) <= TOLERANCE
-    return bool(one.all() and (deviation >= 0).all()) and _rises(signal)
+    return bool(one.all() and (deviation > 0).all()) and _rises(signal)
 
 
 def _rises(signal: npt.NDArray[np.float64]) -> bool:

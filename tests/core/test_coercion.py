@@ -1,7 +1,5 @@
 """Numbers and arrays of callers: what comes through, and what is told about the rest."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The record of a correction: what it must look like, what it costs, and when action dimensions share it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

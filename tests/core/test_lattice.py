@@ -1,7 +1,5 @@
 """Plans on the lattice: ``origins`` against the semantics executed cell by cell, legality, legalisation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st

@@ -1,7 +1,5 @@
 """``PolicySpec.loops``: several denoising loops of one policy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Paths that lead to something that may be read for ever: each is refused unread, by whatever takes a path."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -11,14 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 import ttscompile
+from tests.commands import run
 from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli import main
 from ttscompile.core.paths import require_free_or_path, require_path
 from ttscompile.errors import ArtifactError, CalibrationError, CheckpointError, TrajectoryError, TtscompileError
 from ttscompile.trajectories import load_trajectories
@@ -109,8 +106,7 @@ def test_functions_that_take_a_path(endless: Path, artifact: Path, tmp_path: Pat
 def test_commands_that_take_a_path(artifact: Path, tmp_path: Path, command: list[str]) -> None:
     for kind in ("pipe", "/dev/zero"):
         names = {"PATH": make(kind, tmp_path / "endless"), "ARTIFACT": artifact, "OUTPUT": tmp_path / "out"}
-        arguments = [str(names.get(word, word)).replace("OUTPUT", str(tmp_path / "out")) for word in command]
-        result = CliRunner().invoke(main, arguments)
+        result = run(*(str(names.get(word, word)).replace("OUTPUT", str(tmp_path / "out")) for word in command))
         names["PATH"].unlink()
         assert result.exit_code == 2, result.output
         assert "endless: expected a file or a directory; found a " in result.stderr

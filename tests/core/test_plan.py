@@ -1,7 +1,5 @@
 """A plan is checked where it is made: who makes one of other fields learns at once what is wrong."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

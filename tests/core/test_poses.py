@@ -1,7 +1,5 @@
 """Poses that are relative to a measured one: by hand, by properties, and as numpy, torch and ONNX have them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rest of a loop: what it begins with, and that it goes on as the whole one does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,6 +12,8 @@ from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from ttscompile.core.spec import SamplerTable
 from ttscompile.core.start import rest_of
 from ttscompile.errors import SpecError
+from ttscompile.policies.last_step import clipped
+from ttscompile.policies.octo_loop import own_table, schedule
 from ttscompile.runtimes.reference.sampler import TorchSampler
 from ttscompile.samplers.flow import flow_matching_table
 from ttscompile.samplers.table import sampler_table
@@ -86,6 +86,15 @@ def test_noise_of_the_steps_stays_with_them() -> None:
     np.testing.assert_array_equal(rest.noise_to_next, table.noise_to_next[6:])
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_first_step_of_a_rest_is_of_first_order_where_the_last_sample_alone_is_clipped(order: int) -> None:
+    """As CogACT's: what the solver remembers is not clipped there."""
+    table = sampler_table(DPMSolverMultistepScheduler(**BETAS, solver_order=order, timestep_spacing="leading"), 8)
+    found, expected = rest_of(clipped(table, 1.0), 4)[0], clipped(rest_of(table, 4)[0], 1.0)
+    for name in (*SamplerTable.COLUMNS, "memory_to_next", "to_memory"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize(("last_steps", "found"), [(0, "0"), (8, "8"), (9, "9"), (True, "True"), (2.5, "2.5")])
 def test_there_is_no_rest_of_so_many_steps(last_steps: int, found: str) -> None:
     with pytest.raises(SpecError, match=rf"last_steps.*{found}"):
@@ -105,6 +114,10 @@ def without_plus(prediction_type: str) -> SamplerTable:
         lambda: flow_matching_table(2, "rk4"),
         lambda: ddim(prediction_type="sample"),
         lambda: flow_matching_table([0, 5.0, 9.0]),
+        lambda: flow_matching_table(4, end=2.0),  # the last steps of which look like those of a flow to 1
+        # Of a flow the noise is another share; that of its last steps is so small that any kind would do.
+        lambda: sampler_table(DPMSolverMultistepScheduler(use_flow_sigmas=True, prediction_type="flow_prediction"), 50),
+        lambda: own_table(*schedule(2), bound=5.0),  # Octo's network predicts noise, but x0 is the clipped sample
         *(partial(without_plus, kind) for kind in ("epsilon", "sample", "v_prediction")),
     ],
 )

@@ -1,7 +1,5 @@
 """Images of any size are resized as torch, openpi and torchvision do it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

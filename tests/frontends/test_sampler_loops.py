@@ -92,6 +92,24 @@ def test_the_bound_on_the_sample_is_kept_or_refused(payload: Build, save: Save) 
     assert (spec.sampler.clip, spec.loops["ddim-8"].clip) == (2, 2)
 
 
+@pytest.mark.parametrize(
+    ("changes", "bound"), [({}, None), ({"sample_max_value": 2.0}, None), ({"thresholding": True}, 1.0)]
+)
+@pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
+def test_a_policy_of_the_solver_gets_no_bound_that_it_had_not(
+    payload: Build, save: Save, changes: dict[str, Any], bound: float | None, sampler: str
+) -> None:
+    """The settings of the solver have no ``clip_sample``, which DDPM and DDIM have on where nothing is said."""
+    built = payload()
+    own = BETAS | {"_target_": SOLVER, "prediction_type": "sample"} | changes
+    built["cfg"]["policy"] |= {"noise_scheduler": own, "num_inference_steps": 4}
+    spec = load_checkpoint_policy(save(built), options=LoadOptions(sampler=sampler, steps=5))[1]
+    assert (spec.sampler.clip, spec.loops[f"{sampler}-5"].clip) == (bound, bound)
+    own |= {"thresholding": True, "sample_max_value": 1.5}
+    with pytest.raises(SpecError, match="thresholding=True depends on the whole sample"):
+        load_checkpoint_policy(save(built), options=LoadOptions(sampler=sampler, steps=5))
+
+
 def payload_with(built: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """The checkpoint with other settings of its scheduler."""
     built["cfg"]["policy"]["noise_scheduler"].update(changes)

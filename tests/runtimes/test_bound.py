@@ -1,7 +1,5 @@
 """A corrected sample leaves the range of the sampler no more than the policy's own does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +51,8 @@ def diffusion(scheduler: type[Any], **settings: Any) -> SamplerTable:
     [
         (lambda: diffusion(DDPMScheduler), 1.0),
         (lambda: diffusion(DDPMScheduler, clip_sample_range=2.0), 2.0),
+        # It ends above timestep 0, where diffusers adds noise of the deviation 1e-10.
+        (lambda: diffusion(DDPMScheduler, timestep_spacing="trailing"), 1.0),
         (lambda: diffusion(DDIMScheduler, timestep_spacing="trailing"), 1.0),
         (lambda: diffusion(DDIMScheduler).with_skip(), 1.0),
         (lambda: diffusion(DDPMScheduler, clip_sample=False), None),

@@ -1,7 +1,5 @@
 """Prefixes: committed actions that a call keeps, and inpaints the rest of its chunk to."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +23,7 @@ from ttscompile.core.plan import Plan
 from ttscompile.errors import ObservationError
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
+from ttscompile.policies.octo_loop import own_table, schedule
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.inpainting import TOLERANCE, Known, MaskedUpdates, known_samples, noise_levels, prefix_refusal
 from ttscompile.runtimes.reference.model import ReferenceModel
@@ -124,6 +123,7 @@ def test_noise_levels_of_a_straight_flow_are_its_times(start: float, end: float)
         lambda: noise_solver(prediction_type="v_prediction"),
         lambda: flow_matching_table(2, "rk4"),
         lambda: flow_matching_table([0.3, 0.5, 1.0]),
+        lambda: own_table(*schedule(100), bound=5.0),  # of Octo, whose x0 is its clipped sample
         lambda: toy_program().spec.sampler,
     ],
 )

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.rounding import assert_equal_but_for_rounding
 from tests.samplers.integration import NOISE, by_table, euler, rk4, velocity
@@ -73,6 +74,13 @@ def test_the_clipped_sample_is_where_the_velocity_leads() -> None:
     assert_equal_but_for_rounding(found, second, terms=4)
 
 
+@pytest.mark.parametrize("clip", [np.float32(0.5), np.array(0.5), torch.tensor(0.5)])
+def test_a_bound_may_come_from_statistics(clip: Any) -> None:
+    """It becomes a number of Python, which graphs and manifests take."""
+    table = flow_matching_table(4, clip=clip)
+    assert (type(table.clip), table.clip) == (float, 0.5)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -86,6 +94,10 @@ def test_the_clipped_sample_is_where_the_velocity_leads() -> None:
         ({"steps": 4, "timestep_scale": float("nan")}, "timestep_scale"),
         ({"steps": 4, "method": "heun"}, "expected one of euler, rk4"),
         ({"steps": 4, "method": "rk4", "clip": 1.0}, "between the stages"),
+        *(
+            ({"steps": 4, "clip": each}, "clip must be a positive number")
+            for each in (-1.0, 0.0, np.nan, np.inf, True, "1")
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:invalid value")

@@ -11,6 +11,8 @@ from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
 from diffusers.schedulers.scheduling_flow_match_euler_discrete import FlowMatchEulerDiscreteScheduler
+from diffusers.schedulers.scheduling_flow_match_heun_discrete import FlowMatchHeunDiscreteScheduler
+from diffusers.schedulers.scheduling_flow_match_lcm import FlowMatchLCMScheduler
 from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from diffusers.schedulers.scheduling_pndm import PNDMScheduler
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
@@ -212,22 +214,39 @@ def test_other_samplers_are_refused_by_name(scheduler_class: type[Any], settings
         sampler_table(scheduler_class(**(BETAS | settings)), 10)
 
 
-def test_of_flow_matching_the_schedulers_own_times_make_the_loop() -> None:
+@pytest.mark.parametrize("trained", [1000, 100])
+def test_of_flow_matching_the_schedulers_own_times_make_the_loop(trained: int) -> None:
     """The message says so: one loop against the scheduler's, on outputs that are made up."""
-    scheduler = FlowMatchEulerDiscreteScheduler(shift=3.0)
+    scheduler = FlowMatchEulerDiscreteScheduler(trained, shift=3.0)
     named = (
-        r"FlowMatchEulerDiscreteScheduler is .*flow_matching_table\(scheduler.sigmas.tolist\(\), timestep_scale=1000\)"
+        r"FlowMatchEulerDiscreteScheduler is .*"
+        rf"flow_matching_table\(scheduler.sigmas.tolist\(\), timestep_scale={trained}\)"
     )
     with pytest.raises(SpecError, match=named):
         sampler_table(scheduler, 10)
     scheduler.set_timesteps(10)
-    table = flow_matching_table(scheduler.sigmas.tolist(), timestep_scale=1000)
+    table = flow_matching_table(scheduler.sigmas.tolist(), timestep_scale=trained)
     np.testing.assert_allclose(table.timesteps, scheduler.timesteps.numpy(), rtol=bound(4))
     start, *outs = torch.randn(11, 2, 4, 3, generator=torch.Generator().manual_seed(0))
     x = start
     for out, timestep in zip(outs, scheduler.timesteps, strict=True):
         x = scheduler.step(out, timestep, x).prev_sample
     assert_equal_but_for_rounding(chain_of_table(table, start, torch.stack(outs), torch.stack(outs)), x, terms=40)
+
+
+@pytest.mark.parametrize(
+    "scheduler",
+    [
+        FlowMatchLCMScheduler(),  # a loop of the same times ends elsewhere, by as much as other noise would
+        FlowMatchEulerDiscreteScheduler(stochastic_sampling=True),
+        FlowMatchHeunDiscreteScheduler(),
+    ],
+)
+def test_another_method_of_flow_matching_is_not_called_its_table(scheduler: Any) -> None:
+    with pytest.raises(
+        SpecError, match=f"{type(scheduler).__name__}.* has no table; that of Euler's steps without noise is"
+    ):
+        sampler_table(scheduler, 10)
 
 
 @pytest.mark.parametrize(

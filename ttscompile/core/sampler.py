@@ -62,6 +62,11 @@ class SamplerTable:
             if column.shape != timesteps.shape or not np.isfinite(column).all():
                 raise SpecError(f"sampler column {name} must hold {len(timesteps)} finite numbers; found {column}.")
             object.__setattr__(self, name, column)
+        if self.clip is not None:
+            clip = listed(self.clip, "sampler clip", SpecError, "float64")
+            if clip.shape or clip.dtype.kind not in "iuf" or not 0 < clip < np.inf:
+                raise SpecError(f"sampler clip must be a positive number, or None for none; found {self.clip!r:.80}.")
+            object.__setattr__(self, "clip", float(clip))
         memory_to_next, to_memory = (numbers(getattr(self, n), n, SpecError) for n in ("memory_to_next", "to_memory"))
         if not memory_to_next.size and not to_memory.size:
             memory_to_next, to_memory = (np.zeros((len(timesteps), 0, *rest), np.float32) for rest in ((), (3,)))
@@ -77,15 +82,8 @@ class SamplerTable:
         object.__setattr__(self, "memory_to_next", memory_to_next)
         object.__setattr__(self, "to_memory", to_memory)
 
-    def with_skip(self) -> SamplerTable:
-        """The table for a network that predicts ``out - x``: it adds the sample itself, wherever ``out`` is read."""
-        return self._moved(1)
-
-    def without_skip(self) -> SamplerTable:
-        """The table of which ``with_skip`` makes this one."""
-        return self._moved(-1)
-
-    def _moved(self, times: int) -> SamplerTable:
+    def with_skip(self, times: int = 1) -> SamplerTable:
+        """The table for a network that predicts ``out - x``: it adds the sample wherever ``out`` is; -1 undoes it."""
         to_memory = self.to_memory.copy()
         to_memory[..., 1] += times * to_memory[..., 2]
         return replace(
@@ -97,8 +95,7 @@ class SamplerTable:
 
     def same_as(self, other: SamplerTable) -> bool:
         """Whether both have the same name and the same numbers."""
-        pairs = [(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)]
-        return all(np.array_equal(one, two) for one, two in pairs)
+        return all(np.array_equal(getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
 
     def takes_noise_as(self, other: SamplerTable) -> bool:
         """Whether the same noise means the same in both: a sampler of this name, with as many steps and draws."""
@@ -121,7 +118,7 @@ class SamplerTable:
         It is ``clip`` where the last step gives the clipped x0 and nothing beside.
         """
         beside = (self.sample_to_next[-1], self.out_to_next[-1], self.noise_to_next[-1], *self.memory_to_next[-1])
-        return self.clip if self.x0_to_next[-1] == 1 and not any(beside) else None
+        return self.clip if self.x0_to_next[-1] == 1 and np.abs(beside).max() < 1e-9 else None
 
     @property
     def stochastic(self) -> bool:

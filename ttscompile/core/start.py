@@ -69,8 +69,10 @@ def rest_of(table: SamplerTable, last_steps: int) -> tuple[SamplerTable, Start]:
     action, noise = _shares(table, skipped)
     columns = {name: getattr(table, name)[skipped:].copy() for name in ("timesteps", *SamplerTable.COLUMNS)}
     from_memory, to_memory = table.memory_to_next[skipped:].copy(), table.to_memory[skipped:].copy()
-    columns["x0_to_next"][0] += from_memory[0].sum()
-    to_memory[0, :, 0] += to_memory[0, :, 3:].sum(-1)
+    own = to_memory[0, :1, :3].sum(0)  # its own, of x0, sample and prediction, if there is a memory
+    for name, share in zip(SamplerTable.COLUMNS[2:5], from_memory[0].sum() * own, strict=True):
+        columns[name][0] += share
+    to_memory[0, :, :3] += to_memory[0, :, 3:].sum(-1, keepdims=True) * own
     from_memory[0], to_memory[0, :, 3:] = 0, 0
     rest = replace(table, **columns, memory_to_next=from_memory, to_memory=to_memory)
     return rest, Start(skipped, action, noise)
@@ -78,11 +80,11 @@ def rest_of(table: SamplerTable, last_steps: int) -> tuple[SamplerTable, Start]:
 
 def _shares(table: SamplerTable, step: int) -> tuple[float, float]:
     """Of action and of noise in the sample before a step."""
-    sample, out = float(table.sample_to_x0[step]), float(table.out_to_x0[step])
-    if table.name == "euler" and sample == 1 and 0 < abs(out) <= 1:  # x0 = x + left v; x = (1 - left) x0 + left noise
-        return 1 - abs(out), abs(out)
+    sample, out, most = map(float, (table.sample_to_x0[step], table.out_to_x0[step], table.out_to_x0.max()))
+    if sample == 1 and table.name == "euler" and abs(abs(table.out_to_x0[0]) - 1) < TOLERANCE:
+        return 1 - abs(out), abs(out)  # x0 = x + left v; x = (1 - left) x0 + left noise
     # What the output means is added to the sample; DPM-Solver without ++ takes it off, for it means the noise.
-    if table.name in ("ddpm", "ddim", "dpmsolver++") and sample > 0 and table.x0_to_next[step] >= 0:
+    if table.name in ("ddpm", "ddim", "dpmsolver++") and table.x0_to_next[step] >= 0 and 0 < sample != 1 and most < 0:
         if abs(1 + out**2 - sample**2) < TOLERANCE * sample**2:  # the network predicts the noise: x0 = (x - s out) / a
             return 1 / sample, -out / sample
         if abs(sample**2 + out**2 - 1) < TOLERANCE:  # it predicts the velocity: x0 = a x - s out

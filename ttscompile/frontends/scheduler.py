@@ -76,8 +76,7 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     if spacing is not None and spacing not in SPACINGS:
         raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
     if steps is not None and (type(steps) is not int or not 1 <= steps <= MOST_STEPS):
-        expected = f"expected a positive whole number, {MOST_STEPS} at most"
-        raise SpecError(f"{steps!r:.80} denoising steps are not possible; {expected}.")
+        raise SpecError(f"{steps!r:.80} denoising steps are not possible; expected a whole number, 1 to {MOST_STEPS}.")
 
     name = sampler or own_name
     if name is None:
@@ -100,6 +99,9 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
         )
     if name == DPM and own_name != DPM:
         given = _for_dpm_solver(given, where)
+    elif name != DPM == own_name:
+        bounds = bool(given.get("thresholding"))  # the only bound that it has, and one that is not at 1 is refused
+        given |= {"clip_sample": bounds, "thresholding": bounds and given.get("sample_max_value", 1) != 1}
     if spacing is not None:
         given["timestep_spacing"] = spacing
     trained = given.get("num_train_timesteps", 1000)
@@ -140,10 +142,9 @@ def _for_dpm_solver(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     if clips and bound != 1:
         found = f"clip_sample_range is {bound!r:.80}"
         raise SpecError(f"{where}: {found}; sampler {DPM} bounds the sample at 1 or not at all. Use ddpm or ddim.")
-    kept = {key: value for key, value in settings.items() if key != "variance_type"}
     blows_up = not clips and settings.get("prediction_type", "epsilon") == "epsilon"
-    spacing = "leading" if blows_up else "trailing"
-    return {**kept, "timestep_spacing": spacing, "thresholding": bool(clips), "sample_max_value": 1.0}
+    changed = {"timestep_spacing": "leading" if blows_up else "trailing", "variance_type": None}
+    return {**settings, **changed, "thresholding": bool(clips), "sample_max_value": 1.0}
 
 
 def _step_arguments(

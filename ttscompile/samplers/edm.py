@@ -57,12 +57,11 @@ def edm_table(sigmas: Sequence[float], sigma_data: float, *, clip: float | None 
         raise SpecError(f"EDM's noise levels must fall, and be two or more; found {levels.tolist()}.")
     if levels[-1] < 0 or not (np.isfinite(sigma_data) and sigma_data > 0):
         raise SpecError(f"noise levels and sigma_data must not be negative; found {levels[-1]} and {sigma_data}.")
-    sigma, following = levels[:-1], levels[1:]
+    sigma, ratio = levels[:-1], levels[1:] / levels[:-1]
     deviation = np.hypot(sigma, sigma_data)
     # The sample of a row is x / unit: noise at first, c_in x then, and after the last row x itself.
     unit = np.concatenate([sigma[:1], deviation[1:]])
     next_unit = np.append(unit[1:], 1.0)
-    ratio = following / sigma
     return deterministic_table(
         "edm",
         sigma,

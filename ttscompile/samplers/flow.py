@@ -118,9 +118,8 @@ def _times(steps: int | Sequence[float], start: float, end: float) -> Times:
 
 
 def _euler(times: Times, scale: float, clip: float | None) -> SamplerTable:
-    lengths = np.diff(times)
+    lengths, left = np.diff(times), times[-1] - times[:-1]
     zero, one = np.zeros_like(lengths), np.ones_like(lengths)
-    left = times[-1] - times[:-1]
     # x + h v = x0 h / left + x (1 - h / left) where x0 = x + left v; unclipped it is added directly.
     share = zero if clip is None else lengths / left
     return deterministic_table(

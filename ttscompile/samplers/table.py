@@ -204,8 +204,7 @@ def _verify(chains: _Chains, rows: _Rows) -> None:
             unclipped = rows.sample_to_x0[k] * given[k] + rows.out_to_x0[k] * outs[k]
             x0 = unclipped if rows.clip is None else unclipped.clamp(-rows.clip, rows.clip)
             terms = [rows.x0_to_next[k] * x0, rows.sample_to_next[k] * given[k], rows.out_to_next[k] * outs[k]]
-            terms += [rows.noise_to_next[k] * noise[k]]
-            terms += [weight * memory for weight, memory in zip(rows.before[k], kept, strict=True)]
+            terms += [rows.noise_to_next[k] * noise[k], *(w * m for w, m in zip(rows.before[k], kept, strict=True))]
             expected = torch.stack(terms).sum(0)
             scale = max(1.0, float(unclipped.abs().max()), *(float(term.abs().max()) for term in terms))
             error = max(float((meant[k] - x0).abs().max()), float((made[k] - expected).abs().max()))
@@ -223,8 +222,10 @@ def _refuse_known(scheduler: Any) -> None:
     """Refuse by name what probing would refuse by number."""
     name, config = type(scheduler).__name__, scheduler.config
     if name.startswith("FlowMatch"):
-        loop = "ttscompile.flow_matching_table(scheduler.sigmas.tolist(), timestep_scale=1000)"
-        raise SpecError(f"sampler {name} is of flow matching, whose loop is {loop} after set_timesteps.")
+        euler = name == "FlowMatchEulerDiscreteScheduler" and not config.get("stochastic_sampling")
+        told = "is of flow matching, whose loop is" if euler else "has no table; that of Euler's steps without noise is"
+        loop = f"flow_matching_table(scheduler.sigmas.tolist(), timestep_scale={config.num_train_timesteps})"
+        raise SpecError(f"sampler {name} {told} ttscompile.{loop} after set_timesteps.")
     if any(part in name for part in _UNREAD):
         remedy = "Use DPMSolverMultistepScheduler.from_config(scheduler.config), which has the same betas."
         raise SpecError(f"sampler {name}: no table can be measured of its steps. {remedy}")
@@ -296,9 +297,8 @@ def sampler_table(
     rows = _measure(chains)
     _verify(chains, rows)
     count = rows.before.shape[1]
-    shift = np.zeros((count, 3 + count))
-    shift[0:1, 0] = 1  # the newest memory is what the output meant
-    shift[range(1, count), range(3, 2 + count)] = 1
+    shift = np.eye(count, 3 + count, 2)  # each memory is the one before
+    shift[:1] = np.eye(1, 3 + count)  # but the newest, which is what the output meant
     return SamplerTable(
         name=name or NAMES.get(name_of, name_of),
         timesteps=timesteps.numpy(),
