@@ -1,7 +1,5 @@
 """The one yardstick: what it says of answers that are known, and of plans that cannot share the original's noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import erf
 from pathlib import Path
@@ -156,6 +154,8 @@ def test_limits_of_a_difference() -> None:
     assert difference == pytest.approx(0.1**0.5 - 0.2)
     assert limit > difference
     assert further(score(0.09), score(0.04))[1] > 100, "one call tells nothing"
+    below = score(-0.01, -0.01, -0.01)
+    assert further(score(0.0025, 0.0025, 0.0025), below) == pytest.approx((0.15, 0.05)), "no distance is below 0"
 
 
 @pytest.mark.parametrize(

@@ -168,7 +168,8 @@ def further(score: Score, other: Score) -> tuple[float, float]:
     clustered = replace(own, h=own.h - theirs.h).clustered
     if len(own.h) == 1:
         return difference, float("inf")
-    apart = signed_root(own.resampled(clustered)) - signed_root(theirs.resampled(clustered))
+    # No distance is below 0, though its estimate may be: that counts as 0, else what is near seems far from it.
+    apart = signed_root(own.resampled(clustered)) - signed_root(theirs.resampled(clustered)).clip(0)
     return difference, float(np.quantile(apart, 0.975))
 
 
