@@ -86,28 +86,32 @@ def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, Observati
 
 
 def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
-    if array.shape[1:] == spec.shape and len(array) > 0 and array.dtype == spec.dtype:
+    wrong = "shape" if array.shape[1:] != spec.shape or len(array) < 1 else "dtype"
+    if wrong == "dtype" and array.dtype == spec.dtype:
         return
-    expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]"
-    found = f"{array.dtype!s:.80} {list(array.shape)}"
-    if array.shape[1:] != spec.shape or len(array) < 1:
-        single = " A single stream needs a first axis of 1: use obs[None]."
-        remedy = single if array.shape == spec.shape else image_remedy(array, spec)
-        raise ObservationError(f"observation {key!r} has the wrong shape: expected {expected}; found {found}.{remedy}")
-    remedy = f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of training."
-    remedy = image_remedy(array, spec) or remedy
-    raise ObservationError(f"observation {key!r} has the wrong dtype: expected {expected}; found {found}.{remedy}")
+    convert = f" Convert it with .astype(np.{spec.dtype}), after making sure that its units are those of training."
+    remedy = image_remedy(array, spec) or (convert if wrong == "dtype" else _frames_remedy(array, spec))
+    if array.shape == spec.shape:
+        remedy = " A single stream needs a first axis of 1: use obs[None]."
+    expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]; found {array.dtype!s:.80} {list(array.shape)}"
+    told = f"observation {key!r} has the wrong {wrong}: expected {expected}"
+    raise ObservationError(f"{told}.{remedy}")
+
+
+def _frames_remedy(array: Array, spec: ObservationSpec) -> str:
+    """What to do with another number of frames than the key has; nothing for other arrays."""
+    if spec.frames and array.shape[1:] != spec.shape and spec.shape[1:] in (array.shape[1:], array.shape[2:]):
+        return f" Give the last {spec.frames} frames of each stream; select_action takes the newest alone."
+    return " It has no axis of frames here: give the newest alone, [:, -1]." if array.shape[2:] == spec.shape else ""
 
 
 def image_remedy(array: Array, spec: ObservationSpec) -> str:
     """What to do with an image of bytes, or with its channels last; nothing for other arrays."""
-    remedy = ""
-    if spec.image and array.dtype.kind in "iu":
-        remedy += f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
+    divide = f" Divide by 255, channels first: image.astype(np.{spec.dtype}) / 255."
     channels = spec.shape[-3] if spec.image and array.ndim > 3 else 0
-    if 0 < channels == array.shape[-1] and array.shape[-3] != channels:
-        remedy += " Its channels are last: use np.moveaxis(image, -1, -3)."
-    return remedy
+    last = bool(0 < channels == array.shape[-1] and array.shape[-3] != channels)
+    move = " Its channels are last: use np.moveaxis(image, -1, -3)."
+    return divide * bool(spec.image and array.dtype.kind in "iu") + move * last
 
 
 def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:

@@ -92,15 +92,15 @@ def build(
     require_rate(policy_hz)
     if isinstance(trajectories, str | os.PathLike):
         trajectories = (trajectories,)
+    if not trajectories:
+        trajectories = (recordings_of(checkpoint),)
+        explain("recordings", (f"no recordings were given: {trajectories[0]}, of its training; -t takes a copy",))
     named = tuple(trajectories)
 
     def check(spec: PolicySpec) -> None:
-        if named and spec.instruction is None:  # else the artifact's tokenizer is needed
+        if spec.instruction is None:  # else the artifact's tokenizer is needed
             load_episodes(spec, named, observation)
 
-    if not trajectories:
-        trajectories = (recordings_of(checkpoint),)
-        explain("recordings", (f"no recordings were given: {trajectories[0]}, which the policy was trained on",))
     how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, "read": check}
     how |= of_checkpoint
     target = Path(os.path.realpath(directory))

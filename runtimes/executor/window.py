@@ -73,8 +73,8 @@ class FrameSpec:
     def _own(self, key: str, array: Array, spec: ObservationSpec) -> Array:
         if array.shape != spec.shape or array.dtype != spec.dtype:
             remedy = image_remedy(array[None], spec).strip() or "Convert it with .astype." * (array.shape == spec.shape)
-            if array.shape[1:] == spec.shape and key in self.history:
-                remedy = f"Give one frame at a time; the executor makes the window of {self.steps}."
+            if array.shape[1:] == spec.shape:
+                remedy = f"Give one frame of one robot, [0] say; the executor makes the window of {self.steps}."
             what = f"one frame of observation {key!r} must be {spec.dtype} {list(spec.shape)}"
             raise ObservationError(f"{what}; found {array.dtype!s:.80} {list(array.shape)}. {remedy}".rstrip())
         own = array.copy()  # and then looked at: another thread may write into the caller's

@@ -1,7 +1,5 @@
 """The doctor: what it sees, that every trouble has a remedy, and that it works where nothing else does."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -13,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
+from tests.artifact.folders import flip
+from tests.commands import done, refused, run
 from tests.plans import store_schedules
-from ttscompile.cli import main
 from ttscompile.core.finding import Finding, Level
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor, machine as doctor_machine
@@ -49,7 +47,7 @@ def system(root: Path, **files: str) -> Path:
 
 
 def test_an_artifact_that_runs_here_has_no_problem(calibrated: Path) -> None:
-    result = CliRunner().invoke(main, ["doctor", str(calibrated), "--json"], catch_exceptions=False)
+    result = run("doctor", calibrated, "--json")
     told = json.loads(result.stdout)
     assert (result.exit_code, told["ok"], told["problems"]) == (0, True, 0)
     by_name = {finding["what"]: finding for finding in told["findings"]}
@@ -60,20 +58,15 @@ def test_an_artifact_that_runs_here_has_no_problem(calibrated: Path) -> None:
 
 
 def test_the_same_as_text(calibrated: Path) -> None:
-    result = CliRunner().invoke(main, ["doctor", str(calibrated)], catch_exceptions=False)
-    assert result.exit_code == 0
+    told = done("doctor", calibrated).stdout
     for expected in ("onnxruntime", "threads=1", "identity", "MiB of rollout cache", "No problem"):
-        assert expected in result.stdout
+        assert expected in told
 
 
 def test_a_damaged_artifact_is_a_problem_with_its_remedy(calibrated: Path, tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged"
-    shutil.copytree(calibrated, damaged)
-    weights = damaged / "weights.safetensors"
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
-    result = CliRunner().invoke(main, ["doctor", str(damaged)], catch_exceptions=False)
+    damaged = shutil.copytree(calibrated, tmp_path / "damaged")
+    flip(damaged / "weights.safetensors", -1)
+    result = run("doctor", damaged)
     assert result.exit_code == 1
     assert "PROBLEM load" in result.stdout
     assert "the file was changed since it was written" in result.stdout
@@ -87,7 +80,7 @@ def test_an_artifact_that_is_not_calibrated_is_a_warning(toy_compiled: Path) -> 
 
 
 def test_a_folder_that_is_not_there_is_bad_input() -> None:
-    assert CliRunner().invoke(main, ["doctor", "/nowhere"]).exit_code == 2
+    assert refused("doctor", "/nowhere")
     assert doctor.main(["/nowhere"]) == 2
     assert doctor.main(["--wrong"]) == 2
 
@@ -133,6 +126,9 @@ def test_requirements_are_read_with_their_extras() -> None:
     wanted = doctor_machine.requirements()
     assert ("numpy", "2.0", "") in wanted
     assert ("torch", "2.11", "compile") in wanted
+    assert ("metaworld", "3.1.1", "examples") in wanted, "of one version alone"
+    assert all(each.least for each in wanted)
+    assert found("extra 'videos'", doctor_machine.package_findings()).level in (Level.OK, Level.NOTE)
     assert release("2.13.0+cpu") == (2, 13)
 
 

@@ -121,7 +121,9 @@ LEROBOT_TYPES += ["molmoact2", "fastwam", "something_new"]
 
 DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["adapter_config.json", "adapter_model.safetensors"], "PEFT adapter.*adapter_config.json.*Merge"),
-    (["step_10/pretrained_model/config.json"], "around what lerobot saved.*Give its folder pretrained_model"),
+    (["step_10/pretrained_model/config.json"], "around what lerobot saved.*Give the folder pretrained_model in it"),
+    (["checkpoints/000200/pretrained_model/config.json"], "told by checkpoints/000200/pretrained_model.*in it"),
+    (["meta/info.json", "data/chunk-000/file-000.parquet"], "a data set of LeRobot, not a policy.*with --trajectories"),
     (["params/_METADATA", "params/manifest.ocdbt", "assets/norm.json"], "a JAX checkpoint.*Convert it to PyTorch"),
     (["model.msgpack"], "a JAX checkpoint"),
     (["manifest.json", "weights.safetensors"], "compiled already.*ttscompile.load"),

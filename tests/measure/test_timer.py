@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ttscompile.measure.points import best_plan
 from ttscompile.measure.timer import Timer, Times
 
 
@@ -42,3 +43,13 @@ def test_medians_and_quartiles_are_numpys() -> None:
         times = Times(ms)
         assert times.median == pytest.approx(np.median(ms))
         assert times.quartiles == pytest.approx(np.percentile(ms, [25, 75]))
+
+
+@pytest.mark.parametrize("deadline_ms", [None, 100.0])
+def test_of_plans_whose_distances_are_printed_alike_the_faster_is_the_nearest(deadline_ms: float | None) -> None:
+    """That in eight bits, say, of which the other is the same in fp32; a plan that is really nearer is taken."""
+    times = {"fp32": Times((68.5,)), "int8": Times((41.4,)), "near": Times((90.0,))}
+    distances = {"fp32": 0.11156, "int8": 0.11162, "near": 0.104}
+    alike = {name: times[name] for name in ("fp32", "int8")}
+    assert best_plan(alike, distances, (), deadline_ms) == "int8"
+    assert best_plan(times, distances, (), deadline_ms) == "near"

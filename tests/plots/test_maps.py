@@ -65,6 +65,13 @@ def test_a_name_that_is_moved_from_its_point_is_led_to_it() -> None:
     assert [isinstance(text, Annotation) and text.arrow_patch is not None for text in texts] == [False, True]
 
 
+def test_plans_of_one_distance_are_beside_each_other_and_no_tick_has_the_label_of_another() -> None:
+    axes = frontier_of([Point("s", "fast", 0.1116, 41.4), Point("s", "schedule", 0.11156, 68.5)]).axes[0]
+    labels = [t.get_text() for t in axes.get_yticklabels(which="both") if t.get_text()]
+    low, high = axes.get_ylim()
+    assert len(labels) == len(set(labels)) > 0 and high > 1.4 * low
+
+
 @pytest.mark.parametrize("plan", [np.zeros((4, 3), np.int8), np.full((4, 2), 4, np.int8), np.zeros((1, 4, 2), np.int8)])
 def test_what_is_no_plan_of_these_blocks_is_refused(plan: np.ndarray) -> None:
     with pytest.raises(IllegalPlanError, match=r"expected \[K, 2\]"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from ttscompile.core.lattice import dense_plan
 from ttscompile.core.plan import Plan
 from ttscompile.doctor.target import artifact_findings
 from ttscompile.ir.program import Program
+from ttscompile.report.facts import limits
 from ttscompile.report.timing import measure_plans
 from ttscompile.runtimes.random_calls import random_call
 from ttscompile.samplers.flow import flow_matching_table
@@ -63,3 +65,11 @@ def test_such_a_plan_is_timed_tried_and_verified(artifact: Artifact) -> None:
     assert "calls a second" in call.found
     rungs = {rung.name: rung for rung in ttscompile.verify(artifact.path).rungs}
     assert "executed actions of plan 'drawing' are" in rungs["sparsity error"].told
+
+
+def test_who_has_eight_bits_is_not_told_to_get_them(once: Once, tmp_path: Path) -> None:
+    path, plain = shutil.copytree(policies.compiled(once, "int8"), tmp_path / "int8"), policies.compiled(once)
+    plans = load_artifact(path).plans
+    update_plans(path, {**plans, "exact": replace(plans["dense"], precision={})}, "exact", {})
+    told = [" ".join(limits(load_artifact(one)).points) for one in (plain, path)]
+    assert ["--precision int8 may be faster" in one for one in told] == [True, False]

@@ -1,7 +1,5 @@
 """``select_action`` and ``predict_action_chunk``: LeRobot's queues, on any policy."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 
@@ -44,6 +42,21 @@ def window(queues: Queues) -> list[float]:
     state = queues.observation(queues._frames)["observation.state"]
     assert state.shape[1:] == (3, 2)
     return state[0, :, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("shape", "remedy"),
+    [((1, 2), "Give the last 3 frames of each stream"), ((1, 1, 2), "last 3 frames"), ((1, 6, 2), "last 3 frames"),
+     ((1, 3, 3), None), ((1, 6), None), ((0, 3, 2), None)],
+)  # fmt: skip
+def test_another_number_of_frames_is_refused_with_advice(shape: tuple[int, ...], remedy: str | None) -> None:
+    with pytest.raises(ObservationError, match=r"wrong shape: expected float32 \[B, 3, 2\]") as refused:
+        check_observation({"obs": np.zeros(shape, np.float32)}, {"obs": SPECS["observation.state"]})
+    assert ("frames" in str(refused.value)) == (remedy is not None)
+    assert remedy is None or remedy in str(refused.value)
+    queues = Queues(SPECS)
+    with pytest.raises(ObservationError, match=r"expected float32 \[B, 2\].*give the newest alone, \[:, -1\]"):
+        queues.after(frame(1) | {"observation.state": np.zeros((1, 3, 2), np.float32)})
 
 
 def test_the_first_frame_stands_for_those_before_it() -> None:

@@ -50,7 +50,7 @@ def test_calls_are_divided_into_episodes(file: Path) -> None:
 )
 def test_a_file_that_is_no_archive_is_told_so(file: Path, content: bytes, found: str) -> None:
     file.write_bytes(content)
-    with pytest.raises(TrajectoryError, match=f"expected an .npz, a zip archive of arrays; found {found}") as caught:
+    with pytest.raises(TrajectoryError, match=f".npz, or the folder of a data set; found {found}") as caught:
         load(file)
     assert "pickle" not in str(caught.value)
 
@@ -132,6 +132,7 @@ NAN = np.where(np.arange(30).reshape(5, 2, 3) == 13, np.nan, 0).astype(np.float3
         (changed(obs=None, state=np.zeros((5, 2, 3))), "has no array 'obs'.*; it has goal, state"),
         (changed(obs=np.zeros((5, 2, 4), np.float32)), r"'obs' has shape \[5, 2, 4\]; expected .*\[.., 2, 3\]"),
         (changed(obs=np.zeros((5, 3), np.float32)), r"shape \[5, 3\].*If its rows are frames, say so"),
+        (changed(obs=np.zeros((5, 1, 2, 3), np.float32)), r"without the axis of streams: obs\[:, 0\]"),
         (changed(obs=np.zeros((4, 2, 3), np.float32)), "observations differ in length"),
         (changed(obs=np.float32(1)), "observations differ in length"),
         (changed(obs=np.zeros((5, 2, 3), np.complex64)), "'obs' has dtype complex64; expected float32"),

@@ -351,7 +351,7 @@ def warn_if_noisy(trials: Trials) -> None:
         trials.bar.warn(
             f"the original hardly heeds what was recorded: with other noise its actions change by {noise:.4g}, and with"
             f" another observation by {observed:.4g}. Look at the units of the recordings, and at the order of their"
-            " columns."
+            " columns. If these are right, the policy has learned little from what it observes: train it longer."
         )
 
 

@@ -166,16 +166,16 @@ def plans_beside(
     plans: dict[str, Found] = {}
     skipped: dict[str, str] = {}
     if not strategy.fits_correction:
-        return plans, dict.fromkeys((SAFE, FAST), f"strategy {strategy.name!r} fits no correction")
+        return plans, dict.fromkeys((SAFE, FAST), f"needs a correction: strategy {strategy.name!r} fits none")
     if 2 * target >= steps:
-        skipped[SAFE] = f"twice {target} of {steps} steps is the dense plan"
+        skipped[SAFE] = f"would be the dense plan: twice {target} of {steps} steps"
     if target <= 2:
-        skipped[FAST] = f"the target computes {target} whole step{'s' * (target > 1)}: half of that is too little"
+        skipped[FAST] = f"would compute too little: half of the target's {target} whole step{'s' * (target > 1)}"
     for name, count in ((SAFE, 2 * target), (FAST, max(2, target // 2))):
         if name in skipped:
             continue
         if (best := crowded.best(count, f"plan {name}")) is None:
-            skipped[name] = "the time limit left none for it"
+            skipped[name] = "found no time within the limit"
         else:
             plans[name] = task.whole_steps(best.steps)
     return plans, skipped

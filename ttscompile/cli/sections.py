@@ -37,7 +37,7 @@ def require_recordings(paths: Recordings) -> None:
     """Raise TrajectoryError unless all of these exist: to be told before torch is imported, which takes seconds."""
     for path in paths:
         if not on_hub(path):
-            require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
+            require_path(path, TrajectoryError, "Give a recording, or hf://datasets/ORGANISATION/NAME.")
 
 
 def trajectories_options(required: bool = True, what: str = "Learn from these recorded episodes.") -> Decorator:

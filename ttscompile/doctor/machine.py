@@ -28,6 +28,7 @@ ENABLES = {
     "compile": "convert, calibrate, bench -t, inspect -o, pictures, runtime='torch' and 'reference'",
     "tokens": "instructions as text",
     "recordings": "recordings in zarr, HDF5 and LeRobot's format",
+    "videos": "LeRobot's data sets with videos",
     "serve": "serve",
     "hub": "hf:// names, push",
     "pusht": "examples/pusht",
@@ -37,7 +38,7 @@ ENABLES = {
 """What each extra of ttscompile is for. Those for its own development are not looked at."""
 
 _REQUIREMENT = re.compile(
-    r"(?P<name>[A-Za-z0-9._-]+)(\[.*?\])?\s*(>=\s*(?P<least>[0-9.]+))?[^;]*(;\s*extra\s*==\s*['\"](?P<extra>\w+)['\"])?$"
+    r"(?P<name>[\w.-]+)(\[.*?\])?\s*([>=]=\s*(?P<least>[0-9.]+))?[^;]*(;\s*extra\s*==\s*['\"](?P<extra>\w+)['\"])?$"
 )
 _COMMAND_LINE = ("click", "rich")
 _PROVIDER = "CPUExecutionProvider"
@@ -70,10 +71,8 @@ def _python() -> list[Finding]:
     part, bits = "python", 8 * struct.calcsize("P")
     told = f"{platform.python_implementation()} {platform.python_version()}, {bits} bits"
     old = sys.version_info[:2] < PYTHON
-    remedy = "Install a 64-bit Python: onnxruntime has no other."
-    if old:
-        remedy = f"Install Python {'.'.join(map(str, PYTHON))} or later."
-    own = Finding.judged(part, "version", told, old or bits < 64, remedy, Level.PROBLEM)
+    better = f"Python {'.'.join(map(str, PYTHON))} or later" if old else "a 64-bit Python: onnxruntime has no other"
+    own = Finding.judged(part, "version", told, old or bits < 64, f"Install {better}.", Level.PROBLEM)
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
     remedy = "ttscompile is tested on Linux only; use that."
     return [own, Finding.judged(part, "system", system, platform.system() != "Linux", remedy)]

@@ -27,7 +27,7 @@ _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert 
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
 _DPPO = f"{_BUILD}. Of one that is fine-tuned, the module takes actor_ft in the last steps, and actor before them."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
-_INNER = "Give its folder pretrained_model."
+_INNER = "Give the folder pretrained_model in it."
 _PUT = "Put model.safetensors beside the JSON files and statistics of a LeRobot policy {}, and convert that folder."
 _TRAIN = f"No tool makes LeRobot's {{}} of it: train one with LeRobot. Or: {_HEAD}"
 _JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
@@ -80,9 +80,10 @@ POLICIES = (
 
 DIRECTORIES = (
     Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
+    Refusal(r"^meta/info\.json$", "a data set of LeRobot, not a policy", "Give it with --trajectories."),
     Refusal(r"^adapter_config\.json$", "a PEFT adapter without the config.json of its policy", MERGE),
     Refusal(r"(^|/)(_(CHECKPOINT_)?METADATA|manifest\.ocdbt)$|\.msgpack$", "a JAX checkpoint (Orbax or msgpack)", _JAX),
-    Refusal(r"(^|/)pretrained_model/config\.json$", "a directory around what lerobot saved", _INNER),
+    Refusal(r"(^|/)pretrained_model(/config\.json)?$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
     Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT.format("xvla")),

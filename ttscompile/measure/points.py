@@ -157,7 +157,7 @@ def best_plan(
 
     Without a deadline it is the ``fastest`` of those that are near enough, or the nearest of all if none is. With one
     it is the nearest of those whose longest call keeps it, of those that are near enough where one of them keeps it;
-    None if none at all does.
+    None if none at all does. The faster of two is the nearest where three decimals do not tell their distances apart.
 
     Args:
         times: of the plans that may be taken.
@@ -168,7 +168,7 @@ def best_plan(
         return fastest({name: times[name].median for name in times if name in near}, distances)
     in_time = [name for name, one in times.items() if deadline_ms is None or max(one.ms) <= deadline_ms]
     of = [name for name in in_time if name in near] or in_time
-    return min(of, key=lambda name: (distances[name], times[name].median), default=None)
+    return min(of, key=lambda name: (round(distances[name], 3), times[name].median), default=None)
 
 
 @dataclass(frozen=True)

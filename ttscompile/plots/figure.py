@@ -22,8 +22,7 @@ STEPS_AXIS = "denoising step k, in order of execution (0 is the noisiest)"
 FORMATS = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 """Suffixes of pictures; and of the metadata that matplotlib would write, what has to stay out."""
 
-_CHARACTER = 0.012
-"""Share of the axes' width, about, that a character of a point's name takes."""
+_CHARACTER = 0.012  # share of the axes' width, about, that a character of a point's name takes
 
 
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:

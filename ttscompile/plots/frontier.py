@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log
+from math import log, sqrt
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +27,7 @@ MOST_NAMES = 12
 ROUNDING = 1e-4
 """A plan that is nearer is the original but for rounding: drawn, it would take the axis from all others."""
 
-_TITLE_WIDTH = 105
-"""Characters."""
+_TITLE_WIDTH = 105  # characters
 
 
 def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: str) -> Figure:
@@ -71,6 +70,8 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     plain_powers(axes.xaxis)
     plain_powers(axes.yaxis)
     axes.margins(x=0.08, y=0.1)
+    low, high = axes.get_ylim()  # nearer than three digits tell apart is beside each other
+    axes.set_ylim(min(low, sqrt(low * high) / 1.2), max(high, sqrt(low * high) * 1.2))
     exact = ", ".join(f"{p.name} of {p.series}, {p.latency_ms:.3g} ms" for p in points if p.distance <= ROUNDING)
     parts = [*title.splitlines(), *([f"not drawn, at no distance but rounding: {exact}"] if exact else [])]
     lines = [line for part in parts for line in wrap(part, _TITLE_WIDTH)]

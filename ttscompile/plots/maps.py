@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 COLOURS = {Source.COMPUTE: "#d55e00", Source.FORWARD: "#009e73", Source.TIMESTEP: "#b9dcf2", Source.ROLLOUT: "#f0e442"}
 """From Okabe and Ito's palette, which colour-blind readers can tell apart; what is computed is the darkest."""
 
-_LEAST, _MOST = -8.0, 0.0
-"""Powers of ten at the ends of the colours of errors: rounding, and another residual altogether."""
+_LEAST, _MOST = -8.0, 0.0  # powers of ten at the ends of the colours: rounding, and another residual altogether
 
 _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward": "FF"}
 

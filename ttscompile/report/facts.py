@@ -292,7 +292,7 @@ def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 def left_out(record: Mapping[str, Any]) -> tuple[str, ...]:
     """Why there is no plan of a name that calibration could have made."""
-    return tuple(f"Plan {name!r}: none, {reason}." for name, reason in record.get("skipped", {}).items())
+    return tuple(f"Left out: {name!r}, which {reason}." for name, reason in record.get("skipped", {}).items())
 
 
 def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
@@ -335,9 +335,9 @@ def limits(artifact: Artifact) -> Section:
             f"The sampler ({sampler.name}) draws noise in every step: two calls on one observation differ, dense"
             " or not. Give reset a seed, or predict_action the noise, to repeat a call."
         )
-    if not plans_of(manifest)[manifest.default_plan].precision:
+    if manifest.precision is None:
         points.append("Weights are in fp32. On processors with integer dot products, --precision int8 may be faster.")
-    else:
+    elif plans_of(manifest)[manifest.default_plan].precision:
         points.append(f"It computes in {precision(manifest)}: dense calls differ from those in fp32 as well.")
     if any(plan.pruned for plan in manifest.plans.values()):
         points.append("A plan that is made for each observation costs a different time each call.")

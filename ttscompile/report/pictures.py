@@ -52,8 +52,8 @@ def shares_picture(course: Course) -> bytes:
         drawn = axes.imshow(shares[source].T, cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="none")
         axes.set_title(f"{source.name}: {shares[source].mean():.1%} of the cells", fontsize=10, loc="left")
         axes.set_ylabel("block")
+        axes.locator_params(integer=True, min_n_ticks=1)
     panels[-1].set_xlabel(STEPS_AXIS)
-    panels[-1].locator_params(axis="x", integer=True)
     figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
     return encoded(figure)
 
@@ -133,13 +133,15 @@ def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
     axes = figure.add_subplot()
     computed = [100 * (1 - score["sparsity"]) for score in scores.values()]
     span = (max(computed) - min(computed)) or 1.0
-    for x, (name, score) in zip(computed, scores.items(), strict=True):
-        middle, high = score["error"], score["error_p90"]
+    errors = [score["error"] for score in scores.values()]
+    for i, (name, score) in enumerate(scores.items()):
+        x, middle, high = computed[i], errors[i], score["error_p90"]
+        over = sum(abs(x - computed[j]) < span / 20 and abs(middle - errors[j]) < middle / 10 for j in range(i))
         axes.plot([x, x], [middle, high], color="#999999", linewidth=1, zorder=1)
         axes.plot(x, middle, "o", color=COLOURS[Source.COMPUTE], zorder=2)
         axes.plot(x, high, "_", color="#999999", markersize=10, zorder=1)
         told = plain(name, 24)
-        axes.annotate(told, (x, middle), fontsize=9, **beside((x - min(computed)) / span, told, -3))
+        axes.annotate(told, (x, middle), fontsize=9, **beside((x - min(computed)) / span, told, 11 * over - 3))
     axes.set_yscale("log")
     plain_powers(axes.yaxis)
     axes.set(xlabel="cells computed, %", ylabel="error of the actions, in their units")

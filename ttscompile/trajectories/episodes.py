@@ -206,7 +206,7 @@ def recorded_names(path: Path) -> tuple[list[str], bool]:
 
 def _opened(path: Path, limits: Mapping[str, int], wanted: Sequence[str]) -> tuple[str | None, Frames, bool]:
     """What a recording is (None for an ``.npz``), what it holds, and whether its rows are frames."""
-    require_path(path, TrajectoryError, "Give the file or the directory of a recording.")
+    require_path(path, TrajectoryError, "Give a recording, or hf://datasets/ORGANISATION/NAME.")
     kind = other_format(path)
     return kind, *(_npz(path) if kind is None else (sandboxed_frames(path, kind, wanted, **limits), True))
 
@@ -244,7 +244,7 @@ def read_npz(path: Path, only: str = "") -> dict[str, Array]:
         head = handle.read(6)
     if not head.startswith((b"PK", b"\x93NUMPY")):
         found = f"one that begins with {head!r}" if head else "an empty one"
-        raise TrajectoryError(f"{path}: expected an .npz, a zip archive of arrays; found {found}. {_SAVEZ}.")
+        raise TrajectoryError(f"{path}: expected an .npz, or the folder of a data set; found {found}. {_SAVEZ}.")
     # numpy parses headers as Python text, and raises whatever its parts raise; it leaves open what is no archive.
     with one_error(f"{path}: cannot be read as .npz", hint), path.open("rb") as handle:
         if zipfile.is_zipfile(handle):
@@ -308,6 +308,8 @@ def _checked(path: Path, key: str, array: Array, spec: ObservationSpec, frames: 
         told = f"{path}: {key!r} has shape {list(array.shape)}; expected {what} = [.., {', '.join(map(str, shape))}]."
         if array.shape[1:] == spec.shape[1:] and not frames:
             told += " If its rows are frames, say so: np.savez(..., meta=np.array('{\"frames\": true}'))."
+        elif array.shape[1:] == (1, *shape):
+            told += f" Save it without the axis of streams: {key}[:, 0]."
         elif spec.image:
             last = array.shape[1:] == (*shape[:-3], *shape[-2:], shape[-3])
             told += " Its channels are last: use np.moveaxis(image, -1, -3)." if last else " Is it another camera's?"

@@ -1,7 +1,5 @@
 """Frames in, windows out."""
 
-from __future__ import annotations
-
 import sys
 from contextlib import suppress
 from typing import Any
@@ -73,7 +71,11 @@ def test_an_observation_is_stacked_and_has_a_batch_of_one() -> None:
             {"obs": np.zeros(4, np.float32)},
             r"one frame of observation 'obs' must be float32 \[3\]; found float32 \[4\]",
         ),
-        ({"obs": np.zeros((2, 3), np.float32)}, r"Give one frame at a time; the executor makes the window of 2"),
+        (
+            {"obs": np.zeros((2, 3), np.float32)},
+            r"Give one frame of one robot, \[0\] say; the executor makes the window",
+        ),
+        ({"obs": np.zeros((1, 3), np.float32)}, r"Give one frame of one robot, \[0\] say; .* of 2"),
         ({"obs": np.zeros(3)}, r"found float64 \[3\]. Convert it with .astype"),
         ({"obs": np.array([0, np.nan, 0], np.float32)}, r"'obs' must be finite; found nan at index \(1,\)"),
         ({"obs": [0.0, 0.0, 0.0]}, "is a list; expected a numpy array"),

@@ -21,7 +21,7 @@ class Precision(Proposer):
         """Whether the artifact has another precision."""
         if artifact.manifest.precision is not None:
             return None
-        return "the artifact has fp32 alone; convert the checkpoint with --precision int8"
+        return "the artifact has fp32 alone; make it again with --precision int8, in Python precision='int8'"
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """The plan with as many parts in the other precision as may be; with none of them in fp32, where none may."""
