@@ -27,7 +27,6 @@ NOT_RUN = {
     "python examples/serve": "needs a server; the same tests run it against one",
     "ttscompile convert hf://": "from the hub: tests/hub",
     "ttscompile push compiled/ org/compiled-policy --private": "to the hub: tests/hub",
-    "ttscompile convert outputs/train": "a LeRobot policy: tests/policies/test_lerobot_golden.py converts two",
     "lerobot-": "a command of LeRobot: tests/plugins runs it, where lerobot is installed",
     "python -m lerobot_policy_ttscompile": "the same",
     "ttscompile convert rdt-1b/": "RDT-1B's directory: tests/policies converts a small one",

@@ -112,16 +112,6 @@ def test_a_calibration_keeps_the_precision(int8: Path) -> None:
     assert after.identity != before.identity
 
 
-@pytest.mark.parametrize("name", ["weights_int8.safetensors", "block_01_int8.onnx"])
-def test_changed_and_missing_files_are_found(int8: Path, name: str) -> None:
-    flip(int8 / name, (int8 / name).stat().st_size - 1)
-    with pytest.raises(ArtifactError, match=f"{name}: expected sha256"):
-        load_artifact(int8)
-    (int8 / name).unlink()
-    with pytest.raises(ArtifactError, match=f"{name}: cannot be read: the file is missing"):
-        load_artifact(int8)
-
-
 def test_an_int8_artifact_is_replaced_by_an_fp32_one(int8: Path, tmp_path: Path) -> None:
     write(int8, None)
     assert contents(int8) == contents(write(tmp_path / "fp32", None))

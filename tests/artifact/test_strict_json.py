@@ -1,8 +1,6 @@
 import pytest
 
-from ttscompile.artifact.manifest import PlanRecord
 from ttscompile.artifact.strict_json import Value, dump, parse
-from ttscompile.artifact.typed_json import from_json, to_json
 from ttscompile.core.untrusted_json import MAX_DEPTH
 from ttscompile.errors import ArtifactError
 
@@ -63,9 +61,3 @@ def test_integer_refuses(data: object) -> None:
 def test_number_refuses(data: object) -> None:
     with pytest.raises(ArtifactError, match="number"):
         Value(data, "x").number()
-
-
-@pytest.mark.parametrize("data", [-0.01, 1.01])
-def test_share_refuses(data: float) -> None:
-    with pytest.raises(ArtifactError, match=r"0\.\.1"):
-        from_json(PlanRecord, Value({**to_json(PlanRecord("all")), "sparsity": data}, "x"))

@@ -6,8 +6,6 @@ was settled. ``schema10/answers.npz`` has what that ttscompile answered, by prec
 made anew: when schema 12 comes, a file of schema 11 takes its place.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import zipfile

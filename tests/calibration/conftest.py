@@ -1,7 +1,5 @@
 """Artifacts that the suite shares; a test that changes one takes a copy."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """A calibration that is killed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

@@ -1,7 +1,5 @@
 """Small denoisers to calibrate, and recordings for them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pools of other processes, real and made up."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Iterator, Sequence
 from typing import Any

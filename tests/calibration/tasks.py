@@ -1,7 +1,5 @@
 """Tasks on the small policies, without the rest of calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

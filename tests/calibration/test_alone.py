@@ -1,7 +1,5 @@
 """One at a time changes an artifact: a second one is told so at once, and a kill leaves nothing locked."""
 
-from __future__ import annotations
-
 import fcntl
 import subprocess
 import sys

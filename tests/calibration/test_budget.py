@@ -1,7 +1,5 @@
 """Budgets: in which terms they can be given, what they come to, and when they are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Calibration from end to end on a small policy: what it promises, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a second of a calibration is: of work, whatever else the machine does, unless it gives next to nothing."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

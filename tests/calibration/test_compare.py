@@ -1,7 +1,5 @@
 """The comparison of plans and artifacts: what it measures, and what it refuses to compare."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -10,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 import ttscompile
+from tests.commands import as_json, done, refused
 from tests.families import cameras
 from tests.once import Once
 from tests.plans import store_schedules
@@ -22,7 +20,6 @@ from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.compare import _require_same_policy, compare
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.cli import main
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.core.plan import TokenReuse
 from ttscompile.errors import CalibrationError, OutputError
@@ -178,10 +175,8 @@ def test_the_picture_has_the_points_and_needs_a_folder(frontier: Comparison, tmp
 def test_bench_prints_the_same_as_a_table_and_as_json(
     planned: Path, other_sampler: Path, recording: Path, tmp_path: Path
 ) -> None:
-    arguments = [str(planned), "--trajectories", str(recording), "--with", str(other_sampler), "--calls", "2"]
-    runner = CliRunner()
-    told = runner.invoke(main, ["bench", *arguments, "--json", "--plot", str(tmp_path / "f.svg")])
-    assert told.exit_code == 0, told.stderr
+    words = ["bench", planned, "--trajectories", recording, "--with", other_sampler, "--calls", 2]
+    told = done(*words, "--json", "--plot", tmp_path / "f.svg")
     record = json.loads(told.stdout)
     labels = [one["label"] for one in record["contestants"]]
     assert labels == ["this artifact: dense", "this artifact: half", "five: dense"]
@@ -196,38 +191,31 @@ def test_bench_prints_the_same_as_a_table_and_as_json(
     assert "held-out calls" in (tmp_path / "f.svg").read_text()
     assert "warning: this artifact" in told.stderr
     assert told.stderr.count("held-out calls: ") == 1  # a log has a line for each part of the work, and no bar
-    lost = runner.invoke(main, ["bench", *arguments, "--json", "--plot", str(tmp_path / "none" / "f.png")])
-    assert lost.exit_code == 2
-    assert lost.stdout == ""
-    assert "held-out" not in lost.stderr, "refused before anything is computed"
-    assert "folder" in lost.stderr
-    shown = runner.invoke(main, ["bench", *arguments])
-    assert shown.exit_code == 0, shown.stderr
-    words = " ".join(shown.stdout.split())
-    assert "another sampler takes other noise, and has none" in words
-    assert "in which two calls of the original are" in words
+    lost = refused(*words, "--json", "--plot", tmp_path / "none" / "f.png")
+    assert "held-out" not in lost, "refused before anything is computed"
+    assert "folder" in lost
+    shown = done(*words)
+    text = " ".join(shown.stdout.split())
+    assert "another sampler takes other noise, and has none" in text
+    assert "in which two calls of the original are" in text
     assert f"five: identity {other[:12]}" in shown.stdout
 
 
 def test_bench_judges_the_plans_that_are_named(planned: Path, other_sampler: Path, recording: Path) -> None:
     twins = shutil.copytree(planned, planned.parent / "three")
     store_schedules(twins, None, {name: uniform_plan(10, 6, 5) for name in ("half", "same")}, "half", {})
-    words = ["bench", str(twins), "-t", str(recording), "--with", str(planned), "--calls", "2", "--json"]
+    words = ["bench", twins, "-t", recording, "--with", planned, "--calls", 2]
 
     def judged(*more: str) -> list[tuple[str, str]]:
-        told = CliRunner().invoke(main, [*words, *more])
-        assert told.exit_code == 0, told.stderr
-        return [(point["series"], point["name"]) for point in json.loads(told.stdout)["comparison"]["points"]]
+        return [(point["series"], point["name"]) for point in as_json(*words, *more)["comparison"]["points"]]
 
     both = [("compiled", "dense"), ("compiled", "half")]
     this = [("this artifact", name) for name in ("dense", "half", "same")]
     assert judged() == this + both
     assert judged("--plan", "half") == this[:2] + both
     assert judged("--plan", "same") == [this[0], this[2], both[0]]
-    refused = CliRunner().invoke(main, [*words, "--plan", "quick"])
-    assert refused.exit_code == 2 and "'quick'" in refused.stderr
-    again = CliRunner().invoke(main, [*words, "--with", str(twins), str(twins)])
-    assert again.exit_code == 2 and "two artifacts are called 'three'" in again.stderr
+    assert "'quick'" in refused(*words, "--plan", "quick")
+    assert "two artifacts are called 'three'" in refused(*words, "--with", twins, twins)
 
 
 def test_where_a_plan_is_far_by_number_of_the_action_and_by_call(frontier: Comparison, recording: Path) -> None:
@@ -256,9 +244,9 @@ def test_the_furthest_calls_have_what_the_cameras_saw_and_are_drawn(
     assert set(far.pictures) == set(cameras.CAMERAS)
     held_out = views[cameras.CAMERAS[0]][4 * far.episode + far.call, -1]
     np.testing.assert_allclose(far.pictures[cameras.CAMERAS[0]], held_out, atol=1e-6)
-    words = ["bench", str(folder), "--with", str(other), "-t", str(recorded), "--calls", "1"]
-    result = CliRunner().invoke(main, [*words, "--plot", str(tmp_path / "both.png")], catch_exceptions=False)
-    assert result.exit_code == 0 and "furthest calls" in result.stdout
+    words = ["bench", folder, "--with", other, "-t", recorded, "--calls", 1]
+    result = done(*words, "--plot", tmp_path / "both.png")
+    assert "furthest calls" in result.stdout
     assert f"episode {far.episode}, call" in result.stdout and "both-calls.png" in result.stderr
     with Image.open(tmp_path / "both-calls.png") as picture:
         assert picture.width > 2 * picture.height

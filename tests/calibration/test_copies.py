@@ -1,7 +1,5 @@
 """Calibrations of copies at the same time: each finds what it finds alone."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

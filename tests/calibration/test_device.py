@@ -1,7 +1,5 @@
 """Calibration on a device: everything of the network is there, and the rest on the CPU."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 from typing import Any

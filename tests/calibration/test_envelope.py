@@ -1,7 +1,5 @@
 """What calibration says of what it was given, so that a call can be told to be far outside of it."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

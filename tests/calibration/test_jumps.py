@@ -1,7 +1,5 @@
 """Jumps: fitted to what is not linear, judged on other episodes, and carried out as they were fitted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

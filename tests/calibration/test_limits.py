@@ -1,7 +1,5 @@
 """The time limit, seeds, and errors that are no numbers: what a calibration does at its edges."""
 
-from __future__ import annotations
-
 import errno
 import os
 import time

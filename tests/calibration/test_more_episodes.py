@@ -1,7 +1,5 @@
 """Whether more recorded episodes may pay: told by what half of those that there are would have given."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Plans beside the target: safe and fast."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -80,14 +78,14 @@ def test_a_plan_is_chosen_when_loading_or_calling(calibrated: tuple[Path, Calibr
 
 def test_what_cannot_be_made_is_said(artifact: Path, recording: Path) -> None:
     result = calibrate(artifact, [recording], 0.8, progress=False, max_minutes=1)
-    assert result.skipped == {"fast": "the target computes 2 whole steps: half of that is too little"}
+    assert result.skipped == {"fast": "would compute too little: half of the target's 2 whole steps"}
     assert len(computed(artifact, "safe")) == 4
     result = calibrate(artifact, [recording], 0.5, progress=False, max_minutes=1)
-    assert result.skipped == {"safe": "twice 5 of 10 steps is the dense plan"}
+    assert result.skipped == {"safe": "would be the dense plan: twice 5 of 10 steps"}
     assert len(computed(artifact, "fast")) == 2
     result = calibrate(artifact, [recording], 0.5, strategy="interval", progress=False, max_minutes=1)
     assert set(result.skipped) == {"safe", "fast"}
-    assert "fits no correction" in result.skipped["safe"]
+    assert "needs a correction: strategy" in result.skipped["safe"]
     record = load_artifact(artifact).manifest.calibration
     assert record is not None
     assert record["skipped"] == dict(result.skipped)
@@ -102,7 +100,7 @@ def test_a_search_for_safe_that_is_cut_short_is_no_finished_one(
         whole_steps.WholeSteps, "comparing", lambda self, count: whole(self, count) if count < 8 else float("inf")
     )
     result = calibrate(artifact, [recording], 0.6, progress=False, max_minutes=1)
-    assert (result.stopped, result.skipped["safe"]) == ("time limit", "the time limit left none for it")
+    assert (result.stopped, result.skipped["safe"]) == ("time limit", "found no time within the limit")
 
 
 def test_a_plan_that_is_no_safer_is_left_out_with_the_reason(

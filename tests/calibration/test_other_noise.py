@@ -1,7 +1,5 @@
 """The yardstick beside the errors of plans: how far two dense answers with different noise are apart."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts of a calibration on other processes: the same bits, a death on the way, and a cluster that goes."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What is told of the course of the work, where nobody watches a bar."""
 
-from __future__ import annotations
-
 import pytest
 
 from ttscompile.calibration.progress import Bar

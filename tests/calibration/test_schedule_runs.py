@@ -1,7 +1,5 @@
 """Schedules that begin alike go the same way once, and end where they would alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Consecutive calls with the rollout cache: the executor, corrections and training mean what the reference means."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

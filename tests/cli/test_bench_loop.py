@@ -1,29 +1,18 @@
 """``ttscompile bench --control-hz``."""
 
-from __future__ import annotations
-
-import json
 import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
+from tests.commands import as_json, refused, run
 from tests.plans import store_schedules
-from ttscompile.cli import main
 from ttscompile.core.lattice import dense_plan, uniform_plan
-
-
-def run(*arguments: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(main, ["bench", *map(str, arguments)])
-    return result.exit_code, result.stdout, result.stderr
 
 
 def test_it_says_what_is_feasible_with_the_arithmetic(toy_compiled: Path) -> None:
     """The toy has two actions a chunk: without a margin they last for a frame and two short calls."""
-    code, out, _ = run(toy_compiled, "--control-hz", 5, "--margin-ticks", 0, "--calls", 3, "--json")
-    assert code == 0
-    document = json.loads(out)
+    document = as_json("bench", toy_compiled, "--control-hz", 5, "--margin-ticks", 0, "--calls", 3)
     (name,) = document["loop"]["plans"]
     dense = document["loop"]["plans"][name]
     (timed,) = document["contestants"]
@@ -36,10 +25,10 @@ def test_it_says_what_is_feasible_with_the_arithmetic(toy_compiled: Path) -> Non
 
 
 def test_what_is_not_feasible_is_exit_status_1(toy_compiled: Path) -> None:
-    code, out, _ = run(toy_compiled, "--control-hz", 5, "--calls", 3)
-    assert code == 1
-    assert "too slow" in out
-    assert "ms > 400 ms = 2 actions at 5 Hz" in out
+    result = run("bench", toy_compiled, "--control-hz", 5, "--calls", 3)
+    assert result.exit_code == 1
+    assert "too slow" in result.stdout
+    assert "ms > 400 ms = 2 actions at 5 Hz" in result.stdout
 
 
 @pytest.mark.compiles
@@ -47,7 +36,8 @@ def test_the_baseline_is_named_as_one(toy_compiled: Path, tmp_path: Path) -> Non
     calibrated = shutil.copytree(toy_compiled, tmp_path / "compiled")
     plans = {"uniform": uniform_plan(5, 5, 1), "schedule": dense_plan(5, 5)}  # the baseline is the faster one
     store_schedules(calibrated, None, plans, "schedule", {"strategy": "tts"})
-    told = run(calibrated, "--control-hz", 10, "--margin-ticks", 0, "--calls", 3, "--plan", "uniform")[1]
+    options = ("--control-hz", 10, "--margin-ticks", 0, "--calls", 3, "--plan", "uniform")
+    told = run("bench", calibrated, *options).stdout
     assert "uniform (baseline) " in told and "Not for a robot." in told
 
 
@@ -60,6 +50,4 @@ def test_the_baseline_is_named_as_one(toy_compiled: Path, tmp_path: Path) -> Non
     ],
 )
 def test_bad_usage_is_exit_status_2(toy_compiled: Path, arguments: list[object], message: str) -> None:
-    code, _, err = run(toy_compiled, *arguments)
-    assert code == 2
-    assert message in err
+    assert message in refused("bench", toy_compiled, *arguments)

@@ -1,22 +1,19 @@
 """``ttscompile bench --choose``: the default of another machine, without another calibration."""
 
-from __future__ import annotations
-
-import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 import ttscompile
 from tests.calibration import policies
+from tests.commands import as_json, done, refused, run
 from tests.plans import store_schedules
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.write import choose_default
-from ttscompile.cli import main
 from ttscompile.cli.bench import choosable, choose_again
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
@@ -45,7 +42,7 @@ def made(toy: Path, folder: Path, scores: Mapping[str, Any], **record: Any) -> P
 
 
 def bench(directory: Path, *options: object) -> Result:
-    return CliRunner().invoke(main, ["bench", str(directory), "--calls", "2", "--choose", *map(str, options)])
+    return run("bench", directory, "--calls", 2, "--choose", *options)
 
 
 def timed(**milliseconds: float | tuple[float, ...]) -> list[Measurement]:
@@ -153,12 +150,10 @@ def test_a_plan_whose_limit_is_far_is_not_near(toy_compiled: Path, tmp_path: Pat
 
 
 def test_the_command_times_what_can_be_chosen(built: Path) -> None:
-    result = bench(built, "--json")
-    assert result.exit_code == 0, result.output
-    document = json.loads(result.stdout)
+    document = as_json("bench", built, "--calls", 2, "--choose")
     assert [one["plan"] for one in document["contestants"]] == ["dense", "schedule", "safe", "fast"]
     assert document["chosen"].split("'")[-2] == load_artifact(built).manifest.default_plan in ("schedule", "safe")
-    assert "chosen on" in CliRunner().invoke(main, ["inspect", str(built)]).stdout
+    assert "chosen on" in done("inspect", built).stdout
     assert ttscompile.load(built).info.identity == load_artifact(built).manifest.identity
 
 
@@ -176,17 +171,15 @@ def test_a_deadline_of_the_build_that_no_plan_keeps_is_told(toy_compiled: Path, 
 
 
 def test_what_cannot_be_chosen_is_told_before_anything_is_timed(built: Path) -> None:
-    result = bench(built, "--plan", "dense", "--plan", "far")
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "no --plan may be the default; expected one of schedule, safe, fast." in result.stderr
-    result = bench(Path(shutil.make_archive(str(built.parent / "zipped"), "zip", built)))
-    assert (result.exit_code, result.stdout) == (2, "") and "Unzip it and give the directory" in result.stderr
+    told = refused("bench", built, "--choose", "--plan", "dense", "--plan", "far")
+    assert "no --plan may be the default; expected one of schedule, safe, fast." in told
+    zipped = shutil.make_archive(str(built.parent / "zipped"), "zip", built)
+    assert "Unzip it and give the directory" in refused("bench", zipped, "--choose")
 
 
 def test_without_a_calibration_there_is_nothing_to_choose(toy_compiled: Path) -> None:
-    result = bench(toy_compiled)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "no plan was judged to be within 0.25. Run 'ttscompile build'" in " ".join(result.stderr.split())
+    told = refused("bench", toy_compiled, "--choose")
+    assert "no plan was judged to be within 0.25. Run 'ttscompile build'" in told
 
 
 def test_another_artifact_that_took_its_place_is_left_alone(built: Path) -> None:

@@ -1,7 +1,5 @@
 """The commands on a layer of the Push-T policy: what they print is one JSON document, or tables that say the same."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil
@@ -12,20 +10,14 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
+from tests.commands import as_json, done, refused
 from tests.plans import store_schedules
 from ttscompile.cli import main
 from ttscompile.cli.bench import fewest_threads
 from ttscompile.core.lattice import uniform_plan
 
 pytestmark = pytest.mark.slow
-
-
-def run(*arguments: object) -> Any:
-    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.stderr
-    return result
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +62,7 @@ def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None
         known = {one.name for one in options}
         for section in getattr(command, "sections", ()):
             assert {*section.options, *section.needs} <= known, f"{name}: {section.title}"
-        told = CliRunner().invoke(main, [name, "--help"]).stdout
+        told = done(name, "--help").stdout
         lines = [line.split() for line in told.splitlines() if line.startswith("  -")]
         for option in options:
             word = max(option.opts, key=len)
@@ -81,7 +73,7 @@ def test_every_option_is_in_one_list_of_the_help_and_says_what_it_does() -> None
 
 def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_checkpoint: Path, tmp_path: Path) -> None:
     arguments = ("--sampler", "ddim", "--steps", "4", "--explain", "--json")
-    result = run("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
+    result = done("convert", one_layer_checkpoint, "-o", tmp_path / "compiled", *arguments)
     made = json.loads(result.stdout)
     assert (made["sampler"]["name"], made["sampler"]["steps"]) == ("ddpm", 100)
     assert made["loops"]["ddim-4"] == {"sampler": "ddim", "steps": 4}
@@ -92,11 +84,11 @@ def test_convert_says_what_it_made_and_explains_on_standard_error(one_layer_chec
     assert stages[-1] == "write"
     assert all(stage in result.stderr for stage in stages)
     del made["stages"]
-    assert json.loads(run("inspect", tmp_path / "compiled", "--json").stdout) == made
+    assert as_json("inspect", tmp_path / "compiled") == made
 
 
 def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
-    made = json.loads(run("inspect", scheduled, "--json").stdout)
+    made = as_json("inspect", scheduled)
     flops, plans = made["flops"], made["plans"]
     assert flops["blocks"] == 100 * sum(block["flops"] for block in made["blocks"])
     assert plans["dense"]["flops"] == flops["prologue"] + flops["stems_and_tails"] + flops["blocks"]
@@ -107,26 +99,23 @@ def test_inspect_accounts_for_every_flop(scheduled: Path) -> None:
 
 
 def test_inspect_tells_the_same_in_tables(scheduled: Path) -> None:
-    text = run("inspect", scheduled).stdout
+    text = done("inspect", scheduled).stdout
     for expected in ("100 steps", "self_attention", "cross_attention", "feed_forward", "uniform (default)", "95.0%"):
         assert expected in text
 
 
 def test_inspect_draws_the_default_plan(scheduled: Path, tmp_path: Path) -> None:
-    result = run("inspect", scheduled, "-o", tmp_path / "plan.png", "--json")
-    json.loads(result.stdout)
+    as_json("inspect", scheduled, "-o", tmp_path / "plan.png")
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> None:
     picture = tmp_path / "plan.png"
-    result = CliRunner().invoke(main, ["inspect", str(pruned), "-o", str(picture)])
-    assert result.exit_code == 2
-    assert "Add --trajectories FILE" in result.stderr
+    assert "Add --trajectories FILE" in refused("inspect", pruned, "-o", picture)
     assert not picture.exists()
     rng = np.random.default_rng(0)
     np.savez(tmp_path / "calls.npz", obs=rng.uniform(100, 400, (2, 2, 20)).astype(np.float32), episode_ends=[2])
-    run("inspect", pruned, "-o", picture, "-t", tmp_path / "calls.npz")
+    done("inspect", pruned, "-o", picture, "-t", tmp_path / "calls.npz")
     assert picture.exists()
 
 
@@ -139,22 +128,16 @@ def test_a_pruners_plan_needs_an_observation(pruned: Path, tmp_path: Path) -> No
 )
 def test_an_observation_that_does_not_fit(arrays: dict[str, Any], reason: str, pruned: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "calls.npz", **arrays)
-    arguments = ["inspect", pruned, "-o", tmp_path / "plan.png", "-t", tmp_path / "calls.npz"]
-    result = CliRunner().invoke(main, [str(a) for a in arguments])
-    assert result.exit_code == 2
-    assert reason in result.stderr
+    assert reason in refused("inspect", pruned, "-o", tmp_path / "plan.png", "-t", tmp_path / "calls.npz")
 
 
 def test_a_plan_that_is_not_there_is_named_beside_those_that_are(scheduled: Path, tmp_path: Path) -> None:
-    arguments = ["inspect", str(scheduled), "-o", str(tmp_path / "plan.png"), "--plan", "best"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 2
-    assert "has no plan 'best'; it has ['dense', 'uniform']" in result.stderr
+    told = refused("inspect", scheduled, "-o", tmp_path / "plan.png", "--plan", "best")
+    assert "has no plan 'best'; it has ['dense', 'uniform']" in told
 
 
 def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_checkpoint: Path) -> None:
-    arguments = ("--calls", 2, "--checkpoint", one_layer_checkpoint, "--json")
-    made = json.loads(run("bench", scheduled, *arguments).stdout)
+    made = as_json("bench", scheduled, "--calls", 2, "--checkpoint", one_layer_checkpoint)
     assert made["machine"]["cores"] >= 1
     original, dense, compiled = made["contestants"]
     assert [c["label"] for c in made["contestants"]] == ["original, ddpm 100", "dense", "uniform (baseline)"]
@@ -167,7 +150,7 @@ def test_bench_times_everybody_on_the_same_calls(scheduled: Path, one_layer_chec
 
 def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_worth_it(scheduled: Path) -> None:
     arguments = ("--calls", 2, "--threads", "2,1,2")
-    made = json.loads(run("bench", scheduled, *arguments, "--json").stdout)
+    made = as_json("bench", scheduled, *arguments)
     assert [one["label"] for one in made["contestants"]] == [
         "dense, 2 threads",
         "uniform (baseline), 2 threads",
@@ -175,8 +158,8 @@ def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_wo
         "uniform (baseline), 1 thread",
     ]
     assert made["threads"] == [2, 1] and made["best_threads"] in (1, 2)
-    assert "Load it with threads=" in run("bench", scheduled, *arguments).stdout
-    assert "Load it with threads=" not in run("bench", scheduled, "--calls", 1).stdout
+    assert "Load it with threads=" in done("bench", scheduled, *arguments).stdout
+    assert "Load it with threads=" not in done("bench", scheduled, "--calls", 1).stdout
     assert fewest_threads({4: 9.0, 2: 9.9, 1: 12.0}) == 2
     assert fewest_threads({4: 8.0, 2: 9.9, 1: 12.0}) == 4
 
@@ -191,12 +174,10 @@ def test_bench_times_several_numbers_of_threads_and_takes_the_fewest_that_are_wo
     ],
 )
 def test_threads_that_bench_cannot_time(arguments: tuple[str, ...], told: str, scheduled: Path) -> None:
-    result = CliRunner().invoke(main, ["bench", str(scheduled), *arguments])
-    assert result.exit_code == 2
-    assert told in result.stderr
+    assert told in refused("bench", scheduled, *arguments)
 
 
 def test_bench_prints_a_table_and_warns_of_a_dense_artifact(compiled_layer: Path) -> None:
-    result = run("bench", compiled_layer, "--calls", 1)
+    result = done("bench", compiled_layer, "--calls", 1)
     assert "dense (default)" in result.stdout
     assert "is not calibrated" in result.stderr

@@ -1,20 +1,17 @@
 """The doctor on a checkpoint and on recordings, and what ``convert`` says of the same."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import ttscompile
+from tests.commands import refused, run
 from tests.policies.lerobot_tiny import DS, save_policy
 from ttscompile import driver
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli import main
 from ttscompile.core.finding import Level
 from ttscompile.doctor.target import target_findings
 
@@ -36,14 +33,14 @@ def recorded(path: Path, state: np.ndarray) -> Path:
 
 def test_a_checkpoint_and_its_recordings_as_json_and_as_text(checkpoint: Path, tmp_path: Path) -> None:
     bad = recorded(tmp_path / "bad.npz", np.linspace(1e4, 2e4, 20 * DS, dtype=np.float32).reshape(20, DS))
-    words = ["doctor", str(checkpoint), "-t", str(bad)]
-    result = CliRunner().invoke(main, [*words, "--json"], catch_exceptions=False)
+    words = ("doctor", checkpoint, "-t", bad)
+    result = run(*words, "--json")
     told = json.loads(result.stdout)
     by_name = {one["what"]: one for one in told["findings"]}
     assert (result.exit_code, told["problems"]) == (1, 1)
     assert by_name["range of 'observation.state'"]["level"] == "problem"
     assert by_name["normaliser of observation.state"]["level"] == "warning"
-    text = CliRunner().invoke(main, words, catch_exceptions=False).stdout
+    text = run(*words).stdout
     assert "PROBLEM range of 'observation.state'" in text and "  -> Look at" in text and "1 problem, " in text
 
 
@@ -72,8 +69,7 @@ def test_what_is_no_policy_is_a_problem_with_the_message_of_convert(tmp_path: Pa
 
 def test_recordings_without_a_target_are_bad_usage(tmp_path: Path) -> None:
     path = recorded(tmp_path / "a.npz", np.zeros((4, DS), np.float32))
-    result = CliRunner().invoke(main, ["doctor", "-t", str(path)])
-    assert result.exit_code == 2 and "give a checkpoint or an artifact too" in result.stderr
+    assert "give a checkpoint or an artifact too" in refused("doctor", "-t", path)
 
 
 def test_convert_says_the_same_and_goes_on(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """How commands end: with which status, what they say, and what is left of what could not be written."""
 
-from __future__ import annotations
-
 import builtins
 import json
 import os

@@ -1,7 +1,5 @@
 """Commands tell of frame pieces where there are some."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``ttscompile predict``: observations of words, files and pictures; the chunk as a table, as JSON and as a picture."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

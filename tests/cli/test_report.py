@@ -1,7 +1,5 @@
 """The report: one page that needs nothing else, says what was measured, and lets no name of the artifact's act."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil
@@ -26,7 +24,7 @@ from ttscompile.measure.units import plain
 from ttscompile.report import Extras, build, facts, pictures, render, verified
 from ttscompile.report.page import Table
 from ttscompile.report.timing import Measurement
-from ttscompile.report.usage import run_episode
+from ttscompile.report.usage import Course, run_episode
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode
@@ -249,6 +247,19 @@ def test_a_bar_is_as_long_as_the_call_that_is_written_beside_it() -> None:
     pixels = np.asarray(Image.open(BytesIO(drawn)).convert("RGB"))[:150]  # without the legend
     grey, orange = (int((pixels == of).all(-1).sum()) for of in ((0x99,) * 3, (0xD5, 0x5E, 0x00)))
     assert grey / orange == pytest.approx(5 / 4, rel=0.05)
+
+
+def test_names_of_plans_that_are_alike_do_not_cover_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And an axis of blocks has whole numbers, of one block, too."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(pictures, "encoded", drawn.append)
+    pictures.plans_picture({"schedule": SCORE, "fast": {**SCORE, "error": 1.001 * SCORE["error"]}})
+    drawn[0].canvas.draw()
+    first, second = (text.get_window_extent() for text in drawn[0].axes[0].texts)
+    assert not first.overlaps(second)
+    unread: Any = None
+    pictures.shares_picture(Course("episode", np.zeros((2, 5, 1), np.int8), (0, 0), unread, {}))
+    assert [t for t in drawn[1].axes[0].get_yticks() if -0.5 <= t <= 0.5] == [0]
 
 
 def test_an_artifact_that_is_zipped_is_called_by_its_own_name(toy_compiled: Path, tmp_path: Path) -> None:

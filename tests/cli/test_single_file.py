@@ -1,7 +1,5 @@
 """``convert --single-file``: the file beside the artifact, and what the command says of it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

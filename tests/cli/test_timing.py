@@ -1,7 +1,5 @@
 """What takes part in a timing, what a turn is, and how times are written."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from dataclasses import replace

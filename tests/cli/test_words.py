@@ -1,7 +1,5 @@
 """Every option of every command takes what it is for, and refuses the rest: one message, and status 2."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from tests.commands import done, refused
 from ttscompile.cli import main
 from ttscompile.cli.sections import Section
 from ttscompile.serving import listener
@@ -174,20 +173,19 @@ def assert_of_use(value: object, words: list[str]) -> None:
 )
 @pytest.mark.usefixtures("stops_at_once")
 def test_the_url_is_where_the_server_listens(word: str, url: str) -> None:
-    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], "--host", word])
+    words = ["serve", *NEEDED["serve"][0], "--host", word]
     if word == "0.0.0.0":
-        assert (result.exit_code, result.stdout) == (2, "") and "may be reached from other machines" in result.stderr
-        result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], "--host", word, "--insecure"])
-        assert "warning: there is no token and no certificate: whoever reaches 0.0.0.0 can drive" in result.stderr
-    assert result.exit_code == 0, result.stderr
+        assert "may be reached from other machines" in refused(*words)
+        words.append("--insecure")
+    result = done(*words)
+    warned = "warning: there is no token and no certificate: whoever reaches 0.0.0.0 can drive" in result.stderr
+    assert warned == (word == "0.0.0.0")
     assert json.loads(result.stdout.splitlines()[0])["url"].startswith(url)
 
 
 @pytest.mark.parametrize("word", ["", "l" * 300, NO_TEXT, "example.org", "0", "nan"])
 def test_a_host_that_is_no_address_is_refused(word: str) -> None:
-    result = CliRunner().invoke(main, ["serve", *NEEDED["serve"][0], f"--host={word}"])
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "expected an IP address of this machine" in result.stderr
+    assert "expected an IP address of this machine" in refused("serve", *NEEDED["serve"][0], f"--host={word}")
 
 
 def test_all_commands_together_have_at_most_a_hundred_options() -> None:

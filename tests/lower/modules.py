@@ -1,7 +1,5 @@
 """Denoisers in styles that are hard to lower: heads folded into the batch, sequence first, channels first, adaLN."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Run a lowered model with onnxruntime, its weights filled in."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

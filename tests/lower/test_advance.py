@@ -1,7 +1,5 @@
 """``lower.advance``: tail, sampler update and stem as one graph."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``ir.evaluate``: the meaning of graphs."""
 
-from __future__ import annotations
-
 import itertools
 import weakref
 
@@ -105,13 +103,6 @@ def test_symbolic_sizes_enumerations_lists_and_several_results() -> None:
     d, z = evaluate(Graph(types, {}, nodes, ("d", "z")), {}, {"x": x, "unrelated": x})
     assert d.dtype == torch.float64 and z.shape == (2,)
     torch.testing.assert_close(d, torch.cat([x[:, 2:], x[:, :2]], 1).double())
-
-
-def test_no_batch_axis_at_all() -> None:
-    type_ = TensorType((2, 3), "float32")
-    graph = Graph({"x": type_}, {}, (Node("y", "aten.exp.default", (Ref("x"),), (), (type_,)),), ("y", "x"))
-    y, x = evaluate(graph, {}, {"x": torch.ones(2, 3)})
-    torch.testing.assert_close(y, x.exp())
 
 
 @pytest.mark.parametrize(

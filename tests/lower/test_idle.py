@@ -1,7 +1,5 @@
 """What idle steps need of a total: exact where stem and tail have the form, and no model where they almost have it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

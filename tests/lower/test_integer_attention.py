@@ -1,7 +1,5 @@
 """Attention in integers: exactly the quantised one, close to float32, head by head, and only where that is faster."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

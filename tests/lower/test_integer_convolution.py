@@ -1,7 +1,5 @@
 """Convolutions in integers: exactly the quantised ones, and only where that is faster and can be done."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,23 +1,17 @@
 """The model of all blocks: any of them, chosen by a few booleans, gives what its own model gives."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
-from tests.runtimes.toys import toy_program
-from ttscompile.ir.graph import Batch, TensorType
+from tests.runtimes.toys import f32, toy_program
+from ttscompile.ir.graph import Batch
 from ttscompile.ir.pieces import RESIDUAL, STREAM, join
 from ttscompile.lower.program import lower_program
 
 from .sessions import session
-
-
-def f32(*shape: int | Batch) -> TensorType:
-    return TensorType(shape, "float32")
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """``lower.layout``: moving operations composed and delayed."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st

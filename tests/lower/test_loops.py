@@ -1,7 +1,5 @@
 """Models of several loops of one program, against those of programs that have one of them each."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

@@ -1,7 +1,5 @@
 """``lower``: the same numbers in onnxruntime, at any batch size."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """``lower_precision``: integer products that are what they replace, within what eight bits allow."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where types are promoted is written out or left to torch's exporter; where none is, the exporter looks for none."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

@@ -1,7 +1,5 @@
 """``artifact.graph_json``: graphs as JSON, and JSON that is not a graph."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -1,18 +1,15 @@
 """The single file of the whole call against the policy that it was made of, and in a process without ttscompile."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from onnx import GraphProto
 from torch import nn
 
 import ttscompile
@@ -165,22 +162,6 @@ def test_what_is_not_kept_is_not_there(tmp_path: Path) -> None:
     again = episode.call(obs, noise, reads)
     assert (again["executed_plan"][:, 1:] == Source.TIMESTEP).all()
     assert np.abs(again["action"] - out["action"]).max() > 1e-3
-
-
-def branches(graph: GraphProto) -> Iterator[tuple[str, str]]:
-    """Names of the branches of every If, at any depth."""
-    for node in graph.node:
-        inner = {attribute.name: attribute.g for attribute in node.attribute if attribute.HasField("g")}
-        if node.op_type == "If":
-            yield inner["then_branch"].name, inner["else_branch"].name
-        for body in inner.values():
-            yield from branches(body)
-
-
-def test_every_block_has_a_branch_that_computes_and_one_that_reuses() -> None:
-    _, _, model = lowered(blocks=8)
-    found = sorted(pair for pair in branches(model.graph) if pair[0].startswith("block_"))
-    assert found == [(f"block_{b:02d}", f"block_{b:02d}_reused") for b in range(8)]
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Operations that are exported in a form of our own: what onnxruntime gives is what torch gives, for every argument."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 from typing import Any

@@ -1,7 +1,5 @@
 """Calls of a policy through its single ONNX file, with the state of an episode kept by hand."""
 
-from __future__ import annotations
-
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any

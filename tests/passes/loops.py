@@ -1,7 +1,5 @@
 """A policy of several loops, compiled once with all of them, and once with each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

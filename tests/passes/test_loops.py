@@ -1,7 +1,5 @@
 """Several loops in one program, against programs that have one of them each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

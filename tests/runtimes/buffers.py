@@ -1,7 +1,5 @@
 """Memory of the onnxruntime runtime's buffers; weights are onnxruntime's."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ttscompile.runtimes import Runtime

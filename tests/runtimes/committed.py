@@ -1,7 +1,5 @@
 """A small denoiser that was trained to go on from a prefix: its norms are modulated by a row for each action."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Design, section 2, one stream at a time, with dictionaries: what everything else here is compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

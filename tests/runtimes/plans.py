@@ -1,7 +1,5 @@
 """Random legal plans."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Artifacts that are calibrated by chance: schedules, and pruners that want other things of other observations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

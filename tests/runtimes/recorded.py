@@ -1,7 +1,5 @@
 """A call as one differentiable formula of its gates: what their gradients are compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -6,8 +6,6 @@
 Prints one JSON document, and ends with status 1 if a policy was mixed; the tests beside this file run short versions.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """A small policy that sees: an image encoder, convolutions and a linear layer, in front of a loop of three blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -5,8 +5,6 @@
 Prints one JSON document; the test beside this file runs a short version on a toy.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import hashlib

@@ -1,7 +1,5 @@
 """How a call runs: the pruner beside step 0, what a failure leaves, the first call, callers on several threads."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

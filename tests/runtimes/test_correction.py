@@ -1,7 +1,5 @@
 """Corrections in all runtimes, and which plans get them."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from dataclasses import replace

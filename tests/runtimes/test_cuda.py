@@ -3,8 +3,6 @@
 Nothing of this runs without one. ``test_torch`` replays recordings of the same lines on the CPU.
 """
 
-from __future__ import annotations
-
 import gc
 import threading
 from dataclasses import replace

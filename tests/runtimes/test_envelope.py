@@ -1,7 +1,5 @@
 """Calls far outside of what was recorded: the same in all runtimes, in a module, exported, and in the single file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

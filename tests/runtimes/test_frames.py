@@ -1,7 +1,5 @@
 """Frames are computed once, and known by their content."""
 
-from __future__ import annotations
-
 import gc
 from pathlib import Path
 from typing import Any

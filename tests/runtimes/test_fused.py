@@ -5,8 +5,6 @@ The interpreter needs numpy before 2.5, and has to be asked for before torch imp
     TRITON_INTERPRET=1 pytest tests/runtimes/test_fused.py
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import os

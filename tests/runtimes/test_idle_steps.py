@@ -1,7 +1,5 @@
 """Steps without a computed block, in numpy, against the reference: every sampler, any plan, any number of streams."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The text of a task in place of its tokens, in what a robot gives."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Attention in eight bits in every model of an artifact: of a block, of all blocks, of a step, of the whole call."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

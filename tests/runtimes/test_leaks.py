@@ -1,7 +1,5 @@
 """What was computed for one episode is never read in another, whatever happened in between."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Which entries of the rollout cache are kept."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loading an artifact where there is no torch, and loading none where there is."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

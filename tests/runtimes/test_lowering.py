@@ -1,7 +1,5 @@
 """Instructions against section 2 executed literally, and what makes them few."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

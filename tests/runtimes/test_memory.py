@@ -1,7 +1,5 @@
 """Samplers that remember: DPM-Solver++ and rk4 in the reference, in onnxruntime, and in the single file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

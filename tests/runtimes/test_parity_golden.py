@@ -1,7 +1,5 @@
 """Compiled golden checkpoints against what the original implementations gave, and both runtimes against each other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

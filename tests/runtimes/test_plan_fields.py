@@ -1,7 +1,5 @@
 """Plans that are random in all of their fields, in every runtime that can do their parts, against the reference."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace

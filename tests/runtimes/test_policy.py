@@ -1,7 +1,5 @@
 """The object that users hold: what it gives, what it checks, what it remembers."""
 
-from __future__ import annotations
-
 import gc
 import sys
 import threading
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-import ttscompile
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
 from ttscompile import Noise, Source
@@ -42,10 +39,6 @@ def policy(request: pytest.FixtureRequest, toy_artifact: Artifact) -> CompiledPo
 @pytest.fixture
 def quick(toy_artifact: Artifact) -> CompiledPolicy:
     return load(toy_artifact.path, seed=0)
-
-
-def test_load_is_what_the_package_offers() -> None:
-    assert ttscompile.load is load
 
 
 @pytest.mark.slow
@@ -122,22 +115,6 @@ def test_a_matrix_is_executed_as_it_is_or_refused(policy: CompiledPolicy) -> Non
     policy.reset()
     with pytest.raises(IllegalPlanError, match="never computed"):
         policy.predict_action({"obs": OBS}, plan=both)
-
-
-def test_the_callers_plan_stays_the_callers(policy: CompiledPolicy) -> None:
-    plan = np.zeros((2, 5, 5), np.int8)
-    policy.predict_action({"obs": OBS}, plan=plan)
-    plan[:, 1:] = Source.TIMESTEP
-    report = policy.last_report
-    assert report is not None
-    assert not report.plan.any()
-
-
-def test_plans_that_are_no_matrix_are_refused(policy: CompiledPolicy) -> None:
-    plan: Any
-    for plan in ([[0, 0], [0]], torch.zeros(5, 5, dtype=torch.bfloat16), torch.zeros(5, 5), object()):
-        with pytest.raises(IllegalPlanError, match="int8|integer"):
-            policy.predict_action({"obs": OBS}, plan=plan)
 
 
 def test_a_refused_call_leaves_no_report_of_the_one_before(policy: CompiledPolicy) -> None:

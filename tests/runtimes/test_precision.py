@@ -1,7 +1,5 @@
 """Policies whose blocks have eight-bit weights: against fp32 and the reference, and on processors that saturate."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Eight bits in the prologue beside the blocks: part by part, as a plan says, and left out."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection
 from dataclasses import replace

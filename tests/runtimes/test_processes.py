@@ -1,7 +1,5 @@
 """A policy in a process that was forked, at the end of the interpreter, and under odd environment variables."""
 
-from __future__ import annotations
-
 import copy
 import os
 import pickle

@@ -1,7 +1,5 @@
 """The reference runtime against section 2 executed literally; its gradients against calculus."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

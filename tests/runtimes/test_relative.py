@@ -1,7 +1,5 @@
 """Actions that are relative to numbers that the robot measures; ``test_relative_poses`` has them beside poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

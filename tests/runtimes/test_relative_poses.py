@@ -1,7 +1,5 @@
 """Actions that are relative to a measured pose and to numbers, however a call is made, and from call to call."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from torch import nn
 
 import ttscompile
 from tests.calibration import policies
+from tests.commands import as_json
 from tests.lower.whole_call import every_way
 from tests.once import Once
 from ttscompile import ChunkSpec, Noise, ObservationSpec, Plan, PolicySpec
@@ -25,7 +23,6 @@ from ttscompile.artifact.strict_json import dump, parse
 from ttscompile.artifact.typed_json import from_json, to_json
 from ttscompile.artifact.write import update_plans
 from ttscompile.calibration.compare import compare
-from ttscompile.cli import main
 from ttscompile.core.lattice import Source
 from ttscompile.core.poses import Pose, orthonormal
 from ttscompile.core.spec import Affine, Relative
@@ -164,8 +161,7 @@ def test_every_rung_of_verify_holds_and_bench_measures(made: Path) -> None:
     }
     assert set(rungs.values()) == {"passed", "skipped"}, rungs  # what is saved here is less than noise
     assert set(load_golden_plans(load_artifact(made / "artifact"), 2)) == {"sparse", "warm"}
-    result = CliRunner().invoke(main, ["bench", str(made / "artifact"), "--calls", "2", "--json"])
-    assert result.exit_code == 0, result.output
+    as_json("bench", made / "artifact", "--calls", 2)
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """A policy is wholly what its identity says, whatever is done to the artifact while it is loaded and after."""
 
-from __future__ import annotations
-
 import gc
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A short soak on a toy whose plan changes from call to call and reads the rollout cache."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

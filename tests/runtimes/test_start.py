@@ -1,7 +1,5 @@
 """Plans whose loop begins with the chunk of the call before, against the last steps of that loop on their own."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 import ttscompile
+from tests.commands import done
 from tests.once import Once
 from tests.plans import base_plan
 from ttscompile import Noise, Plan
@@ -20,7 +18,6 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.view import view_of
 from ttscompile.artifact.write import update_plans
-from ttscompile.cli import main
 from ttscompile.core.correction import groups_of, no_correction
 from ttscompile.core.lattice import dense_plan, uniform_plan
 from ttscompile.core.start import rest_of
@@ -153,9 +150,7 @@ def test_a_page_of_an_episode_leaves_the_first_call_out(whole: Path, tmp_path: P
     """Which computes ``full``: it has other steps."""
     obs = np.concatenate([drawn(call, 1)[0]["obs"] for call in range(4)])
     np.savez(tmp_path / "calls.npz", obs=obs, episode_ends=np.array([4]))
-    words = ["inspect", str(whole), "-o", str(tmp_path / "page.html"), "-t", str(tmp_path / "calls.npz")]
-    result = CliRunner().invoke(main, words, catch_exceptions=False)
-    assert result.exit_code == 0, result.stderr
+    done("inspect", whole, "-o", tmp_path / "page.html", "-t", tmp_path / "calls.npz")
     page = (tmp_path / "page.html").read_text()
     assert "3 consecutive calls of calls.npz[0] (without its first call) with the default plan" in page
 

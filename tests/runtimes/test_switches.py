@@ -1,7 +1,5 @@
 """A number of the actions that has two values alone, as a gripper's may, however a call is made."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Several threads: all blocks in one session, the same results, and nothing running between calls."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

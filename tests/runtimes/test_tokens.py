@@ -1,7 +1,5 @@
 """Tokens whose patches did not change keep what they gave."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The runtime on torch: it agrees with the reference, and its calls can be captured."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import partial

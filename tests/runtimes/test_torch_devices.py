@@ -1,7 +1,5 @@
 """What the torch runtime makes of the process that it is in: the caller's settings of precision, and its GPUs."""
 
-from __future__ import annotations
-
 import gc
 from contextlib import nullcontext
 from typing import Any

@@ -1,7 +1,5 @@
 """Graphs as functions of torch: what is written is what the graph says, in fewer operations."""
 
-from __future__ import annotations
-
 import dis
 from dataclasses import replace
 from typing import Any

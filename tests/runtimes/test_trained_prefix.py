@@ -1,7 +1,5 @@
 """Policies that were trained to go on from a prefix: in every runtime, with every plan."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import prod
 from pathlib import Path

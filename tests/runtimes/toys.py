@@ -1,7 +1,5 @@
 """Toy policies as compiled programs, written by hand, whose every number can be checked with a pencil or with numpy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

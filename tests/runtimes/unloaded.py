@@ -5,8 +5,6 @@
 Prints one JSON document, with the figures after each tenth.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

@@ -1,7 +1,5 @@
 """Which loop, and how few of its steps."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import suppress

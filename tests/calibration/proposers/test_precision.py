@@ -1,7 +1,5 @@
 """Which parts compute in eight bits: all but those that change the actions too much."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -116,5 +114,7 @@ def test_one_part_is_not_tried_twice(once: Once, recording: Path, tmp_path: Path
 
 
 def test_an_artifact_in_fp32_has_nothing_to_choose(compiled: Path, once: Once) -> None:
-    assert "convert the checkpoint with --precision int8" in str(Precision(request()).applies(load_artifact(compiled)))
+    assert "make it again with --precision int8, in Python precision=" in str(
+        Precision(request()).applies(load_artifact(compiled))
+    )
     assert Precision(request()).applies(load_artifact(policies.compiled(once, "int8"))) is None

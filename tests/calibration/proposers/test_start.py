@@ -1,7 +1,5 @@
 """From which step a call goes on with the chunk of the call before: chosen on recorded episodes."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

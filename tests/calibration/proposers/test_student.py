@@ -1,7 +1,5 @@
 """The training of a student alone: what it may change, what it learns, and what it is judged by."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

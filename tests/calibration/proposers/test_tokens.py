@@ -1,7 +1,5 @@
 """When tokens are reused is chosen by what it does to the actions."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

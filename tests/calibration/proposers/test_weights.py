@@ -1,7 +1,5 @@
 """Weights of their own, from end to end on a small policy: what plan ``distilled`` is, and what it leaves as it was."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What proposers are given, on small policies."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The training of the paper: its head keeps the budget, goes on where it stopped, and is executed as it was trained."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ The worker thread is real. Advancing the clock wakes it where it waits, and retu
 run is the same.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The fault drill, observations: they stop, come late, out of order, or are wrong."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 from typing import Any

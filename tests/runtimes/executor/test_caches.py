@@ -1,7 +1,5 @@
 """The rollout cache under the executor: late calls, dropped chunks and resets leave what the definition leaves."""
 
-from __future__ import annotations
-
 import random
 import threading
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """``GuardLimits(clip=True)``: what is given out keeps the limits, whatever the policy says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st

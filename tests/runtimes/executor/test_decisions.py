@@ -1,7 +1,5 @@
 """Feasibility, tiers and the guard: decisions without state of the world."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st

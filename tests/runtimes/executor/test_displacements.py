@@ -1,7 +1,5 @@
 """Actions that say how far to move: what is overdue is made up for, and a held action moves nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

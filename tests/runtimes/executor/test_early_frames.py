@@ -1,7 +1,5 @@
 """Frames are prepared while nothing waits for them; whatever comes late, twice or never, no call sees anything else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """How an executor ends: with the program, forgotten, closed by whomever; and what a forked process is told."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

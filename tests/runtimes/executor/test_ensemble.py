@@ -1,7 +1,5 @@
 """The seam ``ensemble``: each action is the weighted mean of what all chunks predicted for its tick."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from math import exp
 

@@ -1,8 +1,5 @@
 """The executor with its real thread, on a clock that the test advances."""
 
-from __future__ import annotations
-
-import inspect
 import subprocess
 import sys
 import threading
@@ -25,7 +22,7 @@ from ttscompile.errors import (
     WorkerDeadError,
 )
 from ttscompile.runtimes.arrays import check_observation
-from ttscompile.runtimes.executor import AsyncExecutor, ExecutorSettings, GuardLimits
+from ttscompile.runtimes.executor import ExecutorSettings, GuardLimits
 from ttscompile.runtimes.executor.measure import some_observation
 
 from .simulation import REAL_LIMIT, TA, FakeClock, ScriptedPolicy, Told, World, opened_meanwhile
@@ -345,8 +342,3 @@ def test_the_executor_needs_nothing_but_numpy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
-
-
-def test_everything_public_says_what_it_does() -> None:
-    for name in ("observe", "action", "reset", "close", "statistics", "feasibility"):
-        assert inspect.getdoc(getattr(AsyncExecutor, name))

@@ -1,7 +1,5 @@
 """The fault drill: everything that goes wrong in the field, injected."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import sys

@@ -1,7 +1,5 @@
 """Where an episode begins: until the first action is given out, the robot is where it was seen."""
 
-from __future__ import annotations
-
 import pytest
 
 from ttscompile.errors import StaleObservationError

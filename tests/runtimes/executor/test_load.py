@@ -1,7 +1,5 @@
 """Frames at many kilohertz from several threads, and clocks that jump."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -1,7 +1,5 @@
 """What the executor costs the control loop. Figures: ``pytest FILE --benchmark-only``."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses, and what else is relative to the state, at seams: nothing jumps with it, and rotations stay rotations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

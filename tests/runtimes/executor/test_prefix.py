@@ -1,7 +1,5 @@
 """The seam ``prefix`` with compiled policies: what is committed is what the next chunk begins with."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A short run is part of every test run; ``pytest tests/runtimes/executor -m soak`` runs at least 100,000 ticks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Statistics and traces: of a fixed size, and in the form that other tools read."""
 
-from __future__ import annotations
-
 import errno
 import inspect
 import json

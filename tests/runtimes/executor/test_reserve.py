@@ -1,7 +1,5 @@
 """What a chunk predicted beyond its horizon: it makes up for latency, and bridges chunks that come late."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

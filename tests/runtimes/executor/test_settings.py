@@ -1,7 +1,5 @@
 """What may be set, and what has to fit the policy."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from math import inf
 from pathlib import Path

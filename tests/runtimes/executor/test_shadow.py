@@ -1,7 +1,5 @@
 """Shadow mode: what is executed is the original's, whatever the compiled policy does; and what is told of it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator, Mapping

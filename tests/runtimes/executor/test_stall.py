@@ -1,7 +1,5 @@
 """The watchdog: a policy that has stopped moving runs another plan for one call, and forgets what it went on from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Actions by tick, and how chunks join."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st

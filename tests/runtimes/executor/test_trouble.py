@@ -1,7 +1,5 @@
 """``trouble``: why no action comes, where none will."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

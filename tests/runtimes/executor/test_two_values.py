@@ -1,7 +1,5 @@
 """Numbers of an action that have two values alone, as a gripper's: no seam and no interpolation gives another one."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Policies that begin with their last chunk: what they are told of it, and what their calls from nothing take."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any

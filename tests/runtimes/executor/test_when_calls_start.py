@@ -1,7 +1,5 @@
 """When calls start: the state machine alone, against the arithmetic of feasibility, at random rates and delays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
