@@ -125,7 +125,7 @@ class OneChannel(torch.nn.Module):
 
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         stream = self.into(sample) + obs[:, None, :1]
-        return self.out(stream + torch.tanh(self.block(stream)))  # type: ignore[no-any-return]
+        return self.out(stream + torch.tanh(self.block(stream)))
 
 
 @pytest.mark.slow
