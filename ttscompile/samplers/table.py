@@ -224,8 +224,8 @@ def _refuse_known(scheduler: Any) -> None:
     if name.startswith("FlowMatch"):
         euler = name == "FlowMatchEulerDiscreteScheduler" and not config.get("stochastic_sampling")
         told = "is of flow matching, whose loop is" if euler else "has no table; that of Euler's steps without noise is"
-        loop = f"flow_matching_table(scheduler.sigmas.tolist(), timestep_scale={config.num_train_timesteps})"
-        raise SpecError(f"sampler {name} {told} ttscompile.{loop} after set_timesteps.")
+        given = f"scheduler.sigmas.tolist(), timestep_scale={config.num_train_timesteps}"
+        raise SpecError(f"sampler {name} {told} ttscompile.flow_matching_table({given}) after set_timesteps.")
     if any(part in name for part in _UNREAD):
         remedy = "Use DPMSolverMultistepScheduler.from_config(scheduler.config), which has the same betas."
         raise SpecError(f"sampler {name}: no table can be measured of its steps. {remedy}")
