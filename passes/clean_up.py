@@ -91,11 +91,11 @@ def _without(graph: Graph, same_as: Callable[[Node], str | None]) -> Graph:
 
 
 def _is_identity(node: Node, types: dict[str, TensorType]) -> bool:
-    """Whether it leaves all numbers where and what they are: ``sum([x, f])`` of Python begins with 0 + x."""
+    """Whether it leaves all numbers where and what they are."""
     source = node.args[0] if node.args else None
     if not isinstance(source, Ref) or len(node.types) != 1 or types.get(source.name) != node.type:
         return False
-    if node.op == "aten.add.Tensor":
+    if node.op == "aten.add.Tensor":  # Python's sum([x, f]) begins with 0 + x
         return node.args[1:] == (0,) and not node.kwargs
     return node.op == _CAST or operation(node.op).movement not in (None, Movement.PERMUTE)
 

@@ -31,12 +31,13 @@ class WriteSums(Pass[Captured, Captured]):
         types, points = graph.types(), set(dominators(graph, [sample], graph.outputs))
         loop = reachable_from(graph, [sample])
         new: dict[str, list[Node]] = {}
-        for node in graph.nodes:  # elsewhere, in a rotary embedding say, the product would be work for nothing
+        for node in graph.nodes:
             stream = node.args[0] if node.name in points and node.args else None
+            # Elsewhere, in a rotary embedding say, the product would be an operation more for nothing.
             if not isinstance(stream, Ref) or stream.name not in points or types[stream.name] != node.type:
                 continue
             added = [one.name for one in _added(node) if isinstance(one, Ref)]
-            if loop.intersection(added) and node.type in [types[name] for name in added]:  # that of their product
+            if loop.intersection(added) and node.type in [types[name] for name in added]:  # so the product has it, too
                 new[node.name] = _written(node, stream)
         if not new:
             return PassResult(program)

@@ -86,7 +86,7 @@ def noise_levels(sampler: SamplerTable) -> Levels | None:
         None if they do not follow.
     """
     levels = _levels(sampler)
-    return levels if levels is not None else _levels(sampler.with_skip(-1))
+    return levels if levels is not None else _levels(sampler.without_skip())
 
 
 def _levels(sampler: SamplerTable) -> Levels | None:

@@ -94,7 +94,7 @@ def build(
         trajectories = (trajectories,)
     if not trajectories:
         trajectories = (recordings_of(checkpoint),)
-        explain("recordings", (f"no recordings were given: {trajectories[0]}, of its training; -t takes a copy",))
+        explain("recordings", (f"none were given: {trajectories[0]}, of its training, is read; -t takes a copy",))
     named = tuple(trajectories)
 
     def check(spec: PolicySpec) -> None:

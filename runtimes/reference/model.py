@@ -35,7 +35,7 @@ from .sampler import Carried, TorchSampler, hold
 class Contexts:
     """What the observation gives the loop; what it gives each step is made of this when a piece reads it.
 
-    A modulated network reads megabytes a call at its hundred steps, which cost next to nothing to make.
+    Of all steps together, what a modulated network reads would be megabytes a call.
     """
 
     streams: int

@@ -44,8 +44,7 @@ class PlainNetwork:
         self._pieces = pieces = module.pieces
         self._evaluators = evaluators = module.evaluators
         self._weights = weights = module.kept("weight")
-        self._others, self._tables = module.kept("first weight"), module.kept("table")
-        self._first = weights | self._others
+        self._first, self._tables = module.kept("first weight"), module.kept("table")
         self.idle = None if module.idle is None else module.idle.on(module.kept("idle"))
         self._streams = streams
         self.stream_type = pieces.blocks[0].type
@@ -108,7 +107,7 @@ class PlainNetwork:
     def contexts(self, k: Tensor) -> dict[str, Tensor]:
         """All that the pieces of the loop read at a step that only the program knows, int64 ``[1]``; by name."""
         rows = {name: self._repeated(name, table.index_select(0, k)[0]) for name, table in self._tables.items()}
-        first = {name: torch.where((k > 0)[0], self._weights[name], other) for name, other in self._others.items()}
+        first = {name: torch.where((k > 0)[0], self._weights[name], own) for name, own in self._first.items()}
         known = {**self._weights, **first, **self._condition, **rows}
         return known if self._pieces.step is None else {**known, **self._step_values(known)}
 
@@ -119,7 +118,7 @@ class PlainNetwork:
     def _at(self, k: int, name: str, value: Tensor) -> Tensor:
         stream = self._streams_of[name]
         reads = {read: self._context(read, k) for read in self._reads[name] if read in self._axes and read != stream}
-        return self._run(name, {**(self._weights if k else self._first), stream: value, **reads})[0]
+        return self._run(name, {**self._weights, **({} if k else self._first), stream: value, **reads})[0]
 
     def _run(self, name: str, values: Tensors) -> tuple[Tensor, ...]:
         return self._evaluators[name].run([values[read] for read in self._reads[name]], self._streams)

@@ -48,3 +48,8 @@ def test_a_state_in_words_says_in_which_of_256_parts_it_is() -> None:
     """The ends of a range are edges: the upper one is in the last part, and what is outside is told, too."""
     state = StateInWords("state", first=(-1.0,) * 5, width=(2.0,) * 5, ranged=True)
     assert state(np.array([-1, 1, 0, -1.01, 9], np.float32)) == "0 255 128 -1 255"
+
+
+def test_one_name_is_no_tuple_of_names() -> None:
+    with pytest.raises(SpecError, match="recorded is a tuple of names of arrays; found 'keypoint'"):
+        ObservationSpec((2, 8), recorded="keypoint")  # type: ignore[arg-type]

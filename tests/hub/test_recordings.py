@@ -97,7 +97,7 @@ def test_build_says_from_what_it_learns(tmp_path: Path, monkeypatch: pytest.Monk
     result = CliRunner().invoke(main, ["build", str(tmp_path), "-o", str(tmp_path / "compiled")])
     assert result.exit_code == 2
     told = " ".join(result.stderr.split())
-    assert f"no recordings were given: {NAME}, of its training; -t takes a copy" in told
+    assert f"none were given: {NAME}, of its training, is read; -t takes a copy" in told
 
 
 def test_how_many_are_read_is_told(hub: Hub, tmp_path: Path) -> None:

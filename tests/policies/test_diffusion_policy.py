@@ -77,7 +77,7 @@ def test_pred_action_steps_only(payload: Build, save: Save) -> None:
     [
         ("pusht_dataset.PushTLowdimDataset", {"zarr_path": "???"}, ("keypoint", "state:2")),
         ("pusht_dataset.PushTLowdimDataset", {"obs_key": "points", "state_key": "pose"}, ("points", "pose:2")),
-        ("blockpush_lowdim_dataset.BlockPushLowdimDataset", {"obs_eef_target": True}, ("obs",)),
+        ("blockpush_lowdim_dataset.BlockPushLowdimDataset", {"obs_eef_target": True}, ()),
         ("robomimic.RobomimicReplayLowdimDataset", {"obs_keys": "${task.obs_keys}"}, ("object", "robot0_eef_pos")),
         ("robomimic.RobomimicReplayLowdimDataset", {"obs_keys": [1]}, ()),
         ("my.OwnDataset", {}, ()),

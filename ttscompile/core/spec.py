@@ -86,6 +86,8 @@ class ObservationSpec:
                     f" of {self.shape[-1]}; found {self.bounds}."
                 )
             object.__setattr__(self, "bounds", (tuple(low.tolist()), tuple(high.tolist())))
+        if isinstance(self.recorded, str):
+            raise SpecError(f"recorded is a tuple of names of arrays; found {self.recorded!r:.80}.")
         if self.fit is not None and not self.image:
             raise SpecError(f"fit is for images with bounds; found an observation of shape {self.shape}.")
         if self.fill and (self.fit not in ("start", "centre") or len(self.fill) != self.shape[-3]):

@@ -71,8 +71,8 @@ def load_trajectories(
         paths: of files and directories, or ``hf://datasets/org/name``: of a LeRobot data set, the first episodes.
         action_steps: how many actions of a chunk are executed: the frames between two calls.
         sources: by key of the observation, the arrays of a recording of frames that it is made of, in order, where they
-            are called otherwise; ``NAME:N`` are the first N numbers of one. With ``task``, the path of a tokenizer, the
-            recorded instructions are made the policy's tokens.
+            are called otherwise than the key, or than its specification says (``recorded``); ``NAME:N`` are the first N
+            numbers of one. With ``task``, the path of a tokenizer, recorded instructions are made the policy's tokens.
         instruction: how the policy is told its task in words.
         tokenizer: makes recorded instructions tokens where ``sources`` names none and no tokens were recorded.
 

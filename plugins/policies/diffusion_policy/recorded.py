@@ -29,8 +29,6 @@ def _parts(data_set: str, config: Config) -> Mapping[str, list[Any]]:
             return {"obs": [config.get("task.dataset.obs_key", "keypoint"), f"{state}:2"]}
         case "PushTImageDataset":
             return {"image": ["img"], "agent_pos": ["state:2"]}
-        case "BlockPushLowdimDataset":
-            return {"obs": [config.get("task.dataset.obs_key", "obs")]}
         case "RobomimicReplayLowdimDataset":
             names = config.get("task.dataset.obs_keys", _ROBOMIMIC)
             return {"obs": names if isinstance(names, list) else []}
