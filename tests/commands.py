@@ -1,7 +1,5 @@
 """Commands, run in this process as somebody types them."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

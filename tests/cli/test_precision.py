@@ -9,9 +9,11 @@ import pytest
 
 import ttscompile
 from tests.commands import as_json, done, refused
+from ttscompile import Noise
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.contestants import Way, contestants
 from ttscompile.runtimes.random_calls import random_calls
+from ttscompile.verification.precision import EIGHT_BITS
 
 STEPS = 4
 
@@ -39,6 +41,24 @@ def test_convert_and_inspect_say_the_precision(converted: tuple[Path, dict[str, 
     assert 0.85e5 < record["bytes"] < 1.0e5  # 2.6e5 in fp32
     text = " ".join(done("inspect", directory).stdout.split())
     assert "precision int8 in blocks" in text
+
+
+@pytest.mark.slow
+def test_it_is_the_reference_within_the_tolerance_of_eight_bits(converted: tuple[Path, dict[str, Any]]) -> None:
+    directory, _ = converted
+    rng = np.random.default_rng(100)
+    obs = {"obs": rng.uniform(100, 400, (1, 2, 20)).astype(np.float32)}
+    noise = Noise(rng.standard_normal((1, 16, 2), dtype=np.float32))
+    compiled, reference = (
+        ttscompile.load(directory, runtime, plan=plan)
+        for runtime, plan in (("onnxruntime", "full"), ("reference", "full@fp32"))
+    )
+    found, expected = (p.predict_action(obs, noise=noise)["action"] for p in (compiled, reference))
+    normalizer = compiled.info.action.normalizer
+    assert normalizer is not None
+    largest = np.abs(normalizer.normalize(expected)).max()
+    difference = np.abs(normalizer.normalize(found) - normalizer.normalize(expected)).max()
+    assert 1e-5 < difference / largest < EIGHT_BITS
 
 
 def test_fp32_is_the_default_and_inspect_says_so(toy_compiled: Path) -> None:
