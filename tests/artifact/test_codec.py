@@ -40,7 +40,8 @@ def test_float32_comes_back_bit_by_bit(scale: list[float], data: st.DataObject) 
     columns: dict[str, Any] = {name: data.draw(triples) for name in SamplerTable.COLUMNS}
     timesteps = data.draw(triples)
     base = tiny_spec()
-    sampler = replace(base.sampler, timesteps=timesteps, clip=data.draw(st.none() | st.floats(0, 1e9)), **columns)
+    clip = data.draw(st.none() | st.floats(0, 1e9, exclude_min=True))
+    sampler = replace(base.sampler, timesteps=timesteps, clip=clip, **columns)
     spec = replace(base, sampler=sampler, observations={"obs": ObservationSpec((n,), affine)})
     found = through_json(spec)
     normalizer = found.observations["obs"].normalizer
