@@ -35,7 +35,7 @@ import ttscompile
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.cli.contestants import original_policy
-from ttscompile.cli.output import identity_of, only_results_on_stdout, print_json, progress, results_console, run, table
+from ttscompile.cli.output import manifest_of, only_results_on_stdout, print_json, progress, results_console, run, table
 from ttscompile.core.lattice import PlanArray, dense_plan
 from ttscompile.core.plan import ORIGINAL
 from ttscompile.measure.machine import fingerprint, one_line
@@ -336,7 +336,7 @@ def judge_and_tell(of: Subject, settings: Settings, as_json: bool) -> int:
         ]
         print_json(
             {
-                "identity": identity_of(of.directory),
+                "identity": manifest_of(of.directory).identity,
                 "machine": fingerprint(),
                 "settings": asdict(settings),
                 "plan": of.plan_name,

@@ -35,7 +35,7 @@ from rich.table import Table
 from rollout import Rollout, run_episodes
 from variants import cache_folder, cache_option, first_seed_option, open_variant, results_console, run, runtime_option
 
-from ttscompile.cli.output import identity_of, print_identity
+from ttscompile.cli.output import manifest_of, print_identity
 
 T = TypeVar("T")
 SEEDS_A_JOB = 4
@@ -253,7 +253,7 @@ def main(
         )
     baseline = summarise("the world waits", rollout, rollout)
     found = {setup: figures(setup, each, rollout) for setup, each in driven.items()}
-    identity = identity_of(Path(variant.partition(":")[0]))
+    identity = manifest_of(Path(variant.partition(":")[0])).identity
     if picture is not None:
         title = f"{make.title} at {hz:g} Hz, {episodes} paired episodes of {variant}; latency simulated"
         scores = {setup: each.evaluation.score for setup, each in found.items()}

@@ -44,7 +44,7 @@ from variants import (
 
 import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.cli.output import identity_of
+from ttscompile.cli.output import manifest_of
 from ttscompile.plots.figure import new_figure, require_picture_name, write_picture
 from ttscompile.trajectories import load_trajectories
 
@@ -89,7 +89,8 @@ def calibrated(
     Raises:
         UsageError: what is there is of another artifact, of other recordings, or was calibrated otherwise.
     """
-    given = {"source": identity_of(source), "recordings": [str(path.resolve()) for path in recordings], **options}
+    identity, files = manifest_of(source).identity, [str(path.resolve()) for path in recordings]
+    given = {"source": identity, "recordings": files, **options}
     kept = folder.with_suffix(".json")
     if kept.exists():
         record = json.loads(kept.read_text())

@@ -33,7 +33,7 @@ from rich.table import Table
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.contestants import original_policy
-from ttscompile.cli.output import identity_of, print_identity
+from ttscompile.cli.output import manifest_of, print_identity
 from ttscompile.frontends.eager import evaluation
 from ttscompile.runtimes.inpainting import noise_levels
 
@@ -257,7 +257,7 @@ def main(
         return
     console = results_console()
     console.print(shown(rows, {way: roughness(each) for way, each in played.items()}, times, baseline))
-    print_identity(identity_of(Path(variant.partition(":")[0])), console)
+    print_identity(manifest_of(Path(variant.partition(":")[0])).identity, console)
 
 
 def prefixed(played: Mapping[Way, Sequence[Driven]], way: Way, variant: str) -> Rollout:

@@ -30,7 +30,7 @@ from rich.table import Table
 
 import ttscompile
 from ttscompile import AsyncExecutor, ExecutorSettings
-from ttscompile.cli.output import identity_of, print_identity
+from ttscompile.cli.output import manifest_of, print_identity
 from ttscompile.errors import DeadlineMissedError
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.runtimes.info import PolicyInfo
@@ -298,7 +298,7 @@ def main(
                 trace = output / f"trace-{label.split()[0]}-{hz:g}hz.json"
                 runs.append(drive(label, policy, hz, 60 * minutes, first_seed, margin_ticks, trace))
     machine = fingerprint()
-    identity = identity_of(artifact)
+    identity = manifest_of(artifact).identity
     figures = [asdict(each) for each in runs]
     document = {"identity": identity, "machine": machine, "threads": threads, "runs": figures}
     (output / "realtime.json").write_text(json.dumps(document, indent=1, allow_nan=False))

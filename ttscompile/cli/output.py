@@ -135,11 +135,6 @@ def manifest_of(path: Path) -> Manifest:
     return read_manifest(path) if path.is_dir() else load_artifact(path).manifest
 
 
-def identity_of(path: Path) -> str:
-    """Identity of an artifact, 64 digits. Raises ArtifactError: there is no artifact."""
-    return manifest_of(path).identity
-
-
 def print_identity(identity: str, console: Console) -> None:
     """The line that says what the figures above are of."""
     say(console, f"identity {abbreviated(identity)}")
