@@ -114,7 +114,7 @@ def test_recordings_that_do_not_fit_end_a_build_before_it_compiles(
     recording, before = policies.record(calibrated.parent / "calls.npz", episodes or 6), contents(calibrated)
     if not episodes:
         np.savez(recording, obs=np.zeros((4, 2, 9), np.float32), episode_ends=[2, 4])
-    monkeypatch.setattr(builder, "recordings_of", lambda _: str(recording))  # of the policy's training
+    monkeypatch.setattr(builder, "recordings_of", lambda *_: str(recording))  # of the policy's training
     with pytest.raises(TtscompileError, match="expected at least two" if episodes else "has shape"):
         ttscompile.build("policy.ckpt", calibrated, [recording] if given else [])
     assert not asked["convert"]["directory"].exists() and "calibrate" not in asked

@@ -19,7 +19,7 @@ from .calibration.state import FILE as STATE
 from .core.spec import INT8, PolicySpec
 from .driver import Explain, convert
 from .errors import ArtifactError, CalibrationError, CalibrationFailedError
-from .frontends.data_set import recordings_of
+from .frontends import recordings_of
 from .runtimes.executor import ExecutorSettings
 from .runtimes.executor.settings import resolve
 from .runtimes.load import open_policy
@@ -64,8 +64,8 @@ def build(
 
     Args:
         checkpoint, directory, explain: see ``convert``.
-        trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on,
-            of a data set on the hub (``frontends.data_set``).
+        trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on
+            (``frontends.recordings_of``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
             plan is then the nearest of those whose longest call keeps up.
         policy_hz: rate of the frames and actions that the policy was trained with; see ``calibrate``. If nobody says
@@ -93,8 +93,8 @@ def build(
     if isinstance(trajectories, str | os.PathLike):
         trajectories = (trajectories,)
     if not trajectories:
-        trajectories = (recordings_of(checkpoint),)
-        explain("recordings", (f"none were given: {trajectories[0]}, of its training, is read; -t takes a copy",))
+        trajectories = (recordings_of(checkpoint, of_checkpoint.get("format", "auto")),)
+        explain("recordings", (f"no episodes were given, so those of its training are read: {trajectories[0]}",))
     named = tuple(trajectories)
 
     def check(spec: PolicySpec) -> None:

@@ -13,7 +13,7 @@ from ttscompile import builder
 from ttscompile.cli import main
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import CalibrationError, CheckpointError, HubError, TrajectoryError
-from ttscompile.frontends.data_set import recordings_of
+from ttscompile.frontends import recordings_of
 from ttscompile.trajectories import episodes, load_trajectories
 
 from .served import Hub
@@ -75,17 +75,53 @@ def test_what_is_no_data_set_is_refused(hub: Hub, text: str, message: str) -> No
         load_trajectories([text], SPECS, 2)
 
 
+def trained(folder: Path, noted: object = None) -> Path:
+    """What LeRobot's training saved, as far as it matters here."""
+    folder.mkdir(exist_ok=True)
+    (folder / "config.json").write_text(json.dumps({"type": "diffusion"}))
+    if noted is not None:
+        (folder / "train_config.json").write_text(json.dumps(noted))
+    return folder
+
+
 @pytest.mark.parametrize("noted", [None, {}, {"dataset": {"repo_id": 3}}, {"dataset": "org/data"}])
 def test_a_checkpoint_that_names_no_data_set_wants_recordings(tmp_path: Path, noted: object) -> None:
-    if noted is not None:
-        (tmp_path / "train_config.json").write_text(json.dumps(noted))
     with pytest.raises(CheckpointError, match="does not say which data set it was trained on. Give recorded episodes"):
-        recordings_of(tmp_path)
+        recordings_of(trained(tmp_path, noted))
 
 
-def test_a_checkpoint_says_what_it_was_trained_on(tmp_path: Path) -> None:
-    (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "org/data"}}))
-    assert recordings_of(tmp_path) == NAME
+def data_set(folder: Path) -> Path:
+    """As much of one as tells that it is there."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text("{}")
+    return folder
+
+
+@pytest.mark.parametrize("variable", ["HF_LEROBOT_HOME", "HF_HOME", "XDG_CACHE_HOME"])
+def test_a_checkpoint_says_what_it_was_trained_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str
+) -> None:
+    """On the hub, unless it is on this machine: where LeRobot keeps its own, or where the training read it."""
+    for each in ("HF_LEROBOT_HOME", "HF_HOME"):
+        monkeypatch.delenv(each, raising=False)
+    monkeypatch.setenv(variable, str(tmp_path))
+    root = tmp_path / "mine"
+    policy = trained(tmp_path / "policy", {"dataset": {"repo_id": "org/data", "root": str(root)}})
+    assert recordings_of(policy) == NAME
+    below = {"HF_LEROBOT_HOME": "", "HF_HOME": "lerobot", "XDG_CACHE_HOME": "huggingface/lerobot"}[variable]
+    own = data_set(tmp_path / below / "org/data")
+    assert recordings_of(policy) == str(own)
+    assert recordings_of(trained(policy, {"dataset": {"repo_id": "org/data", "root": None}})) == str(own)
+    assert recordings_of(trained(policy, {"dataset": {"repo_id": "org/data", "root": str(data_set(root))}})) == str(
+        root
+    )
+
+
+def test_a_name_leads_nowhere_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
+    data_set(tmp_path / "other")
+    for name in ("../other", str(tmp_path / "other")):
+        assert recordings_of(trained(tmp_path, {"dataset": {"repo_id": name}})) == f"hf://datasets/{name}"
 
 
 def test_build_says_from_what_it_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,11 +129,11 @@ def test_build_says_from_what_it_learns(tmp_path: Path, monkeypatch: pytest.Monk
         raise CalibrationError("as far as this.")
 
     monkeypatch.setattr(builder, "convert", stopped)
-    (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "org/data"}}))
-    result = CliRunner().invoke(main, ["build", str(tmp_path), "-o", str(tmp_path / "compiled")])
+    policy = trained(tmp_path / "policy", {"dataset": {"repo_id": "org/data"}})
+    result = CliRunner().invoke(main, ["build", str(policy), "-o", str(tmp_path / "compiled")])
     assert result.exit_code == 2
     told = " ".join(result.stderr.split())
-    assert f"none were given: {NAME}, of its training, is read; -t takes a copy" in told
+    assert f"no episodes were given, so those of its training are read: {NAME}" in told
 
 
 def test_how_many_are_read_is_told(hub: Hub, tmp_path: Path) -> None:

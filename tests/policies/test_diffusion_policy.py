@@ -1,6 +1,7 @@
 """Configuration to policy: variants, sizes, samplers, and every way in which configuration and weights can disagree."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,8 @@ import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 from tests.rounding import Counted, allowed, assert_equal_but_for_rounding
-from ttscompile.errors import SpecError
-from ttscompile.frontends import load_checkpoint_policy
+from ttscompile.errors import CheckpointError, SpecError
+from ttscompile.frontends import load_checkpoint_policy, recordings_of
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.policies.diffusion_policy.parts import choose_weights
 from ttscompile.samplers.table import sampler_table
@@ -93,6 +94,24 @@ def test_the_data_set_says_what_is_recorded(
         "dataset": {"_target_": f"diffusion_policy.dataset.{data_set}", **given},
     }
     assert load_checkpoint_policy(save(built))[1].observations["obs"].recorded == recorded
+
+
+@pytest.mark.parametrize("key", ["zarr_path", "dataset_path"])
+def test_the_data_set_of_the_training_is_taken_where_it_lay(
+    payload: Build, save: Save, key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = payload()
+    with pytest.raises(CheckpointError, match="does not say which data set it was trained on"):
+        recordings_of(save(built))
+    built["cfg"]["task"] = {"dataset": {key: "data/pusht.zarr"}}
+    saved = save(built)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        CheckpointError, match="trained on data/pusht.zarr, and there is no such file here. Run this in"
+    ):
+        recordings_of(saved)
+    (tmp_path / "data" / "pusht.zarr").mkdir(parents=True)
+    assert recordings_of(saved) == "data/pusht.zarr"
 
 
 def test_chunk_ends_with_the_horizon(payload: Build, save: Save) -> None:

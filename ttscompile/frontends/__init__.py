@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.paths import require_free_or_path
+from ..core.paths import on_hub, require_free_or_path
 from ..core.spec import PolicySpec
 from ..core.tokenizer import Tokenizer
 from ..errors import CheckpointError
+from ..hub import fetch_checkpoint
 from .families import AS_SAVED, LoadOptions, find_family, function_of
 
 if TYPE_CHECKING:
@@ -42,6 +43,22 @@ def load_checkpoint_policy(
     """
     require_free_or_path(path, CheckpointError, "Give a file or a directory that was trained.")
     return find_family(Path(path), format).load(Path(path), options)
+
+
+def recordings_of(path: str | os.PathLike[str], format: str = "auto") -> str:
+    """Where the recorded episodes are that a policy was trained on, as ``load_trajectories`` takes it.
+
+    Raises:
+        CheckpointError: the checkpoint does not say, or names what is not here.
+        HubError: the checkpoint is on the hub, and cannot be had.
+    """
+    here = fetch_checkpoint(str(path)).path if on_hub(path) else Path(path)
+    find = find_family(here, format).function("recordings")
+    found: str | None = None if find is None else find(here)
+    if found is None:
+        told = "does not say which data set it was trained on. Give recorded episodes of its robot, with --trajectories"
+        raise CheckpointError(f"{os.fspath(path)}: {told}.")
+    return found
 
 
 def tokenizer_of(

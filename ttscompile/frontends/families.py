@@ -74,11 +74,12 @@ class Family:
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
         module: of ``policies``; imported when one of its functions is called, with torch. ``load(path, options)`` gives
-            network and ``PolicySpec``, or a CheckpointError or SpecError. It may have three more. ``examine(path, spec,
+            network and ``PolicySpec``, or a CheckpointError or SpecError. It may have four more. ``examine(path, spec,
             encoders)`` says what goes wrong without an error, in place of the look at normalisers.
             ``files_beside(path, spec, text)`` gives the files by which the program that trained a policy takes the
             compiled one in its place; none where it cannot take this one. ``tokenizer_file(path, encoders)`` finds what
-            makes an instruction the policy's tokens.
+            makes an instruction the policy's tokens. ``recordings(path)`` says where the recorded episodes are that it
+            was trained on, as ``-t`` takes it; None where the checkpoint does not say.
         options: names of ``LoadOptions`` that it takes; the others are refused.
     """
 

@@ -62,13 +62,30 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
         raise CheckpointError(f"{path}: {error}") from error
 
 
-def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
-    """Module and specification of what ``read_checkpoint`` gave; the rest as ``load``."""
+def recordings(path: Path) -> str | None:
+    """The data set of the training, where it lay then; see ``Family``."""
+    refuse_file(path)
+    config = _config(read_checkpoint(path))
+    named = next((each for key in ("zarr_path", "dataset_path") if (each := config.get(f"task.dataset.{key}"))), None)
+    if named is None or Path(str(named)).exists():
+        return named if named is None else str(named)
+    raise CheckpointError(
+        f"{path}: it was trained on {named!s:.200}, and there is no such file here. Run this in the folder where the"
+        " training ran, or give recorded episodes of its robot, with --trajectories."
+    )
+
+
+def _config(payload: Mapping[str, Any]) -> Config:
     refuse_payload(payload)
     tree = plain_config(payload["cfg"])
     if not isinstance(tree, dict):
         raise CheckpointError(f"cfg is a {type(tree).__name__}; expected a dictionary.")
-    config = Config(tree)
+    return Config(tree)
+
+
+def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
+    """Module and specification of what ``read_checkpoint`` gave; the rest as ``load``."""
+    config = _config(payload)
     name = str(config.require("policy._target_")).rpartition(".")[2]
     if name not in _POLICIES:
         refuse_policy(name)

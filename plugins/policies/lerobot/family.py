@@ -15,11 +15,12 @@ from ttscompile.frontends.refusals import LEROBOT, refuse_policy
 from ttscompile.frontends.settings import read_json
 
 from .config import CONFIG
+from .data_set import recordings
 from .examined import examine
 from .files import files_beside
 from .tokenizer import tokenizer_file
 
-__all__ = ["TYPES", "examine", "files_beside", "load", "tokenizer_file"]
+__all__ = ["TYPES", "examine", "files_beside", "load", "recordings", "tokenizer_file"]
 
 TYPES = {name: name for name in "act diffusion eo1 evo1 groot multi_task_dit smolvla vla_jepa wall_x xvla".split()}
 TYPES |= {"pi0": "pi", "pi05": "pi"}
