@@ -135,13 +135,13 @@ def test_the_term(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(module, "on_other_episodes", held)  # this policy leaves nothing over that is linear
     monkeypatch.setattr(sparse_loop, "TERMS", rows[-1:])
     task = tasks.make_task(policies.compiled(once), policies.record(tmp_path / "calls.npz"), calls=60)
-    some, others = (task.executor.select(task.calls, part) for part in (range(40), range(40, 60)))
-    loop = sparse_loop.SparseLoop(task.executor, some, others, reads=True, whole=True)
+    some, others = (task.runner.select(task.calls, part) for part in (range(40), range(40, 60)))
+    loop = sparse_loop.SparseLoop(task.runner, some, others, reads=True, whole=True)
     place = loop.ends(task.whole.plan([0, 6]))[1]
     correction = loop.correction(place)
     assert correction is not None and list(correction.landings) == [5]
     assert np.count_nonzero(correction.inner[0].any(0)) == 2 * 16  # of the numbers of a chunk, either sign
-    ran = task.executor.corrected(correction).run(task.whole.plan([0, 6]), others)
+    ran = task.runner.corrected(correction).run(task.whole.plan([0, 6]), others)
     np.testing.assert_allclose(place.samples, ran, rtol=1e-4, atol=1e-4)
 
 

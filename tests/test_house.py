@@ -55,7 +55,7 @@ MAY_IMPORT = {
 """Part of the package -> the other parts that it may import, anywhere in its code. Design, section 4."""
 
 RIVALS_READ = {
-    f"ttscompile.calibration.{name}" for name in ("calls", "execute", "pruner.paper", "step_counts", "strategy", "task")
+    f"ttscompile.calibration.{name}" for name in ("calls", "pruner.paper", "runner", "step_counts", "strategy", "task")
 }
 """What rivals know of calibration: what a strategy is given, what it may compare, and how a head is trained."""
 
@@ -155,7 +155,7 @@ def test_no_modules_import_each_other() -> None:
         ("ttscompile.calibration.tts", "ttscompile.rivals.bac"),
         ("ttscompile.rivals.bac", "ttscompile.calibration.pipeline"),
         ("ttscompile.frontends.families", "ttscompile.policies.octo"),
-        ("ttscompile.pool", "ttscompile.calibration.execute"),
+        ("ttscompile.pool", "ttscompile.calibration.runner"),
     ],
 )
 def test_an_import_the_wrong_way_is_found(importer: str, target: str) -> None:

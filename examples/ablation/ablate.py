@@ -41,8 +41,8 @@ from ttscompile.calibration.calls import (
     window_of,
 )
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pruner.paper import UPDATES, Paper
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Search, Task
@@ -112,8 +112,8 @@ def from_corrected(task: Task, updates: int) -> Search:
     """A head that departs from searched steps, trained with their correction."""
     clock = task.clock.until(0.5)
     found, _, _ = search_plan(Tts(replace(task, clock=clock)), clock)
-    executor = task.executor.corrected(found.correction)
-    return Paper(replace(task, executor=executor), begin=found.notes["steps"], updates=updates)
+    runner = task.runner.corrected(found.correction)
+    return Paper(replace(task, runner=runner), begin=found.notes["steps"], updates=updates)
 
 
 def rows_of(directions: Sequence[str], ways: Sequence[str], updates: int) -> list[tuple[str, str, Maker]]:
@@ -136,7 +136,7 @@ def rows_of(directions: Sequence[str], ways: Sequence[str], updates: int) -> lis
 class Judge:
     """Measures plans on held-out calls; see ``Row``."""
 
-    executor: Executor
+    runner: Runner
     actions: Actions
     calls: Calls
     other_noise: float
@@ -144,7 +144,7 @@ class Judge:
     def row(self, decided: str, reads: str, plans: PlanArray, correction: Correction | None, seconds: float) -> Row:
         """Plans ``[N, K, blocks]`` of the judged calls, or ``[K, blocks]`` for all of them."""
         calls = self.calls
-        samples = self.executor.corrected(correction).run(plans, calls)
+        samples = self.runner.corrected(correction).run(plans, calls)
         errors = self.actions.errors(samples, calls.targets, units=True)
         each = np.broadcast_to(plans, (calls.count, *plans.shape[-2:]))
         computed = (each == Source.COMPUTE).sum((1, 2))
@@ -208,7 +208,7 @@ def measured(
     for one in (plain, corrected):
         plans, correction = one.schedule, one.correction
         if one.pruner is not None:
-            plans = pruner_plan(task.executor.logits(judge.calls, one.pruner))
+            plans = pruner_plan(task.runner.logits(judge.calls, one.pruner))
             correction = one.pruner_correction
         row = judge.row(decided, reads, plans, correction, seconds)
         trained = found.notes.get("trained_error")
@@ -232,17 +232,17 @@ def keep(found: Found, directory: Path) -> None:
     update_plans(directory, plans, "found", notes, pruner_weights=found.pruner, pruner_loop=base.loop)
 
 
-def other_noise(executor: Executor, calls: Calls, seed: int) -> float:
+def other_noise(runner: Runner, calls: Calls, seed: int) -> float:
     """How far two answers to one observation are apart with every block computed, in the units of the actions."""
-    spec = executor.view.manifest.spec
-    some = executor.select(calls, np.arange(min(WITH_OTHER_NOISE, calls.count)))
+    spec = runner.view.manifest.spec
+    some = runner.select(calls, np.arange(min(WITH_OTHER_NOISE, calls.count)))
     initial, noise = draw_noise(spec, some.count, (seed, 5))
-    paths = torch.cat(list(dense_rounds(executor, replace(some, initial=initial, noise=noise, path=None))))
+    paths = torch.cat(list(dense_rounds(runner, replace(some, initial=initial, noise=noise, path=None))))
     return float(Actions(spec).errors(paths[:, -1], some.targets, units=True).mean())
 
 
 def drawn(
-    executor: Executor,
+    runner: Runner,
     episodes: Sequence[Any],
     numbers: Sequence[int],
     most: int,
@@ -252,11 +252,11 @@ def drawn(
     pinned: bool,
 ) -> Calls:
     """Windows of consecutive calls, with what is answered if every block is computed."""
-    spec = executor.view.manifest.spec
+    spec = runner.view.manifest.spec
     chosen = sample_calls(episodes, numbers, most, seed, REPEATS if stage == 0 else 1, window)
-    calls = prepare_calls(executor.model, spec, episodes, chosen, (seed, 9, stage), window)
+    calls = prepare_calls(runner.model, spec, episodes, chosen, (seed, 9, stage), window)
     calls = pin(calls) if pinned else calls
-    return replace(calls, path=torch.cat(list(dense_rounds(executor, calls))))
+    return replace(calls, path=torch.cat(list(dense_rounds(runner, calls))))
 
 
 def pin(calls: Calls) -> Calls:
@@ -326,18 +326,18 @@ def main(
     """Measure all rows on the artifact in DIRECTORY."""
     artifact = load_artifact(directory)
     spec, progress = artifact.manifest.spec, Console(stderr=True)
-    executor = Executor(view_of(artifact, base_of(artifact).exact))
-    budget = round(computed_steps * executor.model.blocks)
+    runner = Runner(view_of(artifact, base_of(artifact).exact))
+    budget = round(computed_steps * runner.model.blocks)
     episodes = load_episodes(spec, trajectories, None)
     split = split_episodes(len(episodes), FRACTION, seed)
     window = window_of(episodes, split)
     sets = [
-        drawn(executor, episodes, numbers, most, window, seed, stage, pinned)
+        drawn(runner, episodes, numbers, most, window, seed, stage, pinned)
         for stage, (numbers, most) in enumerate(((split.calibration, learned), (split.validation, judged)))
     ]
-    task = Task.of(executor, sets[0], budget, seed)
-    judge = Judge(executor, task.actions, sets[1], other_noise(executor, sets[1], seed))
-    even = uniform_plan(executor.model.steps, executor.model.blocks, -(-budget // executor.model.blocks))
+    task = Task.of(runner, sets[0], budget, seed)
+    judge = Judge(runner, task.actions, sets[1], other_noise(runner, sets[1], seed))
+    even = uniform_plan(runner.model.steps, runner.model.blocks, -(-budget // runner.model.blocks))
     rows = [judge.row("even steps", "TIMESTEP", even, None, 0.0)]
     if "refreshed" in ways:
         rows += refreshed(task, judge, even)
@@ -346,12 +346,12 @@ def main(
     for decided, reads, maker in rows_of(directions, ways, updates):
         rows += measured(task, judge, decided, reads, maker, minutes, kept)
         progress.print(rows[-2], rows[-1], sep="\n")
-    flops = executor.view.manifest.flops
-    share = flops.pruner / flops.call(dense_plan(executor.model.steps, executor.model.blocks), False)
+    flops = runner.view.manifest.flops
+    share = flops.pruner / flops.call(dense_plan(runner.model.steps, runner.model.blocks), False)
     if path is not None:
         told: Mapping[str, Any] = {
             "computed_steps": computed_steps,
-            "cells": executor.model.steps * executor.model.blocks,
+            "cells": runner.model.steps * runner.model.blocks,
             "calls": [one.count for one in sets],
             "window": window,
             "pinned": pinned,
@@ -359,7 +359,7 @@ def main(
             "rows": [asdict(row) for row in rows],
         }
         path.write_text(json.dumps(told, indent=2))
-    show(rows, f"{budget} of {executor.model.steps * executor.model.blocks} cells, windows of {window} calls")
+    show(rows, f"{budget} of {runner.model.steps * runner.model.blocks} cells, windows of {window} calls")
     print(f"A head costs {share:.4%} of the FLOPs of a call that computes every block.")
 
 

@@ -21,8 +21,8 @@ from three_parts import answered, in_three
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.targets import REPEATS
@@ -107,23 +107,23 @@ def oracle(
             " choices learned on others, and judged on others again. Record more; about sixteen are enough."
         )
     fitting, learning, judging = in_three(len(episodes), seed)
-    executor, actions = Executor(view), Actions(spec)
+    runner, actions = Runner(view), Actions(spec)
 
     def drawn(numbers: tuple[int, ...], stage: int) -> Calls:
         """Observations of some episodes, each with all of its draws, one after the other."""
         chosen = [one for one in sample_calls(episodes, numbers, calls, seed) for _ in range(draws)]
-        return prepare_calls(executor.model, spec, episodes, chosen, (seed, 7, stage))
+        return prepare_calls(runner.model, spec, episodes, chosen, (seed, 7, stage))
 
     repeated = sample_calls(episodes, fitting, FITTED, seed, REPEATS)
-    fitted = prepare_calls(executor.model, spec, episodes, repeated, (seed, 7, 0))
-    fitted = answered(executor, fitted, "dense calls for corrections", progress)
+    fitted = prepare_calls(runner.model, spec, episodes, repeated, (seed, 7, 0))
+    fitted = answered(runner, fitted, "dense calls for corrections", progress)
     parts = [
-        answered(executor, drawn(numbers, stage), f"dense calls to {what}", progress)
+        answered(runner, drawn(numbers, stage), f"dense calls to {what}", progress)
         for stage, (what, numbers) in enumerate({"learn from": learning, "judge": judging}.items(), 1)
     ]
 
     def wrong(plan: PlanArray, correction: Correction | None, part: Calls) -> Array:
-        return actions.errors(executor.corrected(correction).run(plan, part), part.targets, units=True)
+        return actions.errors(runner.corrected(correction).run(plan, part), part.targets, units=True)
 
     counts = [count for count in (budget - 1, budget, budget + 1) if 0 < count < steps]
     placed = [one for count in counts for one in placements(steps, count, schedules, seed)]
@@ -132,13 +132,13 @@ def oracle(
         progress("schedules", number, len(placed))
         plan = whole_steps_plan(steps, blocks, one)
         # As calibration decides for most policies; what does harm is left out.
-        made = [fit_correction(executor, plan, fitted, reads) for reads in (True, False)]
+        made = [fit_correction(runner, plan, fitted, reads) for reads in (True, False)]
         tried = [(wrong(plan, each, parts[0]), each) for each in (*made, None)]
         best, correction = min(tried, key=lambda pair: float(pair[0].mean()))
         errors[0].append(best)
         errors[1].append(wrong(plan, correction, parts[1]))
     progress("schedules", len(placed), len(placed))
-    learned, judged = (_errors(executor, part, each, draws) for part, each in zip(parts, errors, strict=True))
+    learned, judged = (_errors(runner, part, each, draws) for part, each in zip(parts, errors, strict=True))
     computed = np.array([len(one) for one in placed])
     return Oracle(
         budget=budget,
@@ -160,10 +160,10 @@ def placements(steps: int, count: int, most: int, seed: int) -> list[tuple[int, 
     return list(found)
 
 
-def _errors(executor: Executor, calls: Calls, columns: Sequence[Array], draws: int) -> Errors:
+def _errors(runner: Runner, calls: Calls, columns: Sequence[Array], draws: int) -> Errors:
     """The errors of all schedules on calls, of which so many in a row have one observation."""
     assert calls.path is not None
-    condition = executor.model.condition(calls.contexts)
+    condition = runner.model.condition(calls.contexts)
     known = {
         **({"the observation": condition} if 0 < condition.shape[1] <= MOST_NUMBERS else {}),
         "the noise": calls.initial.flatten(1),

@@ -21,8 +21,8 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Actions, Calls, load_episodes, prepare_calls, sample_calls
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import search_plan
 from ttscompile.calibration.sparse_loop import SparseLoop
 from ttscompile.calibration.step_counts import spacings
@@ -91,13 +91,13 @@ class Nested:
 class Kept(WholeSteps):
     """Compares schedules as calibration does, and keeps what they answer."""
 
-    def __init__(self, executor: Executor, actions: Actions, fitted: Calls, learned: Calls, count: int, seed: int):
-        super().__init__(executor, fitted, seed)
+    def __init__(self, runner: Runner, actions: Actions, fitted: Calls, learned: Calls, count: int, seed: int):
+        super().__init__(runner, fitted, seed)
         self.reading = self.reads(count)
         self._kept: dict[Steps, torch.Tensor] = {}
         self._actions_of, self._learned = actions, learned
-        loop = SparseLoop(executor, fitted, learned, reads=self.reading, whole=True)
-        self._loop = ScheduleRuns(loop, self.steps, executor.model.blocks)
+        loop = SparseLoop(runner, fitted, learned, reads=self.reading, whole=True)
+        self._loop = ScheduleRuns(loop, self.steps, runner.model.blocks)
 
     def errors(self, steps: Sequence[int]) -> Errors:
         """See ``WholeSteps``; of corrections that are fitted on one part of the episodes, on another."""
@@ -175,11 +175,11 @@ def nested(
             " thresholds learned on others, and judged on others again. Record more; about sixty are enough."
         )
     fitting, learning, judging = in_three(len(episodes), seed)
-    executor, actions = Executor(view), Actions(spec)
+    runner, actions = Runner(view), Actions(spec)
 
     def dense(numbers: Sequence[tuple[int, int]], what: str, stage: int) -> Calls:
-        calls = prepare_calls(executor.model, spec, episodes, numbers, (seed, 10, stage))
-        return answered(executor, calls, what, progress)
+        calls = prepare_calls(runner.model, spec, episodes, numbers, (seed, 10, stage))
+        return answered(runner, calls, what, progress)
 
     drawn = [
         sample_calls(episodes, numbers, limit, seed, REPEATS)
@@ -187,10 +187,10 @@ def nested(
     ]
     fit = dense(drawn[0], "dense calls for corrections", 0)
     others = dense([*drawn[1], *drawn[2]], "dense calls to compare on", 1)
-    learn, judge = (executor.select(others, one) for one in np.split(np.arange(others.count), [len(drawn[1])]))
+    learn, judge = (runner.select(others, one) for one in np.split(np.arange(others.count), [len(drawn[1])]))
     clock = Clock(60 * minutes)
-    whole = Kept(executor, actions, fit, learn, min(3, most), seed)
-    task = replace(Task.of(executor, fit, 0, seed), whole=whole)
+    whole = Kept(runner, actions, fit, learn, min(3, most), seed)
+    task = replace(Task.of(runner, fit, 0, seed), whole=whole)
     _search(task, most, clock.until(SEARCHING), progress)
     _endings(whole, most, clock, progress)
     fixed = {count: _ranked(whole, count)[0] for count in range(2, most + 1)}
@@ -214,7 +214,7 @@ def nested(
     ]
     needed = {*fixed.values()}
     needed |= {one for _, family in families for one in (family.at, family.at[:-1], *family.endings)}
-    answers = dict(_answers(executor, fit, others, sorted(needed), whole.reading, jumps, progress))
+    answers = dict(_answers(runner, fit, others, sorted(needed), whole.reading, jumps, progress))
     of_judged = {one: error(samples[learn.count :], judge) for one, samples in answers.items()}
     best = Fixed({count: of_judged[one] for count, one in fixed.items()}, judge.episodes, seed)
 
@@ -242,7 +242,7 @@ def _search(task: Task, most: int, clock: Clock, progress: Progress) -> None:
     for count in range(2, most + 1):
         progress("fixed schedules", count - 2, most - 1)
         share = clock.until((clock.elapsed() + clock.left() / (most + 1 - count)) / clock.limit)
-        search_plan(Tts(replace(task, budget=count * task.executor.model.blocks, clock=share)), share)
+        search_plan(Tts(replace(task, budget=count * task.runner.model.blocks, clock=share)), share)
     progress("fixed schedules", most - 1, most - 1)
 
 
@@ -277,7 +277,7 @@ def _continued(steps: int, beginnings: Iterable[Steps], most: int) -> Iterator[S
 
 
 def _answers(
-    executor: Executor,
+    runner: Runner,
     fitted: Calls,
     others: Calls,
     schedules: Sequence[Steps],
@@ -289,9 +289,9 @@ def _answers(
 
     Schedules that begin alike have the same corrections and jumps up to where they part.
     """
-    model = executor.model
-    jumps = jumps and may_jump(executor.view.manifest.spec.sample)
-    loop = SparseLoop(executor, fitted, others, reads=reads, whole=True)
+    model = runner.model
+    jumps = jumps and may_jump(runner.view.manifest.spec.sample)
+    loop = SparseLoop(runner, fitted, others, reads=reads, whole=True)
     runs = ScheduleRuns(loop, model.steps, model.blocks)
     for number, steps in enumerate(schedules):
         progress("judged schedules", number, len(schedules))

@@ -27,9 +27,9 @@ from three_parts import answered
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import FRACTION, Actions, Calls, load_episodes, prepare_calls, sample_calls
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Bar, Progress
 from ttscompile.calibration.regression import Components
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.calibration.targets import REPEATS
 from ttscompile.calibration.task import Task
@@ -81,25 +81,25 @@ class Study:
     def __init__(self, directory: Path, trajectories: Sequence[Path], sources: Sources, steps: Sequence[int]) -> None:
         artifact = load_artifact(directory)
         view = view_of(artifact, base_of(artifact).exact)
-        self.spec, self.executor = view.manifest.spec, Executor(view)
+        self.spec, self.runner = view.manifest.spec, Runner(view)
         self.actions = Actions(self.spec)
         self.episodes = load_episodes(self.spec, trajectories, sources)
         self.steps = tuple(sorted({0, *steps}))
-        if self.steps[-1] >= self.executor.model.steps:
+        if self.steps[-1] >= self.runner.model.steps:
             raise CalibrationError(
-                f"expected computed steps below {self.executor.model.steps}, of the loop; found {self.steps[-1]}."
+                f"expected computed steps below {self.runner.model.steps}, of the loop; found {self.steps[-1]}."
             )
 
     def answers(self, numbers: Sequence[int], count: int, seed: int, what: str, progress: Progress) -> Calls:
         """Calls of some episodes and what the original answers to them."""
         chosen = sample_calls(self.episodes, numbers, count, seed, REPEATS)
-        calls = prepare_calls(self.executor.model, self.spec, self.episodes, chosen, (seed, 11, *numbers[:1]))
-        return answered(self.executor, calls, what, progress)
+        calls = prepare_calls(self.runner.model, self.spec, self.episodes, chosen, (seed, 11, *numbers[:1]))
+        return answered(self.runner, calls, what, progress)
 
     def errors(self, plan: PlanArray, fitted: Calls, judged: Calls, reads: bool) -> np.ndarray:
         """Of each judged call, with the correction that the others give."""
-        correction = fit_correction(self.executor, plan, fitted, reads)
-        found = self.executor.corrected(correction).run(plan, judged)
+        correction = fit_correction(self.runner, plan, fitted, reads)
+        found = self.runner.corrected(correction).run(plan, judged)
         return self.actions.errors(found, judged.targets, units=True).astype(np.float64)
 
     def row(
@@ -113,15 +113,15 @@ class Study:
             numbers = np.random.default_rng((draw, 12, count)).permutation(others)[:count].tolist()
             pool = self.answers(numbers, 2 * limit, draw, f"{count} episodes, draw {draw}", progress)
             first = np.arange(min(limit, pool.count))
-            task = Task.of(self.executor, self.executor.select(pool, first), 0, draw)
+            task = Task.of(self.runner, self.runner.select(pool, first), 0, draw)
             plan, reads = task.whole.plan(self.steps), task.whole.reads(len(self.steps))
             half = first[: len(first) // 2]
             rest = np.arange(len(half), pool.count)
-            missed = self.errors(plan, self.executor.select(pool, half), self.executor.select(pool, rest), reads)
+            missed = self.errors(plan, self.runner.select(pool, half), self.runner.select(pool, rest), reads)
             worst = rest[np.argsort(-missed)[: len(first) - len(half)]]
-            cover = chosen_to_cover(self.executor.model.condition(pool.contexts), len(first))
+            cover = chosen_to_cover(self.runner.model.condition(pool.contexts), len(first))
             for way, which in ((RANDOM, first), (COVER, cover), (WORST, np.concatenate([half, worst]))):
-                errors[way].append(float(self.errors(plan, self.executor.select(pool, which), judged, reads).mean()))
+                errors[way].append(float(self.errors(plan, self.runner.select(pool, which), judged, reads).mean()))
         gains = {way: 1 - np.array(errors[way]) / np.array(errors[RANDOM]) for way in WAYS[1:]}
         return Row(
             count,

@@ -3,7 +3,7 @@
     python examples/ablation/sources.py compiled/ --trajectories calls.npz --computed-steps 3
 
 A cell that is not computed adds a residual that was. TaylorSeer adds a forecast of two or three, FastCache a linear map
-of what the block is given, and ToCa computes some tokens of it. Each runs here in calibration's executor, on calls of
+of what the block is given, and ToCa computes some tokens of it. Each runs here in calibration's runner, on calls of
 episodes that nothing was learned from, with as many computed cells as evenly spaced whole steps have. Nothing is
 written, and no runtime knows of any.
 
@@ -40,8 +40,8 @@ from ttscompile.calibration.calls import (
     sample_calls,
     split_episodes,
 )
-from ttscompile.calibration.execute import Executor, last
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.runner import Runner, last
 from ttscompile.calibration.targets import REPEATS
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import base_of
@@ -93,26 +93,26 @@ Fill = Callable[[int, int, Tensor, Sequence[tuple[int, Tensor]]], tuple[Tensor, 
 class Study:
     """The loop of a policy, with cells filled in any way."""
 
-    def __init__(self, executor: Executor, actions: Actions, learned: Calls, judged: Calls, seed: int) -> None:
-        types = executor.types
-        if not executor.alike or len(types[0].at(2)) != 3:
+    def __init__(self, runner: Runner, actions: Actions, learned: Calls, judged: Calls, seed: int) -> None:
+        types = runner.types
+        if not runner.alike or len(types[0].at(2)) != 3:
             raise CalibrationError(
                 f"expected blocks whose residuals are tokens, [streams, tokens, width]; found {types[0]}. A network"
                 " without a residual stream is one block, and has no tokens."
             )
-        self.executor, self.actions, self.learned, self.judged = executor, actions, learned, judged
-        self.task, self._maps = Task.of(executor, learned, 0, seed), list[Linear]()
-        self.steps, self.blocks = executor.model.steps, executor.model.blocks
-        at = executor.axes[0]
+        self.runner, self.actions, self.learned, self.judged = runner, actions, learned, judged
+        self.task, self._maps = Task.of(runner, learned, 0, seed), list[Linear]()
+        self.steps, self.blocks = runner.model.steps, runner.model.blocks
+        at = runner.axes[0]
         shape = list(types[0].at(2))
         del shape[at]
         self.tokens, self.width = shape
-        manifest = executor.view.manifest
+        manifest = runner.view.manifest
         self._block_flops = float(np.mean(manifest.flops.blocks))
 
     def filled(self, calls: Calls, whole: Steps, fill: Fill) -> Filled:
         """Run calls with some whole steps, and the other cells filled."""
-        model, kept = self.executor.model, [list[tuple[int, Tensor]]() for _ in range(self.blocks)]
+        model, kept = self.runner.model, [list[tuple[int, Tensor]]() for _ in range(self.blocks)]
         computed = 0.0
 
         def blocks(k: int, stream: Tensor) -> Tensor:
@@ -128,7 +128,7 @@ class Study:
             return stream
 
         with torch.no_grad():
-            samples = last(self.executor.samples(calls, blocks))
+            samples = last(self.runner.samples(calls, blocks))
         return Filled(samples, computed)
 
     def row(self, way: str, done: Filled, beside: float = 0.0) -> Row:
@@ -169,7 +169,7 @@ class Study:
             ]
 
             def seen(k: int, b: int, stream: Tensor, kept: Sequence[tuple[int, Tensor]]) -> tuple[Tensor, float]:
-                residual = self.executor.model.block(b, k, stream, self.learned.contexts)
+                residual = self.runner.model.block(b, k, stream, self.learned.contexts)
                 x = stream.reshape(-1, self.width).double()
                 x = torch.cat([x, torch.ones(len(x), 1).double()], 1)
                 sums[b][0].addmm_(x.T, x)
@@ -190,7 +190,7 @@ class Study:
 
     def gated(self, calls: Calls, threshold: float, otherwise: Fill) -> Filled:
         """Calls in which a block is computed where its input has changed by more than a threshold since it last was."""
-        axis, before = self.executor.axes[0], dict[int, Tensor]()
+        axis, before = self.runner.axes[0], dict[int, Tensor]()
         latest = dict[int, Tensor]()
 
         def fill(k: int, b: int, stream: Tensor, kept: Sequence[tuple[int, Tensor]]) -> tuple[Tensor, float]:
@@ -202,7 +202,7 @@ class Study:
             shape = [1, 1, 1]
             shape[axis] = -1
             chosen = new.reshape(shape)
-            computed = self.executor.model.block(b, k, stream, calls.contexts)
+            computed = self.runner.model.block(b, k, stream, calls.contexts)
             other, _ = otherwise(k, b, stream, [(k, latest[b])])
             before[b], latest[b] = torch.where(chosen, stream, before[b]), torch.where(chosen, computed, latest[b])
             return torch.where(chosen, computed, other), float(new.float().mean())
@@ -221,12 +221,12 @@ class Study:
 
     def some_tokens(self, whole: Steps, count: int) -> Filled:
         """Calls in which the tokens of a block whose residual changed most are computed, so many, at other steps."""
-        axis, calls, latest = self.executor.axes[0], self.judged, dict[int, Tensor]()
+        axis, calls, latest = self.runner.axes[0], self.judged, dict[int, Tensor]()
 
         def fill(k: int, b: int, stream: Tensor, kept: Sequence[tuple[int, Tensor]]) -> tuple[Tensor, float]:
             if k - 1 in whole:
                 latest[b] = kept[0][1]
-            computed = self.executor.model.block(b, k, stream, calls.contexts).movedim(axis, 0)
+            computed = self.runner.model.block(b, k, stream, calls.contexts).movedim(axis, 0)
             old = latest[b].movedim(axis, 0)
             chosen = (computed - old).norm(dim=-1).topk(count, 1).indices
             mask = torch.zeros(old.shape[:2]).scatter(1, chosen, 1.0)[..., None] > 0
@@ -251,7 +251,7 @@ def rows_of(study: Study, count: int, only: Sequence[str] = WAYS) -> list[Row]:
             done = study.filled(judged, whole, study.forecast(order))
             found.append(study.row(f"forecast of each block, order {order}", done))
         plan = uniform_plan(study.steps, study.blocks, count)
-        corrected = study.executor.corrected(correction_for(study.task, whole))
+        corrected = study.runner.corrected(correction_for(study.task, whole))
         found.append(study.row("forecast of the output, a correction", Filled(corrected.run(plan, judged), cells)))
     if "linear" in only:
         found.append(study.row("linear in the input", study.filled(judged, whole, study.linear), product))
@@ -289,7 +289,7 @@ def main(
     """Measure it for the policy of the artifact in DIRECTORY."""
     artifact = load_artifact(directory)
     view = view_of(artifact, base_of(artifact).exact)
-    spec, executor = view.manifest.spec, Executor(view)
+    spec, runner = view.manifest.spec, Runner(view)
     if not 1 < computed_steps < view.manifest.steps:
         raise CalibrationError(
             f"computed steps: expected between 2 and {view.manifest.steps - 1}, of the loop; found {computed_steps}."
@@ -300,10 +300,10 @@ def main(
         parts = []
         for stage, numbers in enumerate((split.calibration, split.validation)):
             chosen = sample_calls(episodes, numbers, calls, seed, REPEATS)
-            drawn = prepare_calls(executor.model, spec, episodes, chosen, (seed, 17, stage))
-            parts.append(answered(executor, drawn, "dense calls", bar.tell))
+            drawn = prepare_calls(runner.model, spec, episodes, chosen, (seed, 17, stage))
+            parts.append(answered(runner, drawn, "dense calls", bar.tell))
         learned, judged = parts
-        rows = rows_of(Study(executor, Actions(spec), learned, judged, seed), computed_steps, only)
+        rows = rows_of(Study(runner, Actions(spec), learned, judged, seed), computed_steps, only)
     if as_json:
         print_json({"rows": [asdict(one) for one in rows]})
         return

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 
 from ttscompile.calibration.calls import FRACTION, Calls, split_episodes
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.targets import dense_rounds
 
 Numbers = tuple[int, ...]
@@ -22,11 +22,11 @@ def in_three(count: int, seed: int) -> tuple[Numbers, Numbers, Numbers]:
     return fitting, learning, split.validation
 
 
-def answered(executor: Executor, calls: Calls, what: str, progress: Progress) -> Calls:
+def answered(runner: Runner, calls: Calls, what: str, progress: Progress) -> Calls:
     """The calls with the samples of the dense policy after every step (``Calls.path``); tells of it as ``what``."""
     paths: list[torch.Tensor] = []
     progress(what, 0, calls.count)
-    for found in dense_rounds(executor, calls):
+    for found in dense_rounds(runner, calls):
         paths.append(found)
         progress(what, sum(map(len, paths)), calls.count)
     return replace(calls, path=torch.cat(paths))

@@ -37,8 +37,8 @@ from ttscompile.calibration.calls import (
     sample_calls,
     split_episodes,
 )
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.strategies import NAMES
 from ttscompile.calibration.targets import REPEATS, dense_rounds
 from ttscompile.calibration.task import Found, Task
@@ -204,18 +204,18 @@ def main(
     view = view_of(artifact, base)
     manifest, spec = view.manifest, view.manifest.spec
     episodes = load_episodes(spec, trajectories, sources)
-    split, executor = split_episodes(len(episodes), FRACTION, seed), Executor(view)
+    split, runner = split_episodes(len(episodes), FRACTION, seed), Runner(view)
     with Bar(shown=True) as bar:
         drawn = sample_calls(episodes, split.calibration, learned_calls, seed, REPEATS)
-        learned = prepare_calls(executor.model, spec, episodes, drawn, (seed, 15))
+        learned = prepare_calls(runner.model, spec, episodes, drawn, (seed, 15))
         bar.stage("calls to learn from", learned.count, 0)
-        learned = replace(learned, path=torch.cat(list(dense_rounds(executor, learned))))
+        learned = replace(learned, path=torch.cat(list(dense_rounds(runner, learned))))
         places = sample_calls(episodes, split.validation, calls, seed, REPEATS)
         initial, steps = draw_noise(spec, len(places), (seed, 16))
         noise = Noise(initial.numpy(), None if steps is None else steps.numpy())
         judged = Judged(normalized(spec, observed(spec, episodes, places)), noise)
         asked = [float(one) for one in sparsities.split(",")] if sparsities else default_sparsities(manifest.steps)
-        contestants, task = Contestants(artifact, base), Task.of(executor, learned, 0, seed)
+        contestants, task = Contestants(artifact, base), Task.of(runner, learned, 0, seed)
         for name, plan in artifact.plans.items():
             if plan.loop == base.loop and name not in (DENSE, FULL):
                 contestants.add_plan(f"the artifact's {name}", "online" if plan.pruned else "", plan)

@@ -22,7 +22,7 @@ import torch
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, prepare_calls
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.step_counts import spacings
 from ttscompile.calibration.targets import dense_rounds
 from ttscompile.calibration.task import Task
@@ -32,11 +32,11 @@ from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.trajectories.episodes import Episode
 
 
-def drawn_calls(executor: Executor, count: int) -> Calls:
+def drawn_calls(runner: Runner, count: int) -> Calls:
     """Calls without targets, each an episode of its own."""
-    spec = executor.view.manifest.spec
+    spec = runner.view.manifest.spec
     episodes = [Episode("drawn", obs) for obs, _ in random_calls(spec, count, seed=0)]
-    return prepare_calls(executor.model, spec, episodes, [(number, 0) for number in range(count)], (0,))
+    return prepare_calls(runner.model, spec, episodes, [(number, 0) for number in range(count)], (0,))
 
 
 @click.command()
@@ -49,20 +49,20 @@ def main(directory: Path, cores: str, calls: int, full_steps: int, rounds: int) 
     """Time dense calls and candidates of the artifact DIRECTORY on clusters of some of this machine's cores."""
     torch.set_num_threads(1)
     artifact = load_artifact(directory)
-    executor = Executor(view_of(artifact, base_of(artifact).exact))
-    drawn = drawn_calls(executor, calls)
+    runner = Runner(view_of(artifact, base_of(artifact).exact))
+    drawn = drawn_calls(runner, calls)
     counts = [int(each) for each in cores.split(",")]
     seconds: dict[int, list[tuple[float, float]]] = {count: [] for count in counts}
     answers = []
     for _ in range(rounds):
         for count in counts:
             with RayPool("local", cores=count) as pool:
-                list(dense_rounds(executor, drawn, pool=pool))  # starts the processes, which import torch
+                list(dense_rounds(runner, drawn, pool=pool))  # starts the processes, which import torch
                 begun = time.perf_counter()
-                path = torch.cat(list(dense_rounds(executor, drawn, pool=pool)))
+                path = torch.cat(list(dense_rounds(runner, drawn, pool=pool)))
                 dense = time.perf_counter()
-                whole = Task.of(executor, replace(drawn, path=path), 0, 0, pool).whole
-                family = spacings(executor.model.steps, full_steps)
+                whole = Task.of(runner, replace(drawn, path=path), 0, 0, pool).whole
+                family = spacings(runner.model.steps, full_steps)
                 for number in range(len(family)):
                     whole.expect(family[number:])
                 errors = [whole.errors(steps).normalised for steps in family]

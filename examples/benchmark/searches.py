@@ -14,12 +14,12 @@ from ttscompile.calibration.budget import cells_of, goal_of
 from ttscompile.calibration.calls import Calls, digest_of
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.compare import Entrant, Joining
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.progress import Progress
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.strategies import strategy_of
-from ttscompile.calibration.targets import executor_arguments, executor_elsewhere
+from ttscompile.calibration.targets import runner_arguments, runner_elsewhere
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import HELD_OUT, Trials
 from ttscompile.core.correction import FEATURES, Correction
@@ -181,7 +181,7 @@ class Searching:
             "correct": correct,
         }
         state = self._state = ComparisonState(self._path, settings)
-        manifest = trials.executor.view.manifest
+        manifest = trials.runner.view.manifest
         budgets = {one: cells_of(goal_of(target_sparsity=one), manifest, False) for one in self._sparsities}
         with opened_pool(self._ray) as pool:
             trials = replace(trials, state=state, pool=pool, limits=CallLimits(*[self._learned] * 3))
@@ -193,8 +193,8 @@ class Searching:
             missing = [wish for wish in names if searches.known(*wish) is None]
             if missing:
                 progress("dense calls to learn from", 0, 1)
-                task = _of_schedules(trials.executor, trials.calls, trials.seed)
-                given = *executor_arguments(trials.executor), trials.calls, trials.seed, self._how
+                task = _of_schedules(trials.runner, trials.calls, trials.seed)
+                given = *runner_arguments(trials.runner), trials.calls, trials.seed, self._how
                 outcomes = pool.map(Work(partial(_searched, task, self._how), _searched_elsewhere, given), missing)
                 for number, wish in enumerate(missing, len(names) - len(missing)):
                     progress(f"search: {names[wish]}", number, len(names))
@@ -278,12 +278,12 @@ def _searched(task: Task, how: How, wish: Wish) -> Outcome:
 def _searched_elsewhere(
     path: str, identity: str, loop: str, calls: Calls, seed: int, how: How
 ) -> Callable[[Wish], Outcome]:
-    return partial(_searched, _of_schedules(executor_elsewhere(path, identity, loop), calls, seed), how)
+    return partial(_searched, _of_schedules(runner_elsewhere(path, identity, loop), calls, seed), how)
 
 
-def _of_schedules(executor: Executor, calls: Calls, seed: int) -> Task:
+def _of_schedules(runner: Runner, calls: Calls, seed: int) -> Task:
     """What strategies are given, but for the budget.
 
     Without constants of a pruner nobody spends time on plans that depend on the observation.
     """
-    return replace(Task.of(executor, calls, 0, seed), pruner={})
+    return replace(Task.of(runner, calls, 0, seed), pruner={})

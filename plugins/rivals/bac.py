@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.task import Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 
@@ -44,8 +44,8 @@ FEED_FORWARD = "feed_forward"
 @fixed
 def bac(task: Task) -> Found:
     """The schedule of the scheduler and the union."""
-    model = task.executor.model
-    calls, run = some_calls(task, DENSE_CALLS), task.executor
+    model = task.runner.model
+    calls, run = some_calls(task, DENSE_CALLS), task.runner
     found = [dense_statistics(run, run.select(calls, [i])) for i in task.clock.in_time(range(calls.count))]
     similarity, change = (np.mean([one[part] for one in found], axis=0) for part in range(2))
     most = min(model.steps, task.budget // model.blocks + 1)
@@ -144,14 +144,14 @@ def spend(schedules: Sequence[Sequence[Schedule]], followed: Mapping[int, Sequen
     return counts
 
 
-def dense_statistics(executor: Executor, calls: Calls) -> tuple[Scores, Scores]:
+def dense_statistics(runner: Runner, calls: Calls) -> tuple[Scores, Scores]:
     """How each block's residual changes over the steps of dense calls.
 
     Returns:
         Cosine similarities ``[blocks, K, K]``, and mean absolute differences over all pairs of steps ``[blocks]``; both
         averaged over the calls.
     """
-    residuals = dense_residuals(executor, calls)
+    residuals = dense_residuals(runner, calls)
     similarity, change = [], []
     for rows in residuals:  # [N, K, size]
         unit = torch.nn.functional.normalize(rows, dim=-1)
@@ -160,10 +160,10 @@ def dense_statistics(executor: Executor, calls: Calls) -> tuple[Scores, Scores]:
     return np.stack(similarity), np.array(change)
 
 
-def dense_residuals(executor: Executor, calls: Calls) -> list[Tensor]:
+def dense_residuals(runner: Runner, calls: Calls) -> list[Tensor]:
     """What each block adds at every step of dense calls: ``[N, K, size]`` a block."""
-    kept: list[list[Tensor]] = [[] for _ in executor.axes]
-    for _, residuals in dense_steps(executor, calls):
-        for rows, residual, axis in zip(kept, residuals, executor.axes, strict=True):
+    kept: list[list[Tensor]] = [[] for _ in runner.axes]
+    for _, residuals in dense_steps(runner, calls):
+        for rows, residual, axis in zip(kept, residuals, runner.axes, strict=True):
             rows.append(residual.movedim(axis, 0).flatten(1))
     return [torch.stack(rows, 1) for rows in kept]

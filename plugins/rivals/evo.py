@@ -36,7 +36,7 @@ class Evo(NothingAfter):
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        model = task.executor.model
+        model = task.runner.model
         self._least = min(LEAST, task.budget // model.blocks)
         self._population: BoolArray = self._first()
         self._errors = np.full(len(self._population), np.inf)
@@ -81,7 +81,7 @@ class Evo(NothingAfter):
 
     def _first(self) -> BoolArray:
         """Whole-step plans, and random ones."""
-        task, model = self._task, self._task.executor.model
+        task, model = self._task, self._task.runner.model
         draw = task.draw(10**6)
         family = spacings(model.steps, max(1, task.budget // model.blocks))
         whole = [whole_steps_plan(model.steps, model.blocks, steps) == Source.COMPUTE for steps in family]

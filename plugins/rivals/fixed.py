@@ -23,7 +23,7 @@ class Fixed(NothingAfter):
 
     def __init__(self, task: Task, choose: Callable[[Task], Found]) -> None:
         self._task, self._choose = task, choose
-        model = task.executor.model
+        model = task.runner.model
         self._found = Found(dense_plan(model.steps, model.blocks))
 
     @property

@@ -60,7 +60,7 @@ class Gates(NothingAfter):
 
     def __init__(self, task: Task, reuse: Source, whole: int = 0) -> None:
         self._task, self._reuse = task, reuse
-        model = task.executor.model
+        model = task.runner.model
         shape = (model.steps, model.blocks)
         self._fixed: BoolArray = np.zeros(shape, np.bool_)
         self._fixed[:: whole or model.steps] = True
@@ -74,8 +74,8 @@ class Gates(NothingAfter):
         """One gradient step, then the plan of the scores on calls that are always the same."""
         task = self._task
         numbers = task.draw(interval, 0).permutation(task.calls.count)[:BATCH]
-        calls = task.executor.select(task.calls, numbers)
-        gradient = slopes(task.executor, task.actions, self._cells(self._room(interval)), self._reuse, calls)
+        calls = task.runner.select(task.calls, numbers)
+        gradient = slopes(task.runner, task.actions, self._cells(self._room(interval)), self._reuse, calls)
         self._step(gradient.astype(np.float64), interval)
         plan = self._cells(task.budget)
         error = task.error(plan, some_calls(task, COMPARED))

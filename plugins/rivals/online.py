@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.calibration.calls import Calls, FloatArray
-from ttscompile.calibration.execute import Executor, StreamCaches, last
+from ttscompile.calibration.runner import Runner, StreamCaches, last
 from ttscompile.calibration.task import Array, Found, Task
 from ttscompile.core.lattice import BoolArray, PlanArray, Source
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, IllegalPlanError
@@ -187,22 +187,22 @@ class Decided:
         return np.asarray((self.plans == Source.COMPUTE).sum((1, 2)))
 
 
-def decide(executor: Executor, criterion: Criterion, calls: Calls) -> Decided:
+def decide(runner: Runner, criterion: Criterion, calls: Calls) -> Decided:
     """Run calls with plans that the criterion decides step by step."""
-    model, caches = executor.model, StreamCaches()
+    model, caches = runner.model, StreamCaches()
     decisions = Decisions(criterion, model.steps, model.blocks, calls.count)
     first, others = range(criterion.always), range(criterion.always, model.blocks)
     computed = np.full((1, model.blocks), Source.COMPUTE, np.int8)
     rows: list[PlanArray] = []
 
     def blocks(k: int, stem: Tensor) -> Tensor:
-        stream = executor.step(computed, k, stem, calls, caches, first)
+        stream = runner.step(computed, k, stem, calls, caches, first)
         feature = torch.stack([caches.timestep[b] for b in first]).sum(0) if first else stem
-        rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(executor.axes[0], 0).cpu().numpy())))
-        return executor.step(rows[-1], k, stream, calls, caches, others)
+        rows.append(decisions.decide(k, np.ascontiguousarray(feature.movedim(runner.axes[0], 0).cpu().numpy())))
+        return runner.step(rows[-1], k, stream, calls, caches, others)
 
     with torch.no_grad():
-        sample = last(executor.samples(calls, blocks))
+        sample = last(runner.samples(calls, blocks))
     return Decided(np.stack(rows, 1), sample)
 
 
@@ -225,7 +225,7 @@ def fit_threshold(
     def fits(threshold: float) -> bool:
         nonlocal found
         tried = replace(criterion, threshold=threshold)
-        decided = decide(task.executor, tried, calls)
+        decided = decide(task.runner, tried, calls)
         kept = bool(decided.cells.mean() + 2 * decided.cells.std() / len(decided.cells) ** 0.5 <= task.budget)
         found = (tried, decided) if kept else found
         return kept
@@ -289,7 +289,7 @@ def dbcache(task: Task) -> Found:
 
 def proposals(task: Task) -> Sequence[tuple[Criterion, float]]:
     """For each number of first blocks and of warm-up steps that the budget has room for, a criterion."""
-    steps, blocks = task.executor.model.steps, task.executor.model.blocks
+    steps, blocks = task.runner.model.steps, task.runner.model.blocks
     if blocks < 2:
         raise CalibrationError(
             "strategy 'dbcache' decides about the blocks after the first; the policy has one block. Take teacache."
@@ -325,24 +325,24 @@ def teacache(task: Task) -> Found:
 def proposal(task: Task) -> Sequence[tuple[Criterion, float]]:
     """The criterion, and a threshold to begin with."""
     calls = some_calls(task, DENSE_CALLS)
-    before, after = dense_changes(task.executor, calls)
+    before, after = dense_changes(task.runner, calls)
     # A policy of fewer steps than coefficients has fewer pairs to fit.
     degree = max(0, min(DEGREE, len(np.unique(before)) - 1))
     polynomial = tuple(float(c) for c in np.linalg.lstsq(np.vander(before, degree + 1), after)[0])
     total = float(np.maximum(np.polyval(polynomial, before), 0).sum()) / calls.count
-    start = max(total / max(1, task.budget // task.executor.model.blocks), 1e-3)
+    start = max(total / max(1, task.budget // task.runner.model.blocks), 1e-3)
     return [(Criterion("teacache", 0, start, polynomial, accumulates=True, warmup=1, closes=True), start)]
 
 
-def dense_changes(executor: Executor, calls: Calls) -> tuple[Array, Array]:
+def dense_changes(runner: Runner, calls: Calls) -> tuple[Array, Array]:
     """Relative changes from step to step in dense calls: of the first block's input, and of the last one's output.
 
     Returns:
         Two arrays ``[(K - 1) * N]``.
     """
     seen = []
-    for stem, residuals in dense_steps(executor, calls):
-        seen.append([value.movedim(executor.axes[0], 0).cpu().numpy() for value in (stem, sum(residuals, stem))])
+    for stem, residuals in dense_steps(runner, calls):
+        seen.append([value.movedim(runner.axes[0], 0).cpu().numpy() for value in (stem, sum(residuals, stem))])
     changes = [[relative_change(b, a) for a, b in zip(*pair, strict=True)] for pair in pairwise(seen)]
     before, after = (np.concatenate([pair[i] for pair in changes]) for i in range(2))
     return before, after

@@ -11,22 +11,22 @@ import torch
 from torch import Tensor
 
 from ttscompile.calibration.calls import Actions, Calls, IntArray
-from ttscompile.calibration.execute import Executor, last
+from ttscompile.calibration.runner import Runner, last
 from ttscompile.core.lattice import PlanArray, Source
 
 BYTES = 2**28
 """Memory for what the blocks compute; gradients and what they need take three to four times as much."""
 
 
-def chunks(executor: Executor, count: int) -> Iterator[IntArray]:
+def chunks(runner: Runner, count: int) -> Iterator[IntArray]:
     """Numbers of ``count`` calls, as many at once as there is memory for."""
-    each = 4 * executor.model.steps * sum(math.prod(type_.at(1)) for type_ in executor.types)
+    each = 4 * runner.model.steps * sum(math.prod(type_.at(1)) for type_ in runner.types)
     chunk = int(np.clip(BYTES // each, 1, 32))
     return (np.arange(start, min(start + chunk, count)) for start in range(0, count, chunk))
 
 
 def sensitivity(
-    executor: Executor, plan: PlanArray, reuse: Source, calls: Calls, figure: Callable[[Tensor], Tensor]
+    runner: Runner, plan: PlanArray, reuse: Source, calls: Calls, figure: Callable[[Tensor], Tensor]
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Run the plan, and go back from a figure.
 
@@ -38,8 +38,8 @@ def sensitivity(
         On the CPU, by the number of a cell, ``k * blocks + b``: what its block computes there, or would, for each call
         (``[N, size]``), and the gradient of the figure in what the cell adds (``[N, size]``).
     """
-    model = executor.model
-    streams = executor.select(calls, np.arange(calls.count))
+    model = runner.model
+    streams = runner.select(calls, np.arange(calls.count))
     cache: dict[int, Tensor] = {}
     computed: list[Tensor] = []
     passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before
@@ -47,8 +47,8 @@ def sensitivity(
 
     def blocks(k: int, stream: Tensor) -> Tensor:
         row = plan[k]
-        computes = bool((row == Source.COMPUTE).any()) or not executor.alike
-        for b, axis in enumerate(executor.axes):
+        computes = bool((row == Source.COMPUTE).any()) or not runner.alike
+        for b, axis in enumerate(runner.axes):
             key = model.groups[b] if reuse == Source.FORWARD else b
             if row[b] == Source.COMPUTE:
                 cache[key] = model.block(b, k, stream, streams.contexts)
@@ -66,8 +66,8 @@ def sensitivity(
         return stream
 
     streams.initial.requires_grad_()
-    gradients = torch.autograd.grad(figure(last(executor.samples(streams, blocks))), passed)
-    axes = executor.axes * model.steps
+    gradients = torch.autograd.grad(figure(last(runner.samples(streams, blocks))), passed)
+    axes = runner.axes * model.steps
     return computed, [_rows(gradients[i], axis) for i, axis in zip(position, axes, strict=True)]
 
 
@@ -79,7 +79,7 @@ def _rows(values: Tensor, axis: int) -> Tensor:
 Matrix = npt.NDArray[np.float32]
 
 
-def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls) -> Matrix:
+def slopes(runner: Runner, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls) -> Matrix:
     """The slope of the mean error in every COMPUTE gate: straight through, from one sparse rollout.
 
     A plan that reuses in one direction only is a set of *chains*: cells in order of execution, of which each adds what
@@ -98,8 +98,8 @@ def slopes(executor: Executor, actions: Actions, plan: PlanArray, reuse: Source,
         executed actions, normalised. 0 in step 0, which is always computed.
     """
     total = np.zeros(plan.shape, np.float64)
-    for numbers in chunks(executor, calls.count):
-        total += _summed(executor, actions, plan, reuse, executor.select(calls, numbers))
+    for numbers in chunks(runner, calls.count):
+        total += _summed(runner, actions, plan, reuse, runner.select(calls, numbers))
     return (total / calls.count).astype(np.float32)
 
 
@@ -110,17 +110,15 @@ def chains(plan: PlanArray, reuse: Source, groups: tuple[int, ...]) -> list[npt.
     return [cells[:, owner == one].reshape(-1) for one in np.unique(owner)]
 
 
-def _summed(
-    executor: Executor, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls
-) -> npt.NDArray[np.float64]:
+def _summed(runner: Runner, actions: Actions, plan: PlanArray, reuse: Source, calls: Calls) -> npt.NDArray[np.float64]:
     """The slopes of a few calls, added up: ``[K, blocks]``."""
 
     def error(samples: Tensor) -> Tensor:
         return (actions.executed(samples) - actions.executed(calls.targets)).abs().mean(-1).sum()
 
-    would, gradients = sensitivity(executor, plan, reuse, calls, error)
+    would, gradients = sensitivity(runner, plan, reuse, calls, error)
     computed, values = (plan == Source.COMPUTE).reshape(-1), np.zeros(plan.size, np.float64)
-    for chain in chains(plan, reuse, executor.model.groups):
+    for chain in chains(plan, reuse, runner.model.groups):
         f = torch.stack([would[i] for i in chain])  # [cells, N, size]
         until = torch.cumsum(torch.stack([gradients[i] for i in chain]), 0)
         until = torch.cat([torch.zeros_like(until[:1]), until])

@@ -31,14 +31,14 @@ Candidates = list[tuple[PlanArray, dict[str, int]]]
 @fixed
 def interval(task: Task) -> Found:
     """The one schedule that there is."""
-    steps, blocks = task.executor.model.steps, task.executor.model.blocks
+    steps, blocks = task.runner.model.steps, task.runner.model.blocks
     return best_of(task, [(uniform_plan(steps, blocks, max(1, task.budget // blocks)), {})])
 
 
 @fixed
 def delta_dit(task: Task) -> Found:
     """The best of ``delta_plans``."""
-    return best_of(task, delta_plans(task.executor.model.steps, task.executor.model.blocks, task.budget))
+    return best_of(task, delta_plans(task.runner.model.steps, task.runner.model.blocks, task.budget))
 
 
 def delta_plan(steps: int, blocks: int, full_steps: int, fresh: int, boundary: int) -> PlanArray:
@@ -69,7 +69,7 @@ def delta_plans(steps: int, blocks: int, budget: int) -> Candidates:
 @fixed
 def deepcache(task: Task) -> Found:
     """The best of ``edge_plans``."""
-    return best_of(task, edge_plans(task.executor.model.steps, task.executor.model.blocks, task.budget))
+    return best_of(task, edge_plans(task.runner.model.steps, task.runner.model.blocks, task.budget))
 
 
 def edge_plan(steps: int, blocks: int, full_steps: int, edge: int) -> PlanArray:

@@ -51,11 +51,11 @@ class TaylorSeer(Fixed):
 
 def _best(task: Task) -> Found:
     """Of ``schedules`` the one whose forecasts are best."""
-    model, calls = task.executor.model, some_calls(task, COMPARED)
+    model, calls = task.runner.model, some_calls(task, COMPARED)
     tried: list[tuple[float, Mapping[str, Any]]] = []
     proposed = schedules(model.steps, max(1, min(task.budget // model.blocks, model.steps)))
     for warmup, steps in task.clock.in_time(proposed.items()):
-        run = task.executor.corrected(correction_for(task, steps))
+        run = task.runner.corrected(correction_for(task, steps))
         samples = run.run(whole_steps_plan(model.steps, model.blocks, steps), calls)
         error = float(task.actions.errors(samples, calls.targets, units=False).mean())
         tried.append((error, {"steps": list(steps), "warmup": warmup}))
@@ -88,7 +88,7 @@ def forecast(k: int, before: Sequence[int]) -> tuple[float, float]:
 
 def correction_for(task: Task, steps: Sequence[int]) -> Correction:
     """What puts the forecasts in the place of what reuse predicts, where these steps are computed."""
-    view = task.executor.view
+    view = task.runner.view
     spec = view.manifest.spec
     share = of_prediction(spec.sampler)
     nothing, (horizon, _) = no_correction(spec.sampler.steps, spec.sample, view.groups), spec.sample

@@ -10,7 +10,7 @@ import numpy as np
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, load_episodes, prepare_calls, sample_calls
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.task import Found, Task
@@ -30,12 +30,12 @@ def make_task(
 ) -> Task:
     """A task with all that a strategy may ask for."""
     artifact = load_artifact(directory)
-    spec, executor = artifact.manifest.spec, Executor(view_of(artifact, "dense"))
+    spec, runner = artifact.manifest.spec, Runner(view_of(artifact, "dense"))
     recorded = load_trajectories([recording], spec.observations, 4)
     chosen = sample_calls(recorded, episodes, calls, seed=0, repeats=100)
-    prepared = prepare_calls(executor.model, spec, recorded, chosen, (0, episodes.start))
-    prepared = replace(prepared, path=executor.run_dense(prepared))
-    return Task.of(executor, prepared, budget, seed)
+    prepared = prepare_calls(runner.model, spec, recorded, chosen, (0, episodes.start))
+    prepared = replace(prepared, path=runner.run_dense(prepared))
+    return Task.of(runner, prepared, budget, seed)
 
 
 def trials_of(directory: Path, recording: Path, state: Path, **fields: Any) -> Trials:
@@ -58,9 +58,9 @@ def found_by(name: str, task: Task, intervals: int | None = None) -> Found:
 
 def in_windows(task: Task, windows: int, window: int = WINDOW) -> Calls:
     """Consecutive calls of made-up episodes, with targets."""
-    spec, model = task.executor.view.manifest.spec, task.executor.model
+    spec, model = task.runner.view.manifest.spec, task.runner.model
     walk = np.cumsum(np.random.default_rng(5).standard_normal((windows, window, 2, 3)), 1).astype(np.float32)
     episodes = [Episode("made up", {"obs": one}) for one in walk]
     chosen = [(n, row) for n in range(windows) for row in range(window)]
     calls = prepare_calls(model, spec, episodes, chosen, (0, 9), window)
-    return replace(calls, path=task.executor.run_dense(calls))
+    return replace(calls, path=task.runner.run_dense(calls))

@@ -13,8 +13,8 @@ import ttscompile
 from tests.artifact.folders import contents
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import split_episodes
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import CalibrationResult, calibrate
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.state import FILE
 from ttscompile.calibration.trials import DRAWS
 from ttscompile.core.lattice import Source, uniform_plan
@@ -147,14 +147,14 @@ def test_resuming_after_a_kill_ends_where_it_would_have_ended(
 
 def _count_targets(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     count = 0
-    run_dense = Executor.run_dense
+    run_dense = Runner.run_dense
 
-    def counting(self: Executor, calls: Any) -> Any:
+    def counting(self: Runner, calls: Any) -> Any:
         nonlocal count
         count += calls.count
         return run_dense(self, calls)
 
-    monkeypatch.setattr(Executor, "run_dense", counting)
+    monkeypatch.setattr(Runner, "run_dense", counting)
     return lambda: count
 
 

@@ -37,14 +37,14 @@ def test_anchors_are_steps_that_compute_half_their_blocks() -> None:
 
 def fitted(task: Task, plan: PlanArray, reads: bool = True) -> Task:
     """The same with the correction of a plan, fitted on all of its calls."""
-    return replace(task, executor=task.executor.corrected(fit_correction(task.executor, plan, task.calls, reads)))
+    return replace(task, runner=task.runner.corrected(fit_correction(task.runner, plan, task.calls, reads)))
 
 
 @pytest.mark.slow
 def test_it_helps_on_calls_of_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
     task, held_out = make_task(calls=400, episodes=range(4)), make_task(calls=60, episodes=range(4, 6)).calls
     corrected = fitted(task, plan)
-    assert task.executor.correction is None
+    assert task.runner.correction is None
     assert corrected.error(plan, held_out) < 0.5 * task.error(plan, held_out)
 
 
@@ -60,22 +60,20 @@ def test_a_linear_policy_is_corrected_to_its_own_noise(
 
 def test_a_dense_plan_needs_none(make_task: MakeTask) -> None:
     task = make_task(calls=80)
-    dense = dense_plan(task.executor.model.steps, task.executor.model.blocks)
+    dense = dense_plan(task.runner.model.steps, task.runner.model.blocks)
     corrected = fitted(task, dense)
-    assert corrected.executor.correction is not None
-    assert np.abs(corrected.executor.correction.weights).max() < 1e-3
+    assert corrected.runner.correction is not None
+    assert np.abs(corrected.runner.correction.weights).max() < 1e-3
     assert corrected.error(dense, task.calls) < 1e-5
 
 
 @pytest.mark.slow
 def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=70)
-    executor, calls = fitted(task, plan).executor, task.calls
-    ours = executor.run(plan, calls)
+    runner, calls = fitted(task, plan).runner, task.calls
+    ours = runner.run(plan, calls)
     with torch.no_grad(), Counted() as counted:
-        theirs = executor.model.denoise(
-            calls.contexts, calls.initial, calls.noise, plan, correction=executor.correction
-        )
+        theirs = runner.model.denoise(calls.contexts, calls.initial, calls.noise, plan, correction=runner.correction)
     assert_equal_but_for_rounding(ours, theirs.sample, counted.terms)
 
 
@@ -83,7 +81,7 @@ def test_the_reference_runtime_does_the_same(make_task: MakeTask, plan: PlanArra
 def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: MakeTask, plan: PlanArray) -> None:
     task = make_task(calls=400, episodes=range(4))
     held_out = make_task(calls=60, episodes=range(4, 6)).calls
-    steps = task.executor.model.steps
+    steps = task.runner.model.steps
     early, late = (task.whole.plan([0, k]) for k in (steps // 2, steps - 2))
     blind, reading = (
         min(fitted(task, two, reads).error(two, held_out) for two in (early, late)) for reads in (False, True)
@@ -104,7 +102,7 @@ def test_any_schedule_can_be_corrected(make_task: MakeTask, plan: PlanArray) -> 
         found = task.corrected(Found(schedule, {"made": "by hand"}))
         assert found.correction is not None
         assert found.notes["corrected"] is True and found.notes["made"] == "by hand"
-        better = replace(task, executor=task.executor.corrected(found.correction))
+        better = replace(task, runner=task.runner.corrected(found.correction))
         assert better.error(schedule, held_out) < 0.5 * task.error(schedule, held_out)
 
 
@@ -113,7 +111,7 @@ def test_a_loop_that_ends_in_no_numbers_gets_no_correction(make_task: MakeTask, 
     task = make_task(calls=40)
     assert task.calls.path is not None
     calls = replace(task.calls, path=task.calls.path * float("nan"))
-    assert WholeSteps(task.executor, calls, 0).correction_of(plan) is None
+    assert WholeSteps(task.runner, calls, 0).correction_of(plan) is None
 
 
 def test_a_plan_that_reads_earlier_calls_is_not_corrected(make_task: MakeTask, plan: PlanArray) -> None:
@@ -139,7 +137,7 @@ def test_a_small_network_is_asked_on_every_quarter_of_the_episodes(
     monkeypatch.setattr(WholeSteps, "_errors_of", told)
     for small, parts in ((False, 1), (True, 4)):
         asked.clear()
-        WholeSteps(task.executor, task.calls, 0, small=small).reads(2)
+        WholeSteps(task.runner, task.calls, 0, small=small).reads(2)
         assert len(set(asked)) == parts
     assert sorted(episode for quarter in set(asked) for episode in quarter) == list(range(4))
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import ttscompile
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.errors import CalibrationError, RuntimeUnavailableError
 
 from .killed import killed
@@ -86,13 +86,13 @@ def test_nothing_is_computed_in_fewer_bits_than_the_policy_has(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever the caller chose for its own: TF32, which is what cuDNN does unless it is told, and autocast."""
-    run_dense, seen = Executor.run_dense, set[Any]()
+    run_dense, seen = Runner.run_dense, set[Any]()
 
-    def looking(self: Executor, calls: Any) -> Any:
+    def looking(self: Runner, calls: Any) -> Any:
         seen.add((torch.backends.cudnn.allow_tf32, torch.is_autocast_enabled("cpu")))
         return run_dense(self, calls)
 
-    monkeypatch.setattr(Executor, "run_dense", looking)
+    monkeypatch.setattr(Runner, "run_dense", looking)
     with torch.autocast("cpu", torch.bfloat16), suppress(CalibrationError):
         ttscompile.calibrate(artifact, [recording], 0.5, max_minutes=0.01, max_intervals=1, progress=False)
     assert seen == {(False, False)}

@@ -201,7 +201,7 @@ def test_of_a_small_network_as_many_calls_are_learned_from_as_fit(
 ) -> None:
     """As many are drawn again where a state goes on."""
     trials = trials_of(compiled, recording, tmp_path, limits=CallLimits(8, 16, 64))
-    limit = (fits + 0.5) * _seconds(trials.executor.view) / (QUICKLY * trials.until_share)
+    limit = (fits + 0.5) * _seconds(trials.runner.view) / (QUICKLY * trials.until_share)
     trials = replace(trials, clock=Clock(limit))
     assert trials._affordable("calibration") == drawn
     assert replace(trials, clock=Clock(1e6))._affordable("calibration") == drawn

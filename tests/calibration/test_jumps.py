@@ -73,7 +73,7 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
 ) -> None:
     """What the loop does while it fits them is what a correction with them does; the second of three is none."""
     task = make_task(calls=60)
-    steps, plan = task.executor.model.steps, task.whole.plan([0, 3, 6, 9])
+    steps, plan = task.runner.model.steps, task.whole.plan([0, 3, 6, 9])
     assert steps == 10
     made: list[int] = []
 
@@ -89,17 +89,17 @@ def test_calls_end_where_the_fitted_jumps_lead_them(
         return (inner, middle, outer), through((inner, middle, outer), known)
 
     monkeypatch.setattr(sparse_loop, "TERMS", (drawn_jump,))
-    some, others = (task.executor.select(task.calls, part) for part in (range(40), range(40, 60)))
-    loop = SparseLoop(task.executor, some, others, reads=reads, whole=True)
+    some, others = (task.runner.select(task.calls, part) for part in (range(40), range(40, 60)))
+    loop = SparseLoop(task.runner, some, others, reads=reads, whole=True)
     plain, place = loop.ends(plan)
     correction = loop.correction(place)
     assert correction is not None
     assert made == [2, 5, 8]
     assert correction.landings == {2: 0, 5: 1, 8: 2}
     assert not correction.outer[1].any() and correction.outer[0].any()
-    manifest = task.executor.view.manifest
+    manifest = task.runner.view.manifest
     correction.require_fit(steps, manifest.spec.sample, manifest.condition_numbers)
-    ran = task.executor.corrected(correction).run(plan, others)
+    ran = task.runner.corrected(correction).run(plan, others)
     torch.testing.assert_close(place.samples, ran, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(plain.samples, loop.end(plan).samples)
     assert (plain.samples - place.samples).abs().max() > 1e-3
@@ -109,7 +109,7 @@ def test_without_a_jump_that_holds_there_are_none(make_task: MakeTask, monkeypat
     monkeypatch.setattr(sparse_loop, "TERMS", (lambda *given: None,))
     task = make_task(calls=60)
     plan: PlanArray = task.whole.plan([0, 5])
-    loop = SparseLoop(task.executor, task.calls, None, reads=True, whole=True)
+    loop = SparseLoop(task.runner, task.calls, None, reads=True, whole=True)
     plain, jumping = loop.ends(plan)
     assert plain is jumping
     correction = loop.correction(jumping)
@@ -132,6 +132,6 @@ def test_jumps_stay_if_the_loop_ends_nearer_to_the_dense_policy(
         return (inner, middle, outer), missing if helps else torch.randn(missing.shape, generator=draw)
 
     monkeypatch.setattr(sparse_loop, "TERMS", (exact_or_worse,))
-    correction = fit_correction(task.executor, task.whole.plan([0, 6]), task.calls, True)
+    correction = fit_correction(task.runner, task.whole.plan([0, 6]), task.calls, True)
     assert correction is not None
     assert bool(correction.landings) == helps

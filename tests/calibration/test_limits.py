@@ -21,9 +21,9 @@ from ttscompile.calibration.budget import _pruner_ms
 from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.compare import compare
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
@@ -124,18 +124,18 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
 ) -> None:
     monkeypatch.setattr(targets, "TARGETS_AT_ONCE", 2)
     artifact = load_artifact(compiled)
-    executor, spec = Executor(view_of(artifact, "dense")), artifact.manifest.spec
+    runner, spec = Runner(view_of(artifact, "dense")), artifact.manifest.spec
     episodes = load_trajectories([recording], spec.observations, 4)
-    calls = draw_calls(executor, episodes, split_episodes(6, 0.25, 0), 16, 0)
+    calls = draw_calls(runner, episodes, split_episodes(6, 0.25, 0), 16, 0)
     state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)
     clock.now = 51.0
     with Bar(shown=False) as bar:
-        few = with_targets(executor, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
+        few = with_targets(runner, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
         assert few.count == min(max(4, 2 * torch.get_num_threads()), 16)  # whole rounds, a worker's part is two calls
         clock.now = 0.0
         # As after an interruption.
-        again = with_targets(executor, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
-        whole = with_targets(executor, "calibration", calls, 3, fresh, clock.until(ANSWERED_BY), bar)
+        again = with_targets(runner, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
+        whole = with_targets(runner, "calibration", calls, 3, fresh, clock.until(ANSWERED_BY), bar)
     assert (again.count, whole.count) == (few.count, calls.count)
     assert few.path is not None
     assert whole.path is not None

@@ -26,7 +26,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Told:
         left = {0: half, 1: every}
         seen: list[Calls] = []
 
-        def loop(executor: object, fitted: Calls, judged: Calls, *, reads: bool, whole: bool) -> SimpleNamespace:
+        def loop(runner: object, fitted: Calls, judged: Calls, *, reads: bool, whole: bool) -> SimpleNamespace:
             assert not set(fitted.episodes) & set(judged.episodes)
             seen.append(fitted)
             number = len(seen) - 1

@@ -50,40 +50,40 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
 
 
 def runs_of(task: Task, reads: bool | None, bytes_: int = whole_steps.BYTES) -> ScheduleRuns:
-    fitted = None if reads is None else task.executor.select(task.calls, range(30))
-    judged, model = task.executor.select(task.calls, range(30, 40)), task.executor.model
-    loop = SparseLoop(task.executor, fitted, judged, reads=bool(reads), whole=True)
+    fitted = None if reads is None else task.runner.select(task.calls, range(30))
+    judged, model = task.runner.select(task.calls, range(30, 40)), task.runner.model
+    loop = SparseLoop(task.runner, fitted, judged, reads=bool(reads), whole=True)
     return ScheduleRuns(loop, model.steps, model.blocks, bytes_)
 
 
 def without_jumps(task: Task, plan: PlanArray, reads: bool) -> Correction | None:
     """The correction of a plan as searches fit it."""
-    loop = SparseLoop(task.executor, task.executor.select(task.calls, range(30)), None, reads=reads, whole=True)
+    loop = SparseLoop(task.runner, task.runner.select(task.calls, range(30)), None, reads=reads, whole=True)
     return loop.correction(loop.end(plan))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reads", [True, False, None])
 def test_calls_beside_end_where_the_fitted_correction_leads_them(task: Task, reads: bool | None) -> None:
-    judged, made = task.executor.select(task.calls, range(30, 40)), runs_of(task, reads)
+    judged, made = task.runner.select(task.calls, range(30, 40)), runs_of(task, reads)
     for steps in SCHEDULES:
-        plan, executor = task.whole.plan(steps), task.executor
+        plan, runner = task.whole.plan(steps), task.runner
         if reads is not None:
-            executor = executor.corrected(without_jumps(task, plan, reads))
-        torch.testing.assert_close(made.end(steps).samples, executor.run(plan, judged), rtol=1e-4, atol=1e-4)
+            runner = runner.corrected(without_jumps(task, plan, reads))
+        torch.testing.assert_close(made.end(steps).samples, runner.run(plan, judged), rtol=1e-4, atol=1e-4)
 
 
 def test_what_is_judged_is_bounded_as_a_call_is(task: Task, monkeypatch: pytest.MonkeyPatch) -> None:
     """A correction can leave what the sampler has clipped; a call clips that once more."""
-    model, table = task.executor.model, task.executor.view.manifest.spec.sampler
+    model, table = task.runner.model, task.runner.view.manifest.spec.sampler
     last = np.arange(table.steps) == table.steps - 1
     rows: dict[str, Any] = {n: np.where(last, float(n == "x0_to_next"), getattr(table, n)) for n in table.COLUMNS[2:]}
     monkeypatch.setattr(model, "sampler", TorchSampler(replace(table, clip=0.05, **rows)))
-    judged, plan = task.executor.select(task.calls, range(30, 40)), task.whole.plan((0, 2, 5))
+    judged, plan = task.runner.select(task.calls, range(30, 40)), task.whole.plan((0, 2, 5))
     correction = without_jumps(task, plan, reads=True)
     found = runs_of(task, reads=True).end((0, 2, 5)).samples
     assert found.abs().max() == torch.tensor(0.05)
-    torch.testing.assert_close(found, task.executor.corrected(correction).run(plan, judged), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found, task.runner.corrected(correction).run(plan, judged), rtol=1e-4, atol=1e-4)
 
 
 def test_what_schedules_share_is_computed_once(task: Task, counted: Counted) -> None:

@@ -58,7 +58,7 @@ def test_a_plan_is_legal_and_within_the_budget(
     whole: Callable[[str, int], tuple[Found, Task]], name: str, budget: int
 ) -> None:
     found, task = whole(name, budget)
-    model = task.executor.model
+    model = task.runner.model
     assert found.schedule.shape == (model.steps, model.blocks)
     assert found.schedule.dtype == np.int8
     assert not illegal_cells(found.schedule, model.groups, np.zeros(found.schedule.shape, np.bool_)).any()

@@ -1,4 +1,4 @@
-"""Consecutive calls with the rollout cache: the executor, corrections and training mean what the reference means."""
+"""Consecutive calls with the rollout cache: the runner, corrections and training mean what the reference means."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,10 @@ import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from tests.runtimes.recorded import everything_recorded
-from ttscompile.calibration import execute
+from ttscompile.calibration import runner as runner_module
 from ttscompile.calibration.calls import Calls, Split, sample_calls, window_of
-from ttscompile.calibration.execute import Executor, whole_windows
 from ttscompile.calibration.pruner.straight_through import Practice, legal
+from ttscompile.calibration.runner import Runner, whole_windows
 from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.core.lattice import Source, legalize
 from ttscompile.core.spec import FloatArray
@@ -25,17 +25,15 @@ def random_plans(count: int, computed: float, seed: int = 0) -> np.ndarray:
     return plans
 
 
-def one_by_one(executor: Executor, calls: Calls, plans: np.ndarray) -> torch.Tensor:
+def one_by_one(runner: Runner, calls: Calls, plans: np.ndarray) -> torch.Tensor:
     """The same call by call, by the definition: each call legalised, its cache handed to the next of its window."""
     samples = []
     for begin in range(0, calls.count, calls.window):
-        cache = executor.model.empty_cache(1)
+        cache = runner.model.empty_cache(1)
         for i in range(begin, begin + calls.window):
-            one = executor.select(calls, [i])
-            plan, _ = legalize(plans[i], executor.model.groups, cache.written[0])
-            made = executor.model.denoise(
-                one.contexts, one.initial, one.noise, plan, cache, correction=executor.correction
-            )
+            one = runner.select(calls, [i])
+            plan, _ = legalize(plans[i], runner.model.groups, cache.written[0])
+            made = runner.model.denoise(one.contexts, one.initial, one.noise, plan, cache, correction=runner.correction)
             samples.append(made.sample)
             cache = made.cache
     return torch.cat(samples)
@@ -46,22 +44,22 @@ def one_by_one(executor: Executor, calls: Calls, plans: np.ndarray) -> torch.Ten
 def test_windows_equal_the_reference_call_by_call(
     make_task: MakeTask, computed: float, streams: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execute, "STREAMS", streams)  # 5: a window at a time
+    monkeypatch.setattr(runner_module, "STREAMS", streams)  # 5: a window at a time
     task = make_task(calls=2)
     calls, plans = in_windows(task, 3), random_plans(12, computed)
     with Counted() as counted:
-        expected = one_by_one(task.executor, calls, plans)
-    found = task.executor.run(plans, calls)
+        expected = one_by_one(task.runner, calls, plans)
+    found = task.runner.run(plans, calls)
     assert_equal_but_for_rounding(found, expected, counted.terms)
     without = np.where(plans == Source.ROLLOUT, Source.TIMESTEP, plans).astype(np.int8)
-    assert (task.executor.run(without, calls) - found).abs().max() > 1e-3  # else nothing was read
+    assert (task.runner.run(without, calls) - found).abs().max() > 1e-3  # else nothing was read
 
 
 def test_windows_do_not_read_of_each_other(make_task: MakeTask) -> None:
     task = make_task(calls=2)
     calls, plans = in_windows(task, 3), random_plans(12, 0.3)
-    together, alone = task.executor.run(plans, calls), np.arange(WINDOW, 2 * WINDOW)
-    one = task.executor.run(plans[alone], task.executor.select(calls, alone))
+    together, alone = task.runner.run(plans, calls), np.arange(WINDOW, 2 * WINDOW)
+    one = task.runner.run(plans[alone], task.runner.select(calls, alone))
     torch.testing.assert_close(one, together[alone], rtol=1e-5, atol=1e-6)
 
 
@@ -70,7 +68,7 @@ def test_a_schedule_never_reads_an_earlier_call(make_task: MakeTask) -> None:
     task = make_task(calls=2)
     calls, plan = in_windows(task, 2), random_plans(1, 0.3)[0]
     without = np.where(plan == Source.ROLLOUT, Source.TIMESTEP, plan).astype(np.int8)
-    assert torch.equal(task.executor.run(plan, calls), task.executor.run(without, calls))
+    assert torch.equal(task.runner.run(plan, calls), task.runner.run(without, calls))
     assert (legal(np.stack([plan] * 8), WINDOW) != Source.ROLLOUT).all()
 
 
@@ -79,7 +77,7 @@ def test_legal_plans_are_those_that_a_runtime_would_make_of_them(make_task: Make
     written = np.zeros((2, 10, 6), np.bool_)
     expected = np.empty_like(plans)
     for place in range(WINDOW):
-        expected[place::WINDOW], _ = legalize(plans[place::WINDOW], task.executor.model.groups, written)
+        expected[place::WINDOW], _ = legalize(plans[place::WINDOW], task.runner.model.groups, written)
         written |= expected[place::WINDOW] == Source.COMPUTE
     np.testing.assert_array_equal(legal(plans, WINDOW), expected)
     assert (expected == Source.ROLLOUT).any()
@@ -90,7 +88,7 @@ def test_what_is_selected_is_windows_where_whole_ones_are_taken(make_task: MakeT
     task = make_task(calls=2)
     calls = in_windows(task, 3)
     for numbers, window in (([8, 9, 10, 11, 0, 1, 2, 3], 4), ([1, 2, 3, 4], 1), ([0, 1, 2], 1), ([3, 2, 1, 0], 1)):
-        assert task.executor.select(calls, numbers).window == window
+        assert task.runner.select(calls, numbers).window == window
         assert whole_windows(np.array(numbers), 4) == (window == 4)
 
 
@@ -112,15 +110,15 @@ def test_a_correction_of_plans_that_differ_and_read_earlier_calls(make_task: Mak
     """It is fitted along the plans: with it the samples are nearer to the dense ones; and the reference applies it."""
     task = make_task(calls=2)
     calls, plans = in_windows(task, 30), random_plans(120, 0.4)
-    correction = fit_correction(task.executor, plans, calls, reads=False)
-    corrected = task.executor.corrected(correction)
-    plain, better = (float((one.run(plans, calls) - calls.targets).abs().mean()) for one in (task.executor, corrected))
+    correction = fit_correction(task.runner, plans, calls, reads=False)
+    corrected = task.runner.corrected(correction)
+    plain, better = (float((one.run(plans, calls) - calls.targets).abs().mean()) for one in (task.runner, corrected))
     assert better < plain
-    some = task.executor.select(calls, np.arange(8))
+    some = task.runner.select(calls, np.arange(8))
     with Counted() as counted:
         expected = one_by_one(corrected, some, plans[:8])
     assert_equal_but_for_rounding(corrected.run(plans[:8], some), expected, counted.terms)
-    other = fit_correction(task.executor, random_plans(120, 0.4, seed=1), calls, reads=False)
+    other = fit_correction(task.runner, random_plans(120, 0.4, seed=1), calls, reads=False)
     assert correction is not None and other is not None
     assert np.abs(correction.weights - other.weights).max() > 1e-4
 
@@ -133,8 +131,8 @@ def test_training_runs_what_the_executor_runs(make_task: MakeTask) -> None:
     task = make_task(calls=2)
     calls, plans = in_windows(task, 3), legal(random_plans(12, 0.3), WINDOW)
     numbers = np.arange(4, 12)
-    samples = Practice(task.executor, calls).samples(plans[numbers], one_hot(plans[numbers]), numbers)
-    expected = task.executor.run(plans[numbers], task.executor.select(calls, numbers))
+    samples = Practice(task.runner, calls).samples(plans[numbers], one_hot(plans[numbers]), numbers)
+    expected = task.runner.run(plans[numbers], task.runner.select(calls, numbers))
     torch.testing.assert_close(samples[-1].detach(), expected, rtol=1e-4, atol=1e-5)
     assert len(samples) == 10
 
@@ -151,8 +149,8 @@ def test_gradients_of_gates_are_those_of_the_whole_formula_where_all_is_computed
         return np.asarray(torch.autograd.grad((samples * weight).sum(), gates)[0].numpy())
 
     ours, theirs = one_hot(plans), one_hot(plans)
-    found = gradient(Practice(task.executor, calls).samples(plans, ours, np.arange(2))[-1], ours)
-    whole = everything_recorded(task.executor.model, calls.contexts, calls.initial, calls.noise, theirs, {})
+    found = gradient(Practice(task.runner, calls).samples(plans, ours, np.arange(2))[-1], ours)
+    whole = everything_recorded(task.runner.model, calls.contexts, calls.initial, calls.noise, theirs, {})
     expected = gradient(whole, theirs)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(found[:, 1:] / scale, expected[:, 1:] / scale, atol=0.01)

@@ -19,8 +19,8 @@ from ttscompile.core.lattice import uniform_plan
 @pytest.fixture(scope="module")
 def study(compiled: Path, recording: Path) -> sources.Study:
     task = make_task(compiled, recording)
-    spec = task.executor.view.manifest.spec
-    return sources.Study(task.executor, Actions(spec), task.calls, task.calls, 0)
+    spec = task.runner.view.manifest.spec
+    return sources.Study(task.runner, Actions(spec), task.calls, task.calls, 0)
 
 
 def test_forecasts_of_first_and_second_order_by_hand(study: sources.Study) -> None:
@@ -34,12 +34,12 @@ def test_forecasts_of_first_and_second_order_by_hand(study: sources.Study) -> No
 def test_reuse_is_that_of_the_lattice(study: sources.Study) -> None:
     found = study.filled(study.judged, sources.even(10, 4), study.reused)
     assert found.cells == 24
-    expected = study.executor.run(uniform_plan(10, 6, 4), study.judged)
+    expected = study.runner.run(uniform_plan(10, 6, 4), study.judged)
     torch.testing.assert_close(found.samples, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_all_tokens_and_a_threshold_of_nothing_are_the_original(study: sources.Study) -> None:
-    dense = study.executor.run_dense(study.judged)[:, -1]
+    dense = study.runner.run_dense(study.judged)[:, -1]
     for found in (study.some_tokens((0,), study.tokens), study.gated(study.judged, -1.0, study.reused)):
         assert found.cells == pytest.approx(60)
         torch.testing.assert_close(found.samples, dense, rtol=1e-4, atol=1e-5)

@@ -19,7 +19,7 @@ from tests.calibration.pools import Elsewhere, needs_ray
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.compare import compare as measure
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import DRAWS
 from ttscompile.errors import CalibrationError, ClusterError
@@ -130,13 +130,13 @@ def test_an_interrupted_comparison_goes_on_to_the_same_outcome(
     with pytest.raises(CalibrationError, match="the comparison that was interrupted had other settings: seed was 0"):
         again(seed=1, resume=True)
 
-    answer, answered = Executor.run_dense, list[int]()
+    answer, answered = Runner.run_dense, list[int]()
 
-    def counting(self: Executor, calls: Calls) -> torch.Tensor:
+    def counting(self: Runner, calls: Calls) -> torch.Tensor:
         answered.append(calls.count)
         return answer(self, calls)
 
-    monkeypatch.setattr(Executor, "run_dense", counting)
+    monkeypatch.setattr(Runner, "run_dense", counting)
     begun = interrupted_after(9, monkeypatch)
     found, expected = points(again(resume=True)), points(frontier)
     assert begun == ["tts"]

@@ -73,9 +73,9 @@ def test_the_budget_goes_to_all_blocks_alike_and_then_to_those_that_gain_most() 
 @pytest.mark.slow
 def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
     task = make_task(20)
-    calls = task.executor.select(task.calls, [0, 1])
-    residuals = dense_residuals(task.executor, calls)
-    similarity, change = dense_statistics(task.executor, calls)
+    calls = task.runner.select(task.calls, [0, 1])
+    residuals = dense_residuals(task.runner, calls)
+    similarity, change = dense_statistics(task.runner, calls)
     assert similarity.shape == (6, 10, 10)
     one, other = (residuals[4][0, k].double().numpy() for k in (2, 7))
     again = residuals[4][1].double().numpy()
@@ -87,11 +87,11 @@ def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
 
 def test_the_residuals_are_those_of_the_reference(make_task: MakeTask) -> None:
     task = make_task(20)
-    calls = task.executor.select(task.calls, [3])
+    calls = task.runner.select(task.calls, [3])
     dense = np.zeros((10, 6), np.int8)
     with Counted() as counted:
-        rollout = task.executor.model.denoise(calls.contexts, calls.initial, calls.noise, dense)
-    residuals = dense_residuals(task.executor, calls)
+        rollout = task.runner.model.denoise(calls.contexts, calls.initial, calls.noise, dense)
+    residuals = dense_residuals(task.runner, calls)
     for (k, b), expected in rollout.cache.residuals.items():
         assert_equal_but_for_rounding(residuals[b][0, k], expected.flatten(), counted.terms)
 

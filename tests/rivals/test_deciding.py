@@ -13,7 +13,7 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.artifact.load import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls, draw_noise
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.core.lattice import Source
 from ttscompile.core.plan import DENSE
 from ttscompile.core.spec import Noise
@@ -52,12 +52,12 @@ def noise(artifact: Artifact) -> Noise:
 def test_a_call_decides_as_calibration_does(
     artifact: Artifact, obs: dict[str, np.ndarray], noise: Noise, rule: Criterion
 ) -> None:
-    executor = Executor(view_of(artifact, DENSE))
-    contexts = executor.model.prologue({key: torch.from_numpy(one) for key, one in obs.items()})
+    runner = Runner(view_of(artifact, DENSE))
+    contexts = runner.model.prologue({key: torch.from_numpy(one) for key, one in obs.items()})
     assert noise.steps is not None
     drawn = torch.from_numpy(noise.initial), torch.from_numpy(noise.steps)
     with Counted() as counted:
-        expected = decide(executor, rule, Calls(contexts, *drawn, np.arange(STREAMS)))
+        expected = decide(runner, rule, Calls(contexts, *drawn, np.arange(STREAMS)))
     found, plans = Deciding(artifact, artifact.plans[DENSE], rule).predict(obs, noise)
     np.testing.assert_array_equal(plans, expected.plans)
     assert_equal_but_for_rounding(torch.from_numpy(found), expected.samples, counted.terms)

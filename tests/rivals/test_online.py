@@ -43,9 +43,9 @@ def decided_by_the_reference(model: ReferenceModel, calls: Calls, rule: Criterio
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_the_decided_plans_do_what_the_call_did(make_task: MakeTask, rule: Criterion) -> None:
     task = make_task(30)
-    decided = decide(task.executor, rule, task.calls)
+    decided = decide(task.runner, rule, task.calls)
     with Counted() as counted:
-        again = task.executor.run(decided.plans, task.calls)
+        again = task.runner.run(decided.plans, task.calls)
     assert_equal_but_for_rounding(decided.samples, again, counted.terms)
     assert len({plan.tobytes() for plan in decided.plans}) > 1  # calls differ
     assert set(np.unique(decided.plans)) == {Source.COMPUTE, Source.TIMESTEP}
@@ -56,8 +56,8 @@ def test_the_decided_plans_do_what_the_call_did(make_task: MakeTask, rule: Crite
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_the_reference_decides_the_same(make_task: MakeTask, rule: Criterion) -> None:
     task = make_task(30)
-    decided = decide(task.executor, rule, task.calls)
-    model, calls = task.executor.model, task.calls
+    decided = decide(task.runner, rule, task.calls)
+    model, calls = task.runner.model, task.calls
     with Counted() as counted:
         sample, plans = decided_by_the_reference(model, calls, rule)
     np.testing.assert_array_equal(plans, decided.plans)
@@ -71,9 +71,9 @@ def test_the_reference_decides_the_same(make_task: MakeTask, rule: Criterion) ->
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_a_call_does_not_depend_on_the_others(make_task: MakeTask, rule: Criterion) -> None:
     task = make_task(30)
-    together = decide(task.executor, rule, task.calls)
+    together = decide(task.runner, rule, task.calls)
     for i in (0, 5):
-        alone = decide(task.executor, rule, task.executor.select(task.calls, [i]))
+        alone = decide(task.runner, rule, task.runner.select(task.calls, [i]))
         np.testing.assert_array_equal(alone.plans[0], together.plans[i])
 
 
@@ -86,10 +86,10 @@ def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: i
     rule = Criterion.of_record(found.notes["criterion"])
     assert rule.name == name
     assert found.notes["criterion"] == rule.record()
-    cells = decide(task.executor, rule, task.calls).cells
+    cells = decide(task.runner, rule, task.calls).cells
     assert found.notes["computed_cells"] == {"mean": float(cells.mean()), "most": int(cells.max())}
     assert budget - 10 < cells.mean() <= budget
-    more = decide(task.executor, replace(rule, threshold=0.0), task.calls)
+    more = decide(task.runner, replace(rule, threshold=0.0), task.calls)
     assert (more.cells == 60).all()  # a threshold of nothing computes everything
 
 
@@ -97,7 +97,7 @@ def test_the_threshold_uses_the_budget(make_task: MakeTask, name: str, budget: i
 def test_the_schedule_is_the_best_decision(make_task: MakeTask, name: str) -> None:
     task = make_task(30, calls=12)
     found = found_by(name, task)
-    plans = within(decide(task.executor, Criterion.of_record(found.notes["criterion"]), task.calls).plans, 30)
+    plans = within(decide(task.runner, Criterion.of_record(found.notes["criterion"]), task.calls).plans, 30)
     errors = [task.error(plan, task.calls) for plan in plans]
     assert len(plans) > 1
     np.testing.assert_array_equal(found.schedule, plans[int(np.argmin(errors))])
@@ -120,7 +120,7 @@ def test_dbcache_proposes_what_the_budget_has_room_for(make_task: MakeTask) -> N
 
 def test_dbcache_of_one_block_is_refused(make_task: MakeTask, monkeypatch: pytest.MonkeyPatch) -> None:
     task = make_task(60)
-    monkeypatch.setattr(task.executor.model, "blocks", 1)
+    monkeypatch.setattr(task.runner.model, "blocks", 1)
     with pytest.raises(CalibrationError, match="the policy has one block"):
         dbcache(task).advance(0)
 
@@ -128,7 +128,7 @@ def test_dbcache_of_one_block_is_refused(make_task: MakeTask, monkeypatch: pytes
 def test_teacache_fits_its_polynomial_to_dense_calls(make_task: MakeTask) -> None:
     task = make_task(30, calls=8)
     ((criterion, start),) = proposal(task)
-    before, after = dense_changes(task.executor, task.calls)
+    before, after = dense_changes(task.runner, task.calls)
     assert len(criterion.polynomial) == 5
     left = after - np.polyval(criterion.polynomial, before)
     powers = np.vander(before, 5)
@@ -139,10 +139,10 @@ def test_teacache_fits_its_polynomial_to_dense_calls(make_task: MakeTask) -> Non
 
 def test_changes_of_dense_calls(make_task: MakeTask) -> None:
     task = make_task(30)
-    calls = task.executor.select(task.calls, [0, 4])
-    before, after = dense_changes(task.executor, calls)
+    calls = task.runner.select(task.calls, [0, 4])
+    before, after = dense_changes(task.runner, calls)
     assert before.shape == after.shape == (9 * 2,)
-    model, dense = task.executor.model, np.zeros((10, 6), np.int8)
+    model, dense = task.runner.model, np.zeros((10, 6), np.int8)
     with Counted() as counted:
         samples = model.denoise(calls.contexts, calls.initial, calls.noise, dense).samples
     stems = [model.stem(s, k, calls.contexts) for k, s in ((3, samples[2]), (4, samples[3]))]

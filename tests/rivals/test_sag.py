@@ -16,7 +16,7 @@ def test_plans_compute_or_read_forward(make_task: MakeTask, monkeypatch: pytest.
     task = make_task(24, calls=16)
     found = found_by("sag", task)
     assert found.pruner is not None
-    plans = pruner_plan(task.executor.logits(task.calls, found.pruner))
+    plans = pruner_plan(task.runner.logits(task.calls, found.pruner))
     for cells in (found.schedule, plans):
         assert set(cells.reshape(-1).tolist()) == {Source.COMPUTE, Source.FORWARD}
     assert (found.schedule == Source.COMPUTE).sum() == 24

@@ -27,7 +27,7 @@ def gradients(task: Task, plan: PlanArray, reuse: Source) -> np.ndarray:
     calls = task.calls
     one_hot = torch.nn.functional.one_hot(torch.from_numpy(plan.astype(np.int64)), 4).float()
     gates = one_hot.repeat(calls.count, 1, 1, 1).requires_grad_()
-    sample = everything_recorded(task.executor.model, calls.contexts, calls.initial, calls.noise, gates, {})
+    sample = everything_recorded(task.runner.model, calls.contexts, calls.initial, calls.noise, gates, {})
     executed, expected = task.actions.executed(sample), task.actions.executed(calls.targets)
     (executed - expected).abs().mean().backward()
     assert gates.grad is not None
@@ -45,7 +45,7 @@ def test_slopes_are_the_gradients_of_a_whole_formula(
     monkeypatch.setattr(module, "BYTES", size)  # one call at a time, or all
     task = make_task(20, calls=5)
     plan = random_plan(reuse, computed)
-    found = slopes(task.executor, task.actions, plan, reuse, task.calls)
+    found = slopes(task.runner, task.actions, plan, reuse, task.calls)
     with Counted() as counted:
         expected = gradients(task, plan, reuse)
     assert np.abs(expected[1:]).max() > 1e-3

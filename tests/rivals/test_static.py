@@ -85,7 +85,7 @@ def test_gates_move_to_where_the_error_falls_and_shrink_to_the_budget(
     good, bad = (3, 2), (5, 5)
     seen: list[int] = []
 
-    def slopes(executor: object, actions: object, plan: PlanArray, reuse: Source, calls: object) -> np.ndarray:
+    def slopes(runner: object, actions: object, plan: PlanArray, reuse: Source, calls: object) -> np.ndarray:
         seen.append(int((plan == Source.COMPUTE).sum()))
         gradient = np.zeros((10, 6), np.float32)
         gradient[good], gradient[bad] = -1, 1

@@ -40,8 +40,8 @@ def test_schedules_begin_with_steps_in_a_row_and_go_on_evenly() -> None:
 
 def forecast_loop(task: Task, steps: tuple[int, ...]) -> torch.Tensor:
     """The loop of the method, literally: at other steps than these the sampler is given the forecast."""
-    executor, calls, known = task.executor, task.calls, dict[int, torch.Tensor]()
-    model = executor.model
+    runner, calls, known = task.runner, task.calls, dict[int, torch.Tensor]()
+    model = runner.model
     carried = model.sampler.begin(calls.initial)
 
     def blocks(k: int, stream: torch.Tensor) -> torch.Tensor:
@@ -66,13 +66,13 @@ def test_the_correction_is_the_method_where_nothing_is_clipped(
     linear_policy: Path, recording: Path, steps: tuple[int, ...]
 ) -> None:
     task = task_on(linear_policy, recording)
-    model = task.executor.model
+    model = task.runner.model
     with Counted() as counted:
         expected = forecast_loop(task, steps)
-    run = task.executor.corrected(correction_for(task, steps))
+    run = task.runner.corrected(correction_for(task, steps))
     found = run.run(whole_steps_plan(model.steps, model.blocks, steps), task.calls)
     assert_equal_but_for_rounding(found, expected, 4 * counted.terms)  # what is taken out has been put in before
-    plain = task.executor.run(whole_steps_plan(model.steps, model.blocks, steps), task.calls)
+    plain = task.runner.run(whole_steps_plan(model.steps, model.blocks, steps), task.calls)
     assert (plain - expected).abs().max() > 100 * (found - expected).abs().max()
 
 
@@ -81,7 +81,7 @@ def test_the_best_warm_up_is_taken(make_task: MakeTask) -> None:
     found = found_by("taylorseer", task)
     errors = {}
     for warmup, steps in schedules(10, 4).items():
-        run = task.executor.corrected(correction_for(task, steps))
+        run = task.runner.corrected(correction_for(task, steps))
         samples = run.run(whole_steps_plan(10, 6, steps), task.calls)
         errors[warmup] = float(task.actions.errors(samples, task.calls.targets, units=False).mean())
     best = min(errors, key=errors.__getitem__)
@@ -107,7 +107,7 @@ def test_an_interrupted_search_has_its_correction(make_task: MakeTask) -> None:
 
 def test_the_product_executes_it(linear_policy: Path, recording: Path) -> None:
     task, artifact, steps = task_on(linear_policy, recording), load_artifact(linear_policy), (0, 1, 4, 7)
-    model, calls = task.executor.model, task.calls
+    model, calls = task.runner.model, task.calls
     with Counted() as counted:
         expected = forecast_loop(task, steps)
     plan = Plan(cells=whole_steps_plan(model.steps, model.blocks, steps), correction=correction_for(task, steps))

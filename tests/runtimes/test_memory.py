@@ -14,7 +14,7 @@ from ttscompile import Noise, SamplerTable, Source, flow_matching_table
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.execute import Executor
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.sparse_loop import fit_correction
 from ttscompile.core.correction import correction_flops
 from ttscompile.core.plan import Plan
@@ -177,23 +177,23 @@ def test_noise_of_a_deterministic_sampler_is_not_read(made: Made) -> None:
 def test_calibration_runs_the_same_loop_and_its_corrections_help(made: Made) -> None:
     """Batches of plans and calls, and corrections fitted step by step: the memories go along with the samples."""
     artifact, rng = made[1], np.random.default_rng(4)
-    executor, count, table = Executor(view_of(artifact, "dense")), 240, artifact.manifest.spec.sampler
+    runner, count, table = Runner(view_of(artifact, "dense")), 240, artifact.manifest.spec.sampler
     obs, noise = random_inputs(artifact, rng, count)
     initial, steps = noise_tensors(noise, artifact.manifest.spec.sampler.stochastic)
     with torch.no_grad():
-        contexts = executor.model.prologue({"obs": torch.from_numpy(obs["obs"])})
+        contexts = runner.model.prologue({"obs": torch.from_numpy(obs["obs"])})
     calls = Calls(contexts, initial, steps, np.zeros(count, np.int64))
-    calls = replace(calls, path=executor.run_dense(calls))
-    plan = np.full((executor.model.steps, executor.model.blocks), T, np.int8)
+    calls = replace(calls, path=runner.run_dense(calls))
+    plan = np.full((runner.model.steps, runner.model.blocks), T, np.int8)
     plan[[0, 3]] = C
-    corrected = executor.corrected(fit_correction(executor, plan, calls, True))
-    for each in (executor, corrected):
+    corrected = runner.corrected(fit_correction(runner, plan, calls, True))
+    for each in (runner, corrected):
         with torch.no_grad(), Counted() as counted:
-            expected = executor.model.denoise(contexts, initial, steps, plan, correction=each.correction)
+            expected = runner.model.denoise(contexts, initial, steps, plan, correction=each.correction)
         assert_equal_but_for_rounding(each.run(plan, calls), expected.sample, amplified(counted.terms, table))
         if each.correction is None:
             assert_equal_but_for_rounding(
                 each.run(0 * plan, calls), calls.targets, amplified(call_terms(artifact), table)
             )
-    errors = [float((each.run(plan, calls) - calls.targets).abs().mean()) for each in (executor, corrected)]
+    errors = [float((each.run(plan, calls) - calls.targets).abs().mean()) for each in (runner, corrected)]
     assert errors[1] < 0.8 * errors[0]

@@ -328,7 +328,7 @@ def _scored(
     gaps = Gaps(h / max(float(apart.mean()), 1e-12), sample.episodes)
     low, high = np.quantile(signed_root(gaps.resampled(gaps.clustered)), (0.025, 0.975))
     error = error_p90 = None
-    original = trials.executor.view.artifact.manifest.spec.sampler
+    original = trials.runner.view.artifact.manifest.spec.sampler
     if plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original):
         wrong = np.abs(x - y).reshape(*x.shape[:2], -1, spec.chunk.action_dim) / spec.chunk.scale
         each = wrong.mean((2, 3)).clip(max=LARGEST)

@@ -325,7 +325,7 @@ def calibrate(
 
 
 def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
-    bar, view, fewest = trials.bar, trials.executor.view, trials.limits.fewest
+    bar, view, fewest = trials.bar, trials.runner.view, trials.limits.fewest
     if (warning := few_steps(view.manifest)) is not None:
         bar.warn(warning)
     consecutive = any(row.consecutive or (row.name == SCHEDULE and strategy.consecutive) for row in rows)

@@ -22,7 +22,7 @@ from .trials import Trials, base_of
 
 def open_search(name: str, task: Task) -> Search:
     """The search of the strategy of this name, ready to begin."""
-    strategy, model = strategy_of(name), task.executor.model
+    strategy, model = strategy_of(name), task.runner.model
     strategy.require_reach(model.steps, model.blocks, task.budget)
     return strategy.make()(task)
 
@@ -130,13 +130,13 @@ class Schedule(Proposer):
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
         """See ``Proposer``."""
-        view, request = trials.executor.view, self.request
+        view, request = trials.runner.view, self.request
         self._manifest = view.manifest
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
         calls = trials.windows if self._strategy.consecutive else trials.calls
         small = calls.count > trials.limits.usual
-        task = Task.of(trials.executor, calls, 0, trials.seed, trials.pool, small)
+        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small)
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)

@@ -20,8 +20,8 @@ from ..core.lattice import BoolArray, PlanArray, Source
 from ..pool import workers
 from ..runtimes.reference.sampler import correct, features, through
 from .calls import Calls
-from .execute import Executor, StreamCaches
 from .regression import Components, Layers, Solved, fit_jump, solve
+from .runner import Runner, StreamCaches
 
 STREAMS = 64
 """Calls that go through the loop at once."""
@@ -77,7 +77,7 @@ class SparseLoop:
     """The sparse loop of some calls.
 
     Args:
-        executor: runs the policy; its own correction is not used.
+        runner: runs the policy; its own correction is not used.
         fitted: calls with their dense paths, that corrections are fitted on; None for a loop without corrections.
         judged: others; None for none.
         reads: whether corrections may read the observation.
@@ -87,26 +87,24 @@ class SparseLoop:
         begin: the place before step 0.
     """
 
-    def __init__(
-        self, executor: Executor, fitted: Calls | None, judged: Calls | None, *, reads: bool, whole: bool
-    ) -> None:
+    def __init__(self, runner: Runner, fitted: Calls | None, judged: Calls | None, *, reads: bool, whole: bool) -> None:
         self._components: Components | None = None
         self._groups, self._numbers, self._known = 0, 0, torch.empty(0, 0)
         if fitted is not None:
-            steps, sample = executor.model.steps, (fitted.initial.shape[1], fitted.initial.shape[2])
-            condition = executor.model.condition(fitted.contexts)
+            steps, sample = runner.model.steps, (fitted.initial.shape[1], fitted.initial.shape[2])
+            condition = runner.model.condition(fitted.contexts)
             self._numbers = numbers_of([tuple(condition.shape[1:])])
             most = components_of(steps, sample, self._numbers) if reads else 0
             self._components, self._groups = Components.of(condition, most), groups_of(steps, sample)
-            others = [] if judged is None else [self._components.of_others(executor.model.condition(judged.contexts))]
+            others = [] if judged is None else [self._components.of_others(runner.model.condition(judged.contexts))]
             self._known = torch.cat([self._components.values, *others]).float()
             self._episodes = fitted.episodes
 
         def batches(calls: Calls | None) -> tuple[_Batch, ...]:
             if calls is None:
                 return ()
-            parts, sums = calls.parts(STREAMS), whole and executor.alike
-            return tuple(_Batch(executor, executor.select(calls, part, consecutive=True), sums) for part in parts)
+            parts, sums = calls.parts(STREAMS), whole and runner.alike
+            return tuple(_Batch(runner, runner.select(calls, part, consecutive=True), sums) for part in parts)
 
         self.begin = Place(0, batches(fitted), batches(judged))
 
@@ -192,10 +190,10 @@ class SparseLoop:
 class _Batch:
     """Some of the calls at a place; with ``sums`` residuals are kept as their sum, which is enough for whole steps."""
 
-    def __init__(self, executor: Executor, calls: Calls, sums: bool) -> None:
-        self._executor, self._calls, self._sums = executor, calls, sums
+    def __init__(self, runner: Runner, calls: Calls, sums: bool) -> None:
+        self._runner, self._calls, self._sums = runner, calls, sums
         self._caches, self._total = StreamCaches(), calls.initial
-        self._carried = self._before = executor.model.sampler.begin(calls.initial)
+        self._carried = self._before = runner.model.sampler.begin(calls.initial)
         self._k, self._prediction = 0, calls.initial
 
     @property
@@ -216,12 +214,12 @@ class _Batch:
 
     def predict(self, rows: PlanArray, k: int) -> None:
         """Go through step k, without a correction; ``rows`` of plans, ``[1 or n, blocks]``."""
-        model, calls, self._before = self._executor.model, self._calls, self._carried
+        model, calls, self._before = self._runner.model, self._calls, self._carried
 
         def blocks(k: int, stem: Tensor) -> Tensor:
             if self._sums and rows[0, 0] != Source.COMPUTE:
                 return stem + self._total
-            stream = self._executor.step(rows, k, stem, calls, self._caches)
+            stream = self._runner.step(rows, k, stem, calls, self._caches)
             if self._sums:
                 self._total, self._caches = stream - stem, StreamCaches()
             return stream
@@ -256,10 +254,10 @@ class _Batch:
     def correct(self, weight: Tensor, added: Tensor, anchor: bool) -> None:
         """Correct the step: weights ``[G, 6 T, T]``, and what is added beside, ``[D, n, T]``."""
         carried = correct(self._before, self._prediction, self._carried, weight, added, anchor)
-        self._carried = self._executor.model.sampler.bounded(carried, self._k)
+        self._carried = self._runner.model.sampler.bounded(carried, self._k)
 
 
-def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: bool) -> Correction | None:
+def fit_correction(runner: Runner, plan: PlanArray, calls: Calls, reads: bool) -> Correction | None:
     """The correction of a schedule, or one for all plans of a pruner; None where the sparse loop ends in no numbers.
 
     At step k the sparse loop, corrected so far, has features; the correction of the step is the ridge regression, on
@@ -274,8 +272,8 @@ def fit_correction(executor: Executor, plan: PlanArray, calls: Calls, reads: boo
         plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. It may read the rollout cache where
             the calls are windows.
     """
-    loop = SparseLoop(executor, calls, None, reads=reads, whole=is_whole(plan))
-    ends = loop.ends(plan) if may_jump(executor.view.manifest.spec.sample) else (loop.end(plan),)
+    loop = SparseLoop(runner, calls, None, reads=reads, whole=is_whole(plan))
+    ends = loop.ends(plan) if may_jump(runner.view.manifest.spec.sample) else (loop.end(plan),)
 
     def missing(place: Place) -> float:
         return float((torch.cat([batch.sample for batch in place.fitted]) - calls.targets).abs().mean())

@@ -162,7 +162,7 @@ def plans_beside(
 
     ``strategy`` found the target's plan, which computes ``cells``.
     """
-    steps, target = task.executor.model.steps, max(1, cells // task.executor.model.blocks)
+    steps, target = task.runner.model.steps, max(1, cells // task.runner.model.blocks)
     plans: dict[str, Found] = {}
     skipped: dict[str, str] = {}
     if not strategy.fits_correction:

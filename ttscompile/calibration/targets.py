@@ -12,8 +12,8 @@ from ..pool import Here, Pool, Work, artifact_arguments, artifact_elsewhere, wor
 from ..trajectories.episodes import Episode
 from .calls import Calls, Split, prepare_calls, sample_calls
 from .clock import Clock
-from .execute import Executor
 from .progress import Bar
+from .runner import Runner
 from .state import StateFile
 
 REPEATS = 8
@@ -24,7 +24,7 @@ TARGETS_AT_ONCE = 16
 
 
 def with_targets(
-    executor: Executor,
+    runner: Runner,
     name: str,
     calls: Calls,
     least: int,
@@ -39,12 +39,12 @@ def with_targets(
     """
     known = state.get("targets").get(name)
     sample = calls.initial.shape[1:]
-    path = torch.empty(0, executor.model.steps, *sample)
+    path = torch.empty(0, runner.model.steps, *sample)
     if known is not None:
         with state.reading():
             path = torch.cat([path, torch.from_numpy(known)])
     bar.stage(f"dense, {name}", calls.count, len(path))
-    rounds, key = dense_rounds(executor, calls, len(path), pool), f"{name} targets"
+    rounds, key = dense_rounds(runner, calls, len(path), pool), f"{name} targets"
     # A calibration that was interrupted later goes on with as many as it had then.
     count = min(calls.count, int(state.progress.get(key, calls.count)))
     while len(path) < count and (len(path) < least or clock.left() > 0):
@@ -55,11 +55,11 @@ def with_targets(
     state.progress[key] = len(path)
     if len(path) < calls.count:
         path = path[: max(len(path) // calls.window, 1) * calls.window]
-        calls = executor.select(calls, np.arange(len(path)))
+        calls = runner.select(calls, np.arange(len(path)))
     return replace(calls, path=path)
 
 
-def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | None = None) -> Iterator[torch.Tensor]:
+def dense_rounds(runner: Runner, calls: Calls, begin: int = 0, pool: Pool | None = None) -> Iterator[torch.Tensor]:
     """What the dense policy answers to calls, from number ``begin`` on, a round of all workers at a time.
 
     Yields:
@@ -67,41 +67,41 @@ def dense_rounds(executor: Executor, calls: Calls, begin: int = 0, pool: Pool | 
     """
     pool = pool or Here()
     at_once = max(pool.count, torch.get_num_threads()) * TARGETS_AT_ONCE
-    work = Work(executor.run_dense, _dense_elsewhere, executor_arguments(executor), threads=True)
+    work = Work(runner.run_dense, _dense_elsewhere, runner_arguments(runner), threads=True)
     while begin < calls.count:
         end = min(begin + at_once, calls.count)
         parts = [np.arange(i, min(i + TARGETS_AT_ONCE, end)) for i in range(begin, end, TARGETS_AT_ONCE)]
-        found = list(pool.map(work, [executor.select(calls, part) for part in parts]))
+        found = list(pool.map(work, [runner.select(calls, part) for part in parts]))
         begin = end
         yield torch.cat(found)
 
 
-def executor_arguments(executor: Executor) -> tuple[str, str, str]:
-    """The arguments of ``executor_elsewhere``."""
-    return *artifact_arguments(executor.view.artifact), executor.view.variant.loop
+def runner_arguments(runner: Runner) -> tuple[str, str, str]:
+    """The arguments of ``runner_elsewhere``."""
+    return *artifact_arguments(runner.view.artifact), runner.view.variant.loop
 
 
-def executor_elsewhere(path: str, identity: str, loop: str) -> Executor:
-    """The same executor in another process, which may be on another machine."""
-    return Executor(view_of(artifact_elsewhere(path, identity), Plan(loop)))
+def runner_elsewhere(path: str, identity: str, loop: str) -> Runner:
+    """The same runner in another process, which may be on another machine."""
+    return Runner(view_of(artifact_elsewhere(path, identity), Plan(loop)))
 
 
 def _dense_elsewhere(path: str, identity: str, loop: str) -> Callable[[Calls], torch.Tensor]:
-    executor = executor_elsewhere(path, identity, loop)
+    runner = runner_elsewhere(path, identity, loop)
 
     def answer(calls: Calls) -> torch.Tensor:
         with workers() as threads:  # one thread does a part, as here
-            return threads.submit(executor.run_dense, calls).result()
+            return threads.submit(runner.run_dense, calls).result()
 
     return answer
 
 
 def draw_calls(
-    executor: Executor, episodes: Sequence[Episode], split: Split, limit: int, seed: int, window: int = 1
+    runner: Runner, episodes: Sequence[Episode], split: Split, limit: int, seed: int, window: int = 1
 ) -> Calls:
     """The calls to learn from, without targets: at most ``limit`` of them, in windows of so many.
 
     The seed is that of their choice and of their noise.
     """
     chosen = sample_calls(episodes, split.calibration, limit, seed, REPEATS, window)
-    return prepare_calls(executor.model, executor.view.manifest.spec, episodes, chosen, (seed, 2, 0), window)
+    return prepare_calls(runner.model, runner.view.manifest.spec, episodes, chosen, (seed, 2, 0), window)

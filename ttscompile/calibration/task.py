@@ -17,7 +17,7 @@ from ..pool import Pool
 from ..runtimes.plans import pruner_plan
 from .calls import Actions, Calls
 from .clock import Clock
-from .execute import Executor
+from .runner import Runner
 from .whole_steps import WholeSteps
 
 Array = npt.NDArray[Any]
@@ -56,7 +56,7 @@ class Task:
         clock: what can be left out is not begun if it would end after its limit.
     """
 
-    executor: Executor
+    runner: Runner
     actions: Actions
     calls: Calls
     budget: int
@@ -67,19 +67,19 @@ class Task:
 
     @classmethod
     def of(
-        cls, executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool | None = None, small: bool = False
+        cls, runner: Runner, calls: Calls, budget: int, seed: int, pool: Pool | None = None, small: bool = False
     ) -> Task:
         """The task of finding a plan; ``pool`` and ``small`` are those of ``WholeSteps``."""
-        actions, whole = Actions(executor.view.manifest.spec), WholeSteps(executor, calls, seed, pool, small)
-        return cls(executor, actions, calls, budget, seed, executor.view.pruner, whole)
+        actions, whole = Actions(runner.view.manifest.spec), WholeSteps(runner, calls, seed, pool, small)
+        return cls(runner, actions, calls, budget, seed, runner.view.pruner, whole)
 
     def draw(self, *stage: int) -> np.random.Generator:
         """Random numbers that belong to a stage, whatever was drawn before: so that going on equals not stopping."""
         return np.random.default_rng((self.seed, 3, *stage))
 
     def error(self, plan: PlanArray, calls: Calls) -> float:
-        """Mean error of the executed actions of a plan on some calls, normalised; see ``Executor.run``."""
-        return float(self.actions.errors(self.executor.run(plan, calls), calls.targets, units=False).mean())
+        """Mean error of the executed actions of a plan on some calls, normalised; see ``Runner.run``."""
+        return float(self.actions.errors(self.runner.run(plan, calls), calls.targets, units=False).mean())
 
     def whole_steps(self, steps: Sequence[int], **notes: Any) -> Found:
         """The schedule that computes these steps, with its correction.
@@ -106,7 +106,7 @@ class Task:
         notes = {**found.notes, "corrected": correction is not None, **_of_correction(correction)}
         if (weights := found.pruner) is None:
             return replace(found, correction=correction, notes=notes)
-        own = self.whole.correction_of(lambda calls: pruner_plan(self.executor.logits(calls, weights)))
+        own = self.whole.correction_of(lambda calls: pruner_plan(self.runner.logits(calls, weights)))
         notes["pruner_corrected"] = own is not None
         return replace(found, correction=correction, pruner_correction=own, notes=notes)
 

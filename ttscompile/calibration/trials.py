@@ -29,9 +29,9 @@ from ..trajectories.episodes import Episode
 from .arguments import CallLimits
 from .calls import FRACTION, Calls, IntArray, Split, calls_at, observed, split_episodes, window_of
 from .clock import Clock
-from .execute import Executor
 from .progress import Bar
 from .regression import envelope_of
+from .runner import Runner
 from .state import StateFile
 from .targets import dense_rounds, draw_calls, with_targets
 
@@ -109,7 +109,7 @@ class Trials:
         split: numbers of those that are learned from, and of those that are held out.
         seed: of the split, the noise, and everything else that is random.
         base: what a calibration begins with: every cell of its loop, in its precision and with its tokens.
-        executor: runs plans of the base's loop on many calls at once, in fp32.
+        runner: runs plans of the base's loop on many calls at once, in fp32.
         limits: of the number of calls to learn from.
         observations: that the original answers, at most; see ``OBSERVATIONS``.
         name: of the best plan so far.
@@ -127,7 +127,7 @@ class Trials:
     split: Split
     seed: int
     base: Plan
-    executor: Executor
+    runner: Runner
     state: StateFile
     clock: Clock = field(default_factory=Clock)
     bar: Bar = field(default_factory=partial(Bar, shown=False))
@@ -142,7 +142,7 @@ class Trials:
     begun_at: float = 0.0
     until_share: float = ANSWERED_BY
     _calls: dict[int, Calls] = field(default_factory=dict)
-    _loops: dict[str, tuple[Plan, Executor, dict[int, Calls]]] = field(default_factory=dict)
+    _loops: dict[str, tuple[Plan, Runner, dict[int, Calls]]] = field(default_factory=dict)
     _samples: dict[str, Sample] = field(default_factory=dict)
 
     @classmethod
@@ -160,19 +160,19 @@ class Trials:
         if artifact.manifest.spec.loops:
             others |= {"draws": MANY_DRAWS}
         base = base_of(artifact)
-        executor = Executor(view_of(artifact, base.exact), others.get("device"))
+        runner = Runner(view_of(artifact, base.exact), others.get("device"))
         split = split_episodes(len(episodes), fraction, seed)
-        return cls(artifact, episodes, split, seed, base, executor, state, **others)
+        return cls(artifact, episodes, split, seed, base, runner, state, **others)
 
     def of_loop(self, loop: str) -> Trials:
         """The same episodes, noise and answers of the original; to learn from are calls of a loop."""
-        self._loops.setdefault(self.base.loop, (self.base, self.executor, self._calls))
+        self._loops.setdefault(self.base.loop, (self.base, self.runner, self._calls))
         if loop not in self._loops:
             manifest = self.artifact.manifest
             base = replace(self.base, loop=loop, cells=dense_plan(manifest.steps_of(loop), len(manifest.blocks)))
-            self._loops[loop] = base, Executor(view_of(self.artifact, base.exact), self.device), {}
-        base, executor, calls = self._loops[loop]
-        return replace(self, base=base, executor=executor, _calls=calls)
+            self._loops[loop] = base, Runner(view_of(self.artifact, base.exact), self.device), {}
+        base, runner, calls = self._loops[loop]
+        return replace(self, base=base, runner=runner, _calls=calls)
 
     @property
     def calls(self) -> Calls:
@@ -188,7 +188,7 @@ class Trials:
     def envelope(self) -> Envelope | None:
         """Of the observations that were learned from; None where none were, or their condition is not read."""
         for calls in self._calls.values():
-            condition = self.executor.model.condition(calls.contexts)
+            condition = self.runner.model.condition(calls.contexts)
             most = min(COMPONENTS, numbers_of([tuple(condition.shape[1:])]))
             return envelope_of(condition, calls.episodes, most) if most else None
         return None
@@ -198,9 +198,9 @@ class Trials:
             fewest, loop = self.limits.fewest, self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
             most = self._affordable(name)
-            calls = draw_calls(self.executor, self.episodes, self.split, most, self.seed, window)
+            calls = draw_calls(self.runner, self.episodes, self.split, most, self.seed, window)
             work = self.state, self.clock.until(self.until_share), self.bar, self.pool
-            self._calls[window] = with_targets(self.executor, name, calls, fewest, *work)
+            self._calls[window] = with_targets(self.runner, name, calls, fewest, *work)
             if self.clock.left() < 0:
                 self.bar.warn(
                     f"{self.clock.limit / 60:g} minutes were over when the calls to learn from had been answered:"
@@ -215,7 +215,7 @@ class Trials:
         """
         key = f"{name} drawn"
         if key not in self.state.progress:
-            found = QUICKLY * (self.until_share * self.clock.limit - self.begun_at) / _seconds(self.executor.view)
+            found = QUICKLY * (self.until_share * self.clock.limit - self.begun_at) / _seconds(self.runner.view)
             known = name in self.state.get("targets")
             usual, most = self.limits.usual, self.limits.most
             self.state.progress[key] = usual if known else int(np.clip(found, usual, most))
@@ -318,10 +318,10 @@ class Trials:
             if known.shape[1:] != spec.sample or known.dtype != np.float32 or len(known) > len(asked):
                 raise ValueError(f"expected answers float32 [n, {spec.sample}]; found {known.dtype} {known.shape}")
         if len(known) < len(asked):
-            executor = self.executor if self.executor.view.variant == view.variant else Executor(view, self.device)
-            drawn = calls_at(executor.model, spec, self.episodes, places, noise_tensors(noise, spec.sampler.stochastic))
+            runner = self.runner if self.runner.view.variant == view.variant else Runner(view, self.device)
+            drawn = calls_at(runner.model, spec, self.episodes, places, noise_tensors(noise, spec.sampler.stochastic))
             self.bar.stage(f"original, {part} episodes", len(asked), len(known))
-            for found in dense_rounds(executor, drawn, len(known), self.pool):
+            for found in dense_rounds(runner, drawn, len(known), self.pool):
                 known = np.concatenate([known, found[:, -1].numpy()])
                 self.state.put(key, {"samples": known, "calls": calls})
                 self.state.save(seconds=self.clock.elapsed())

@@ -29,7 +29,7 @@ class Tts:
 
     def __init__(self, task: Task) -> None:
         self._task, self._whole = task, task.whole
-        model = task.executor.model
+        model = task.runner.model
         self._full = min(max(1, task.budget // model.blocks), model.steps)
         self._steps: tuple[int, ...] = tuple(range(self._full))
         self.loss = float("nan")
@@ -99,6 +99,6 @@ class Tts:
     def _moved(self, i: int, offset: int) -> tuple[int, ...] | None:
         """The schedule with its i-th step moved; None if it would meet another, or leave the loop."""
         target = self._steps[i] + offset
-        if not 0 < target < self._task.executor.model.steps or target in self._steps:
+        if not 0 < target < self._task.runner.model.steps or target in self._steps:
             return None
         return tuple(sorted((*self._steps[:i], target, *self._steps[i + 1 :])))

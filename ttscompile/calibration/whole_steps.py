@@ -13,9 +13,9 @@ from ..core.lattice import BoolArray, PlanArray, Source, whole_steps_plan
 from ..pool import Here, Pool, Work, workers
 from .calls import Actions, Calls, IntArray, calls_of
 from .clock import Clock
-from .execute import Executor
+from .runner import Runner
 from .sparse_loop import Place, SparseLoop, anchors_of, fit_correction
-from .targets import executor_arguments, executor_elsewhere
+from .targets import runner_arguments, runner_elsewhere
 
 FITTED, COMPARED = 384, 128
 """Calls on which a candidate's correction is fitted, and others on which its error is measured; fewer if there are
@@ -59,15 +59,13 @@ class WholeSteps:
     _pace = 0.0
     """Seconds that a comparison took, for each step that its schedule computes; the most so far."""
 
-    def __init__(
-        self, executor: Executor, calls: Calls, seed: int, pool: Pool | None = None, small: bool = False
-    ) -> None:
-        self._executor, self._actions, self._calls = executor, Actions(executor.view.manifest.spec), calls
+    def __init__(self, runner: Runner, calls: Calls, seed: int, pool: Pool | None = None, small: bool = False) -> None:
+        self._runner, self._actions, self._calls = runner, Actions(runner.view.manifest.spec), calls
         self._reading: dict[int, bool] = {}
         self._known: dict[tuple[int, ...], Errors] = {}
         self._runs: dict[bool | None, ScheduleRuns] = {}
         self._pool = pool or Here()
-        self._work = Work(self.measured, _measured_elsewhere, (*executor_arguments(executor), calls, seed, small))
+        self._work = Work(self.measured, _measured_elsewhere, (*runner_arguments(runner), calls, seed, small))
         self._seed, self._small = seed, small
         self._fitted, self._compared = self._divided(0, SMALL_SHARE if small else FITTED_SHARE)
 
@@ -78,7 +76,7 @@ class WholeSteps:
         apart = _set_apart(calls.episodes[:: calls.window][order], part)
 
         def some(windows: IntArray, most: int) -> Calls:
-            return self._executor.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
+            return self._runner.select(calls, calls_of(windows[: max(1, most // calls.window)], calls.window))
 
         fitted, compared = _sizes(calls.count, share)
         others = some(order[apart], compared)
@@ -87,11 +85,11 @@ class WholeSteps:
     @property
     def steps(self) -> int:
         """K."""
-        return self._executor.model.steps
+        return self._runner.model.steps
 
     def plan(self, steps: Sequence[int]) -> PlanArray:
         """The schedule that computes these steps and reads TIMESTEP elsewhere, int8 ``[K, blocks]``."""
-        return whole_steps_plan(self.steps, self._executor.model.blocks, steps)
+        return whole_steps_plan(self.steps, self._runner.model.blocks, steps)
 
     def errors(self, steps: Sequence[int]) -> Errors:
         """Errors of a schedule, with a correction of its own, on calls that this was not fitted on.
@@ -129,14 +127,14 @@ class WholeSteps:
         """The same for any plan ``[K, blocks]``, or for whatever makes plans ``[N, K, blocks]`` of N calls."""
         plans = _plans(plan, self._calls)
         reads = self.reads(max(1, int(anchors_of(plans).sum())))  # of whole steps, those that are computed
-        fitted = fit_correction(self._executor, _plans(plan, self._fitted), self._fitted, reads)
+        fitted = fit_correction(self._runner, _plans(plan, self._fitted), self._fitted, reads)
         tried = (
-            self._executor.corrected(one).run(_plans(plan, self._compared), self._compared) for one in (fitted, None)
+            self._runner.corrected(one).run(_plans(plan, self._compared), self._compared) for one in (fitted, None)
         )
         corrected, plain = (self._errors_of(samples, self._compared) for samples in tried)
         if plain.normalised <= corrected.normalised:
             return None
-        return fit_correction(self._executor, plans, self._calls, reads)
+        return fit_correction(self._runner, plans, self._calls, reads)
 
     def reads(self, count: int) -> bool:
         """Whether corrections of schedules of so many steps read the observation.
@@ -163,8 +161,8 @@ class WholeSteps:
         total, parts = 0.0, min(QUARTERS, len(np.unique(self._calls.episodes)))
         for part in range(1, parts if self._small else 1):
             fitted, compared = self._divided(part, FITTED_SHARE)
-            loop = SparseLoop(self._executor, fitted, compared, reads=reads, whole=True)
-            runs = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
+            loop = SparseLoop(self._runner, fitted, compared, reads=reads, whole=True)
+            runs = ScheduleRuns(loop, self.steps, self._runner.model.blocks)
             total += min(self._errors_of(runs.end(steps).samples, compared).normalised for steps in tried)
         return total
 
@@ -172,8 +170,8 @@ class WholeSteps:
         """Errors of a schedule with a correction that may, or may not, read the observation; None: without one."""
         if reads not in self._runs:
             fitted = None if reads is None else self._fitted
-            loop = SparseLoop(self._executor, fitted, self._compared, reads=bool(reads), whole=True)
-            self._runs[reads] = ScheduleRuns(loop, self.steps, self._executor.model.blocks)
+            loop = SparseLoop(self._runner, fitted, self._compared, reads=bool(reads), whole=True)
+            self._runs[reads] = ScheduleRuns(loop, self.steps, self._runner.model.blocks)
         return self._errors_of(self._runs[reads].end(steps).samples, self._compared)
 
     def told_of_episodes(self, steps: Sequence[int]) -> str:
@@ -186,8 +184,8 @@ class WholeSteps:
             return ""
         half, every = (np.flatnonzero(np.isin(of, some)) for some in (episodes[::2], episodes))
         count, reads = min(len(half), self._fitted.count), self.reads(len(steps))
-        parts = (self._executor.select(self._calls, some[:count]) for some in (half, every))
-        loops = (SparseLoop(self._executor, part, self._compared, reads=reads, whole=True) for part in parts)
+        parts = (self._runner.select(self._calls, some[:count]) for some in (half, every))
+        loops = (SparseLoop(self._runner, part, self._compared, reads=reads, whole=True) for part in parts)
         before, now = (self._errors_of(one.end(self.plan(steps)).samples, self._compared).normalised for one in loops)
         gain = max(before - now, 0.0) / max(before, 1e-30)  # 0 where nothing is left
         told = f"learned from {len(episodes)} it is {gain:.0%} nearer than learned from half of them"
@@ -210,8 +208,8 @@ class WholeSteps:
 def _measured_elsewhere(
     path: str, identity: str, loop: str, calls: Calls, seed: int, small: bool
 ) -> Callable[[Sequence[int]], tuple[Errors, float]]:
-    executor = executor_elsewhere(path, identity, loop)
-    return WholeSteps(executor, calls, seed, small=small).measured
+    runner = runner_elsewhere(path, identity, loop)
+    return WholeSteps(runner, calls, seed, small=small).measured
 
 
 def _plans(plan: PlanArray | MakePlans, calls: Calls) -> PlanArray:

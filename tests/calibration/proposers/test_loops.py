@@ -20,13 +20,13 @@ from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.choose import choose
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import SAFER, Proposal, near
 from ttscompile.calibration.proposers import loops
 from ttscompile.calibration.proposers.loops import REACH, Cost, Loops
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import DENSE, ORIGINAL, Plan
@@ -151,9 +151,9 @@ def test_a_small_network_is_searched_with_more_calls_than_its_rules_were_tried_o
 ) -> None:
     learned, of = list[tuple[int, bool]](), Task.of
 
-    def told(executor: Executor, calls: Calls, budget: int, seed: int, pool: Pool, small: bool = False) -> Task:
+    def told(runner: Runner, calls: Calls, budget: int, seed: int, pool: Pool, small: bool = False) -> Task:
         learned.append((calls.count, small))
-        return of(executor, calls, budget, seed, pool, small)
+        return of(runner, calls, budget, seed, pool, small)
 
     monkeypatch.setattr(loops, "calls_to_learn_from", lambda *_, corrects: CallLimits(8, 16, 16))
     monkeypatch.setattr(loops, "MOST_NEEDED", 16)

@@ -13,10 +13,10 @@ from ttscompile.artifact.stores import BlockWeights
 from ttscompile.artifact.view import view_of
 from ttscompile.calibration.calls import prepare_calls
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.execute import Executor
 from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.proposers.weights import NAME, Lesson, Student, Weights, trainable
+from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.coercion import Array
 from ttscompile.core.lattice import whole_steps_plan
@@ -34,17 +34,17 @@ def trials(artifact: Path, recording: Path) -> Trials:
 PLAN = Plan(cells=whole_steps_plan(policies.STEPS, 2 * policies.LAYERS, [0, 5]), weights=NAME)
 
 
-def with_weights(trials: Trials, weights: dict[str, Array]) -> Executor:
+def with_weights(trials: Trials, weights: dict[str, Array]) -> Runner:
     held = holding(trials, Proposal(NAME, PLAN, weights={NAME: BlockWeights(weights, {})}))
-    return Executor(view_of(held.artifact, PLAN))
+    return Runner(view_of(held.artifact, PLAN))
 
 
 def _student(trials: Trials) -> tuple[Student, Lesson]:
-    artifact, executor = trials.artifact, trials.executor
+    artifact, runner = trials.artifact, trials.runner
     draw = np.random.default_rng(0)
     episode = Episode("test", {"obs": draw.standard_normal((8, 2, 3)).astype(np.float32)})
-    calls = prepare_calls(executor.model, artifact.manifest.spec, [episode], [(0, i) for i in range(8)], (0,))
-    calls = replace(calls, path=executor.run_dense(calls))
+    calls = prepare_calls(runner.model, artifact.manifest.spec, [episode], [(0, i) for i in range(8)], (0,))
+    calls = replace(calls, path=runner.run_dense(calls))
     own = with_weights(trials, {name: artifact.weights[name] for name in trainable(artifact, 4)})
     one = Student(own, PLAN, 4, 0, 100)
     return one, one.lesson(calls)
@@ -73,8 +73,8 @@ def test_what_is_judged_is_what_is_written(trials: Trials) -> None:
         for _ in range(updates):
             one.update(lesson, 0.0)
         written = with_weights(trials, one.weights()).run(PLAN.cells, lesson.calls)
-        torch.testing.assert_close(one.executor.run(PLAN.cells, lesson.calls), written, rtol=0, atol=1e-5)
-    assert not torch.allclose(written, trials.executor.run(PLAN.cells, lesson.calls), atol=1e-2)
+        torch.testing.assert_close(one.runner.run(PLAN.cells, lesson.calls), written, rtol=0, atol=1e-5)
+    assert not torch.allclose(written, trials.runner.run(PLAN.cells, lesson.calls), atol=1e-2)
 
 
 def test_an_update_follows_the_gradient_of_the_loss(trials: Trials) -> None:

@@ -257,7 +257,7 @@ def test_the_outcome_does_not_depend_on_the_number_of_threads(
 def corrected(trials: Trials) -> Plan:
     """The plan of two steps, with what a correction does."""
     cells = whole_steps_plan(policies.STEPS, len(trials.artifact.manifest.blocks), [0, 5])
-    return replace(trials.base, cells=cells, correction=fit_correction(trials.executor, cells, trials.calls, True))
+    return replace(trials.base, cells=cells, correction=fit_correction(trials.runner, cells, trials.calls, True))
 
 
 def held(trials: Trials, plan: Plan) -> Kept:

@@ -51,7 +51,7 @@ def test_training_lowers_the_error_and_keeps_the_budget(task: Task) -> None:
     assert found.notes["computed_cells"]["most"] >= found.notes["computed_cells"]["mean"]
     assert (found.schedule == Source.COMPUTE).sum() == BUDGET
     assert found.pruner is not None
-    made = pruner_plan(task.executor.logits(task.calls, found.pruner))
+    made = pruner_plan(task.runner.logits(task.calls, found.pruner))
     assert (made[:, 0] == Source.COMPUTE).all()
     for name in NAMES - {paper.BASE}:
         assert not np.array_equal(found.pruner[name], task.pruner[name]), name

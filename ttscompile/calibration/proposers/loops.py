@@ -121,7 +121,7 @@ class Loops(Proposer):
         close, far = list[str](), list[str]()
         for loop in sorted(costs.keys() - {ORIGINAL}, key=lambda loop: costs[loop].one):
             own = trials.of_loop(loop)
-            whole = judge(own, Plan(loop, dense_plan(own.executor.model.steps, own.executor.model.blocks), repair=True))
+            whole = judge(own, Plan(loop, dense_plan(own.runner.model.steps, own.runner.model.blocks), repair=True))
             if whole.interval[0] > self._farthest:
                 self._left_out.append(f"{loop} is {whole.distance:.3g} from the original with every step computed")
             else:
@@ -140,11 +140,11 @@ class Loops(Proposer):
         calls, few = own.calls, max(own.limits.usual, MOST_NEEDED)
         small = calls.count > few
         # Each number of steps is fitted to all: with thousands the time would end before the steps are enough.
-        first = own.executor.select(calls, range(few)) if small else calls
-        task = replace(Task.of(own.executor, first, 0, own.seed, own.pool), clock=clock)
+        first = own.runner.select(calls, range(few)) if small else calls
+        task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
         if small and clock.left() > 0:
-            task = replace(Task.of(own.executor, calls, 0, own.seed, own.pool, small), clock=clock)
+            task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         reached = False  # what is wanted; then one number of steps more is tried
         for number, count in enumerate(counts):
@@ -152,7 +152,7 @@ class Loops(Proposer):
                 clock.cut = True
                 break
             share = _ending(clock, clock.left() / (len(counts) - number))
-            search = open_search("tts", replace(task, clock=share, budget=count * own.executor.model.blocks))
+            search = open_search("tts", replace(task, clock=share, budget=count * own.runner.model.blocks))
             found = resumed_search(own, search, share, None, f"search, {loop}, {count} steps")[0]
             yield from self._judged(self._proposal(task, loop, count, found), cost.of(count))
             before, reached = reached, self._reached(loop, count, wanted)
@@ -166,7 +166,7 @@ class Loops(Proposer):
         safer = wanted < self._bound
         fastest = float("inf") if safer else self._fastest  # of the loops before
         crowded = SpacedSchedules(task.whole, own.state, task.clock, own.bar, f"crowded, {loop}")
-        counts = [n for n in COUNTS if n <= max(1, own.executor.model.steps // 2)]
+        counts = [n for n in COUNTS if n <= max(1, own.runner.model.steps // 2)]
         apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
         hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
         hopeful, reached = list[int](), False
@@ -219,7 +219,7 @@ class Loops(Proposer):
         until_share = (now + ANSWERING * seconds) / limit if np.isfinite(limit) else 1.0
         own = replace(trials.of_loop(loop), begun_at=now, until_share=until_share)
         minutes = max(seconds, 1.0) / 60 if np.isfinite(seconds) else 1e3
-        limits = calls_to_learn_from(own.executor.view.manifest, minutes, corrects=True)
+        limits = calls_to_learn_from(own.runner.view.manifest, minutes, corrects=True)
         usual = own.state.progress.setdefault(f"most of {loop}", limits.usual)
         return replace(own, limits=CallLimits(limits.fewest, usual, max(usual, MOST_CALLS)))
 

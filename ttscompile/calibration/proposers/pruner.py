@@ -38,7 +38,7 @@ class Pruner(Proposer):
                 f"the pruner learns from a schedule of loop {trials.base.loop!r}; found another."
             )
         computed = int((cells == Source.COMPUTE).sum())
-        task = Task.of(trials.executor, trials.windows, computed, trials.seed, trials.pool)
+        task = Task.of(trials.runner, trials.windows, computed, trials.seed, trials.pool)
         search = Paper(replace(task, clock=clock))
         found, updates, _ = resumed_search(trials, search, clock, self.request.intervals, PRUNER)
         self.told = f"{updates} updates; its best head is {found.error:.4g} off on calls that it was not trained on"

@@ -32,9 +32,9 @@ from ...pool import workers
 from ...runtimes.reference.sampler import Carried
 from ..calls import Actions, Calls, IntArray
 from ..clock import Clock
-from ..execute import Executor, StreamCaches, last
 from ..kept import holding
 from ..proposer import Proposal, Proposals, Proposer
+from ..runner import Runner, StreamCaches, last
 from ..sparse_loop import fit_correction
 from ..trials import Trials
 
@@ -97,7 +97,7 @@ class Student:
     """A policy whose blocks change by low-rank matrices after step 0.
 
     Args:
-        executor: of a view with weights beside the original's, which this changes in place.
+        runner: of a view with weights beside the original's, which this changes in place.
         plan: cells of whole steps, at least two of them computed, and their correction.
         seed: of the first changes, and of the order of the calls.
 
@@ -105,14 +105,14 @@ class Student:
         begin: the first step that is trained: the second that the plan computes.
     """
 
-    def __init__(self, executor: Executor, plan: Plan, rank: int, seed: int, updates: int) -> None:
+    def __init__(self, runner: Runner, plan: Plan, rank: int, seed: int, updates: int) -> None:
         assert plan.cells is not None
-        self.executor = executor.corrected(plan.correction)
+        self.runner = runner.corrected(plan.correction)
         self._cells, self._correction, self._seed, self._updates = plan.cells, plan.correction, seed, updates
         self._computed = (plan.cells == Source.COMPUTE).all(axis=1)
         self.begin = int(np.flatnonzero(self._computed)[1])
-        self._actions = Actions(executor.view.manifest.spec)
-        self._weights = {n: executor.model.weights[n].requires_grad_() for n in sorted(executor.view.first_weights)}
+        self._actions = Actions(runner.view.manifest.spec)
+        self._weights = {n: runner.model.weights[n].requires_grad_() for n in sorted(runner.view.first_weights)}
         self._original = {n: value.detach().clone() for n, value in self._weights.items()}
         draw = torch.Generator().manual_seed(seed)
         self._factors: dict[str, Tensor] = {}
@@ -128,7 +128,7 @@ class Student:
         """The calls as far as nothing of them is trained."""
         parts = [np.arange(i, min(i + PART, calls.count)) for i in range(0, calls.count, PART)]
         with workers() as pool:
-            carried = list(pool.map(self._until, [self.executor.select(calls, part) for part in parts]))
+            carried = list(pool.map(self._until, [self.runner.select(calls, part) for part in parts]))
         return Lesson(calls, Carried(*(torch.cat(each) for each in zip(*carried, strict=True))))
 
     def update(self, lesson: Lesson, passed: float) -> float:
@@ -192,7 +192,7 @@ class Student:
 
     def _gradients(self, lesson: Lesson, size: int, numbers: IntArray) -> tuple[float, dict[str, Tensor]]:
         """Loss of some calls of a batch, as their share of it, and its gradients by factor."""
-        calls, index = self.executor.select(lesson.calls, numbers), torch.from_numpy(numbers)
+        calls, index = self.runner.select(lesson.calls, numbers), torch.from_numpy(numbers)
         carried = Carried(*(value[index] for value in lesson.carried))
         with torch.enable_grad():
             sample = last(one.sample for one in self._loop(calls, (self.begin, carried)))
@@ -215,11 +215,11 @@ class Student:
             nonlocal total
             if not self._computed[k]:
                 return stem + total
-            stream = self.executor.step(self._cells[k][None], k, stem, calls, caches)
+            stream = self.runner.step(self._cells[k][None], k, stem, calls, caches)
             total = stream - stem
             return stream
 
-        model = self.executor.model
+        model = self.runner.model
         return model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self._correction, since=since)
 
     @torch.no_grad()
@@ -262,21 +262,21 @@ class Weights(Proposer):
         rank, updates = self.request.rank, self.request.updates
         names = trainable(trials.artifact, rank)
 
-        def corrected(executor: Executor) -> Plan:
-            return replace(plan, correction=fit_correction(executor, cells, calls, reads), weights=NAME)
+        def corrected(runner: Runner) -> Plan:
+            return replace(plan, correction=fit_correction(runner, cells, calls, reads), weights=NAME)
 
-        first, original = corrected(trials.executor), {name: trials.artifact.weights[name] for name in names}
+        first, original = corrected(trials.runner), {name: trials.artifact.weights[name] for name in names}
         if plan.correction is None and first.correction is not None:  # what that alone does is no merit of the weights
             yield Proposal(trials.name, replace(plan, correction=first.correction))
         held = holding(trials, Proposal(NAME, first, weights={NAME: BlockWeights(original, {})}))
-        there = Executor(view_of(held.artifact, first.exact), trials.device)
+        there = Runner(view_of(held.artifact, first.exact), trials.device)
         student = Student(there, first, rank, trials.seed, updates)
         self._train(student, trials, clock.until(TRAINING))
         self.told = f"{len(names)} matrices of blocks were trained in {student.done} updates"
         notes, weights = {"rank": rank, "matrices": len(names), "updates": student.done}, student.weights()
         own = BlockWeights(weights, _in_precision(trials.artifact, weights))
         # What the trained weights predict is corrected anew; what they were trained with they only began from.
-        yield Proposal(NAME, corrected(student.executor), notes, weights={NAME: own})
+        yield Proposal(NAME, corrected(student.runner), notes, weights={NAME: own})
 
     def _train(self, student: Student, trials: Trials, clock: Clock) -> None:
         """All updates, or as many as there is time for; the state is saved on the way."""

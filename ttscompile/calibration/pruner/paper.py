@@ -101,9 +101,9 @@ class Paper(NothingAfter):
         self._task, self._observes = task, observes and has_head(task.pruner)
         self._sources, self._begin, self._reused = sources, begin, reused
         practised, compared = _divided(task)
-        self._practised, self._compared = (task.executor.select(task.calls, one) for one in (practised, compared))
+        self._practised, self._compared = (task.runner.select(task.calls, one) for one in (practised, compared))
         self._practice: Practice | None = None
-        model = task.executor.model
+        model = task.runner.model
         self._most = task.budget if begin is not None else min(round(START * task.budget), model.steps * model.blocks)
         self._values = {BASE: self._base([0])}
         if self._observes:
@@ -120,7 +120,7 @@ class Paper(NothingAfter):
     def advance(self, interval: int) -> None:
         """One update; after every few of them, and after the last, the head is held against the best."""
         if self._practice is None:
-            self._practice = Practice(self._task.executor, self._practised)
+            self._practice = Practice(self._task.runner, self._practised)
         if interval == 0:
             begin = self._begin
             self._values[BASE] = self._base(self._best_steps(self._task.budget) if begin is None else begin)
@@ -169,7 +169,7 @@ class Paper(NothingAfter):
 
     def _best_steps(self, cells: int) -> Sequence[int]:
         """The schedule of so many cells with the lowest error, as far as there is time to try."""
-        task, model = self._task, self._task.executor.model
+        task, model = self._task, self._task.runner.model
         family = spacings(model.steps, max(1, min(cells // model.blocks, model.steps)))
         tried = [
             (task.error(whole_steps_plan(model.steps, model.blocks, steps), self._compared), steps)
@@ -179,7 +179,7 @@ class Paper(NothingAfter):
 
     def _base(self, begin: Sequence[int]) -> Array:
         """What does not depend on the observation, at first, ``[K, blocks, 4]``."""
-        model, draw = self._task.executor.model, self._task.draw(0, 5)
+        model, draw = self._task.runner.model, self._task.draw(0, 5)
         base = np.zeros((model.steps, model.blocks, len(Source)))
         base[list(begin), :, Source.COMPUTE] = FIRST[0]
         base[..., Source.COMPUTE] += APART * draw.standard_normal(base.shape[:2])
@@ -193,11 +193,11 @@ class Paper(NothingAfter):
         """What the head says, ``[N, K, blocks, 4]``."""
         tensors = {name: torch.as_tensor(value) for name, value in values.items()}
         if self._observes:
-            return self._task.executor.model.logits(calls.contexts, tensors)
+            return self._task.runner.model.logits(calls.contexts, tensors)
         return tensors[BASE].expand(calls.count, *tensors[BASE].shape)
 
     def _update(self, practice: Practice, numbers: IntArray, interval: int) -> None:
-        task, calls = self._task, self._task.executor.select(practice.calls, numbers)
+        task, calls = self._task, self._task.runner.select(practice.calls, numbers)
         leaves = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in self._values.items()}
         logits = self._logits(leaves, calls)
         price = torch.zeros(len(Source))
@@ -228,7 +228,7 @@ class Paper(NothingAfter):
     def _compare(self) -> None:
         task, calls, values = self._task, self._compared, self._priced()
         plans = legal(pruner_plan(self._logits(values, calls).numpy()), calls.window)
-        error = float(task.actions.errors(task.executor.run(plans, calls), calls.targets, units=False).mean())
+        error = float(task.actions.errors(task.runner.run(plans, calls), calls.targets, units=False).mean())
         if self._interval:
             self.trained = min(self.trained, error)
         if not error >= self.loss:  # also if nothing was measured before
@@ -238,7 +238,7 @@ class Paper(NothingAfter):
     def _priced(self) -> dict[str, Array]:
         """The head with the price of a computed cell with which calls that it is not trained on keep the budget."""
         task, logits = self._task, self._logits(self._values, self._compared).numpy()
-        blocks, fixed = task.executor.model.blocks, {name: value.copy() for name, value in self._values.items()}
+        blocks, fixed = task.runner.model.blocks, {name: value.copy() for name, value in self._values.items()}
         for cells in range(task.budget, blocks - 1, -1):
             price = _price(logits, cells)
             computed = blocks + (_margins(logits) > price).sum((1, 2))
@@ -251,7 +251,7 @@ class Paper(NothingAfter):
         """The best head's plans as one: the cells that it is the most inclined to compute, as the budget has room."""
         logits = self._logits(self._best, self._compared).numpy()
         inclined = _margins(logits).mean(0)
-        steps, blocks = self._task.executor.model.steps, self._task.executor.model.blocks
+        steps, blocks = self._task.runner.model.steps, self._task.runner.model.blocks
         plan: PlanArray = np.full((steps, blocks), Source.TIMESTEP, np.int8)
         others = logits.mean(0)
         plan[others[..., Source.FORWARD] > others[..., Source.TIMESTEP]] = Source.FORWARD

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...core.lattice import BoolArray, PlanArray, Source
 from ...runtimes.reference.reuse import Caches, Cell, reuse
 from ..calls import Calls, IntArray
-from ..execute import Executor, StreamCaches, latest_before
+from ..runner import Runner, StreamCaches, latest_before
 
 BYTES = 2**28
 """Memory for what the blocks compute in the dense calls, as bfloat16. It decides how many calls are learned from."""
@@ -24,22 +24,22 @@ BYTES = 2**28
 class Practice:
     """Calls to learn from, in windows of consecutive ones, and what the blocks compute in them when all is computed."""
 
-    def __init__(self, executor: Executor, calls: Calls) -> None:
-        model = executor.model
-        each = 2 * model.steps * sum(math.prod(type_.at(1)) for type_ in executor.types) * calls.window
+    def __init__(self, runner: Runner, calls: Calls) -> None:
+        model = runner.model
+        each = 2 * model.steps * sum(math.prod(type_.at(1)) for type_ in runner.types) * calls.window
         windows = min(calls.count // calls.window, max(1, BYTES // each))
-        self._executor = executor
-        self.calls = executor.select(calls, np.arange(windows * calls.window))
+        self._runner = runner
+        self.calls = runner.select(calls, np.arange(windows * calls.window))
         self._dense: list[list[Tensor]] = []
         caches, whole = StreamCaches(), np.full((1, model.blocks), Source.COMPUTE, np.int8)
 
         def blocks(k: int, stem: Tensor) -> Tensor:
-            stream = executor.step(whole, k, stem, self.calls, caches)
+            stream = runner.step(whole, k, stem, self.calls, caches)
             self._dense.append([caches.timestep[b].to(torch.bfloat16) for b in range(model.blocks)])
             return stream
 
         with torch.no_grad():
-            for _ in executor.corrected(None).samples(self.calls, blocks):
+            for _ in runner.corrected(None).samples(self.calls, blocks):
                 pass
 
     def samples(self, plans: PlanArray, gates: Tensor, numbers: IntArray) -> list[Tensor]:
@@ -50,12 +50,12 @@ class Practice:
             gates: the same one-hot, ``[N, K, blocks, 4]``.
             numbers: of N of the calls, whole windows.
         """
-        executor, model, caches = self._executor, self._executor.model, Caches({})
-        calls, there = executor.select(self.calls, numbers), torch.from_numpy(numbers)
+        runner, model, caches = self._runner, self._runner.model, Caches({})
+        calls, there = runner.select(self.calls, numbers), torch.from_numpy(numbers)
         gates = gates.to(model.device)
 
         def blocks(k: int, stream: Tensor) -> Tensor:
-            for b, axis in enumerate(executor.axes):
+            for b, axis in enumerate(runner.axes):
                 column = plans[:, k, b]
                 computed = self._dense[k][b].index_select(axis, there.to(stream.device)).to(stream.dtype)
                 takers = np.flatnonzero(column == Source.COMPUTE)
@@ -65,12 +65,12 @@ class Practice:
                     computed = computed.index_copy(axis, torch.from_numpy(takers).to(stream.device), part)
                 if (before := _earlier(column, computed.detach(), axis, calls.window)) is not None:
                     caches.rollout[k, b] = before
-                cell = Cell(k, b, model.groups[b], column, gates[:, k, b], executor.types[b])
+                cell = Cell(k, b, model.groups[b], column, gates[:, k, b], runner.types[b])
                 stream = stream + reuse(cell, computed, caches)
                 caches.rollout.pop((k, b), None)  # nobody reads it after this cell
             return stream
 
-        return list(executor.samples(calls, blocks))
+        return list(runner.samples(calls, blocks))
 
 
 def legal(wished: PlanArray, window: int) -> PlanArray:

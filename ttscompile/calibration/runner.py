@@ -29,7 +29,7 @@ STREAMS = 256
 """Calls with plans of their own that go through the loop at once."""
 
 
-class Executor:
+class Runner:
     """Runs plans without gradients.
 
     Args:
@@ -55,8 +55,8 @@ class Executor:
         self.correction: Correction | None = None
         self._dense = dense_plan(self.model.steps, self.model.blocks)[None]
 
-    def corrected(self, correction: Correction | None) -> Executor:
-        """The same executor with another correction, or none."""
+    def corrected(self, correction: Correction | None) -> Runner:
+        """The same runner with another correction, or none."""
         other = copy(self)
         other.correction = correction
         return other
@@ -119,7 +119,7 @@ class Executor:
             return np.asarray(self.model.logits(calls.contexts, tensors).numpy(), dtype=np.float32)
 
     def samples(self, calls: Calls, blocks: Blocks) -> Iterator[Tensor]:
-        """The sample ``[N, T, D]`` after each step, with the executor's correction."""
+        """The sample ``[N, T, D]`` after each step, with the runner's correction."""
         loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction)
         return (carried.sample for carried in loop)
 

@@ -1,11 +1,11 @@
-"""The executor of many plans means what the reference runtime means."""
+"""The runner of many plans means what the reference runtime means."""
 
 import numpy as np
 import pytest
 import torch
 
 from tests.rounding import Counted, assert_equal_but_for_rounding
-from ttscompile.calibration import calls, execute
+from ttscompile.calibration import calls, runner as runner_module
 from ttscompile.core.lattice import Source, dense_plan
 from ttscompile.errors import IllegalPlanError
 
@@ -23,13 +23,13 @@ def random_plans(count: int, computed: float) -> np.ndarray:
 @pytest.mark.parametrize("computed", [0.05, 0.5])
 def test_plans_on_calls_equal_the_reference(make_task: MakeTask, computed: float) -> None:
     task = make_task(calls=3)
-    executor, calls = task.executor, task.calls
+    runner, calls = task.runner, task.calls
     plans = random_plans(12, computed)
     plans[1, 1:] = Source.TIMESTEP  # nothing computed after step 0
     for plan in plans:
         with Counted() as counted:
-            expected = executor.model.denoise(calls.contexts, calls.initial, calls.noise, plan).sample
-        assert_equal_but_for_rounding(executor.run(plan, calls), expected, counted.terms)
+            expected = runner.model.denoise(calls.contexts, calls.initial, calls.noise, plan).sample
+        assert_equal_but_for_rounding(runner.run(plan, calls), expected, counted.terms)
 
 
 def test_observations_may_go_through_the_prologue_a_few_at_a_time(
@@ -52,18 +52,18 @@ def test_observations_may_go_through_the_prologue_a_few_at_a_time(
 def test_a_plan_for_each_call_equals_the_reference(
     make_task: MakeTask, streams: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execute, "STREAMS", streams)
+    monkeypatch.setattr(runner_module, "STREAMS", streams)
     task, plans = make_task(calls=5), random_plans(5, 0.3)
-    executor, calls = task.executor, task.calls
+    runner, calls = task.runner, task.calls
     with Counted() as counted:
-        expected = executor.model.denoise(calls.contexts, calls.initial, calls.noise, plans).sample
-    assert_equal_but_for_rounding(executor.run(plans, calls), expected, counted.terms)
+        expected = runner.model.denoise(calls.contexts, calls.initial, calls.noise, plans).sample
+    assert_equal_but_for_rounding(runner.run(plans, calls), expected, counted.terms)
 
 
 def test_different_plans_have_different_results(make_task: MakeTask) -> None:
     """Else the tests above would compare constants."""
     task = make_task(calls=3)
-    first, second = (task.executor.run(plan, task.calls) for plan in random_plans(2, 0.3))
+    first, second = (task.runner.run(plan, task.calls) for plan in random_plans(2, 0.3))
     assert (first - second).abs().max() > 1e-3
     assert (first[0] - first[1]).abs().max() > 1e-3
 
@@ -71,14 +71,14 @@ def test_different_plans_have_different_results(make_task: MakeTask) -> None:
 def test_calls_are_selected_in_the_order_given(make_task: MakeTask) -> None:
     task = make_task(calls=4)
     with Counted() as counted:
-        some = task.executor.run_dense(task.executor.select(task.calls, [2, 0, 2]))
+        some = task.runner.run_dense(task.runner.select(task.calls, [2, 0, 2]))
     assert task.calls.path is not None
     assert_equal_but_for_rounding(some, task.calls.path[[2, 0, 2]], counted.terms)
 
 
 def test_of_consecutive_calls_nothing_is_copied_that_the_prologue_gave(make_task: MakeTask) -> None:
     task = make_task(calls=4)
-    views, copies = (task.executor.select(task.calls, [1, 2], consecutive=one).contexts for one in (True, False))
+    views, copies = (task.runner.select(task.calls, [1, 2], consecutive=one).contexts for one in (True, False))
     given = task.calls.contexts
     each = (views.condition, copies.condition, given.condition)
     memory = [[one[name].untyped_storage().data_ptr() for one in each] for name in each[0]]
@@ -91,6 +91,6 @@ def test_a_plan_that_needs_an_earlier_call_is_refused(make_task: MakeTask) -> No
     task, plan = make_task(calls=2), dense_plan(10, 6)
     plan[3, 1] = Source.ROLLOUT
     with pytest.raises(IllegalPlanError, match="earlier call"):
-        task.executor.run(plan, task.calls)
+        task.runner.run(plan, task.calls)
     with pytest.raises(IllegalPlanError, match="dense step 0"):
-        task.executor.run(np.full_like(plan, Source.TIMESTEP), task.calls)
+        task.runner.run(np.full_like(plan, Source.TIMESTEP), task.calls)
