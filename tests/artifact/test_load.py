@@ -22,7 +22,7 @@ from ttscompile.ir.graph import TensorType
 
 
 def test_a_path_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match="does not exist. Give the directory that 'ttscompile convert' wrote"):
+    with pytest.raises(ArtifactError, match="does not exist. Give the directory that 'ttscompile build' wrote"):
         load_artifact(tmp_path / "none")
 
 

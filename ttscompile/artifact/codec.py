@@ -38,7 +38,7 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
     if document.get("format") != FORMAT:
         raise ArtifactError(
             f"{where}: expected the manifest of a ttscompile artifact (format {FORMAT!r}); found another document."
-            " Give the directory that 'ttscompile convert' wrote."
+            " Give the directory that 'ttscompile build' wrote."
         )
     found, writer = document.get("schema_version"), document.get("ttscompile_version")
     if found not in (SCHEMA_VERSION, SCHEMA_VERSION - 1) or type(found) is not int:

@@ -248,7 +248,7 @@ def load_artifact(path: str | Path) -> Artifact:
 
 def require_artifact_path(path: Path) -> None:
     """Raise unless there is something that may be an artifact."""
-    require_path(path, ArtifactError, "Give the directory that 'ttscompile convert' wrote.")
+    require_path(path, ArtifactError, "Give the directory that 'ttscompile build' wrote.")
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -262,7 +262,7 @@ def read_manifest(directory: Path) -> Manifest:
     if not os.path.lexists(path):
         _refuse_checkpoint(directory)
         raise ArtifactError(
-            f"{directory}: not an artifact: it has no {MANIFEST}. Give the directory that 'ttscompile convert' wrote."
+            f"{directory}: not an artifact: it has no {MANIFEST}. Give the directory that 'ttscompile build' wrote."
         )
     return decode(read_file(path, MAX_MANIFEST_BYTES), str(path))
 

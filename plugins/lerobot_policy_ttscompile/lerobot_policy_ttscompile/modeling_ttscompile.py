@@ -61,7 +61,7 @@ class TtscompilePolicy(PreTrainedPolicy):
         if directory is None:
             raise ValueError(
                 "a compiled policy is not made from scratch, and not trained: give --policy.path=DIR, which ttscompile"
-                " convert wrote"
+                " build wrote"
             )
         self._directory = Path(directory)
         if config.precision is not None:
