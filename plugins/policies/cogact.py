@@ -21,16 +21,14 @@ from ttscompile.frontends.checkpoint import read_checkpoint
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.refusals import refuse_payload
 from ttscompile.frontends.saved_weights import as_float32, filled
-from ttscompile.frontends.scheduler import configured_loops
 
-from .last_step import changed, clipped
+from .loops import respaced_loops
 from .networks.layers import TimestepEmbedder, TimmAttention, TimmMlp
 from .quantiles import GRIPPER, read_statistics
 
 MODELS = {"DiT-S": (384, 6, 4), "DiT-B": (768, 12, 12), "DiT-L": (1024, 24, 16)}
 """Width, layers and heads of the action models; the shapes of the weights tell the first two."""
 GUIDANCE, STEPS = 1.5, 10
-_TRAINED = {"num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2", "clip_sample": False}
 _UNREAD = "history_embedder."
 
 
@@ -106,9 +104,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
         )
     sizes = {"layers": layers, "horizon": horizon, "actions": actions, "cognition": cognition}
     head = filled(lambda: CogACTHead(width, heads, guidance=GUIDANCE, **sizes), weights, "the first of each kind", path)
-    settings = {"_target_": "DDIMScheduler", **_TRAINED}
-    loops = configured_loops(settings, STEPS, options, where=f"{path}: the sampler")
-    loops = changed(loops, lambda table: clipped(table, 1.0))  # predict_action clips what the loop gives
+    loops = respaced_loops(path, STEPS, options)
     own = read_statistics(path, actions, (GRIPPER,) if actions > GRIPPER else ())
     spec = PolicySpec(
         sample=(horizon, actions),

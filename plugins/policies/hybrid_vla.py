@@ -31,16 +31,15 @@ from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.saved_weights import as_float32, filled, require_memory_for
 from ttscompile.frontends.settings import Settings, read_json
 
-from .last_step import changed, clipped
-from .loops import ddim_loops
+from .loops import respaced_loops
 from .networks.language_layers import LanguageConfig, Layer, Norm, Rotation, Seen, added, rotate, rotation
 from .networks.layers import TimestepEmbedder
 from .quantiles import GRIPPER, Range, read_statistics
 
 CONFIG, LENGTH = "config.json", "prefix_tokens"
 """The configuration beside the folder of checkpoints, and what has to be added to it."""
-STEPS, TIMESTEPS = 4, 100
-"""Of its scripts, and of its training."""
+STEPS = 4
+"""Of its scripts."""
 
 _CHANNELS, _EPSILON = 128, 1e-5
 """Of a head of Llama 2, of any size, and of its norms."""
@@ -188,8 +187,7 @@ def load(path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     grippers = {7: (GRIPPER,), 14: (GRIPPER, GRIPPER + 7)}.get(count, ())
     own = read_statistics(path, count, grippers, state=count)
     network = filled(lambda: HybridVLAHead(sizes, own.state), weights, "a Llama 2 as wide as the last norm", path)
-    loops = ddim_loops(where, STEPS, options, num_train_timesteps=TIMESTEPS, clip_sample=False)
-    loops = changed(loops, lambda table: clipped(table, 1.0))  # predict_action clips what the loop gives
+    loops = respaced_loops(where, STEPS, options)
     seen = None if own.state is None else (tuple(own.state.low.tolist()), tuple(own.state.high.tolist()))
     spec = PolicySpec(
         sample=(horizon, count),

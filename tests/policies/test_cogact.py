@@ -18,6 +18,7 @@ from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.scheduler import configured_loops
 from ttscompile.policies import cogact
 from ttscompile.policies.cogact import CogACTHead
+from ttscompile.policies.loops import RESPACED
 
 from .authors import assert_acts_as_the_original, by_one_command
 from .refused import assert_not_read
@@ -68,14 +69,40 @@ def test_every_loop_clips_what_it_gives_and_nothing_before(sampler: str, tmp_pat
     module, spec = load_checkpoint_policy(path, options=LoadOptions(sampler=sampler, steps=20))
     own = spec.in_loop(f"{sampler}-20")
     assert own.sampler.bound == 1
-    settings = {"_target_": "DDIMScheduler", **cogact._TRAINED}
-    plain = configured_loops(settings, 10, LoadOptions(sampler=sampler, steps=20)).others[f"{sampler}-20"]
+    plain = configured_loops(RESPACED, 10, LoadOptions(sampler=sampler, steps=20)).others[f"{sampler}-20"]
     noise = Noise(golden("cogact")["noise"], np.random.default_rng(0).standard_normal((20, 2, 6, 5), dtype=np.float32))
     obs = {"cognition": torch.from_numpy(golden("cogact")["cognition"])}
     found = eager_policy(module, own)(obs, noise).numpy()
     wanted = eager_policy(module, replace(own, sampler=plain))(obs, noise).numpy()
     assert np.abs(wanted).max() > 1
     np.testing.assert_allclose(found, np.clip(wanted, -1, 1), atol=1e-4 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("steps", "first", "stride"), [(10, 90, 10), (8, 91, 13), (6, 85, 17), (16, 90, 6), (1, 50, 0)]
+)
+def test_ddim_visits_the_timesteps_of_the_original(steps: int, first: int, stride: int, tmp_path: Path) -> None:
+    """``space_timesteps`` takes the smallest stride that gives so many; there is none for 16, where it fails."""
+    path = save_cogact(tmp_path / "run", weights_of("cogact"), {"own": {"action": {"q01": [-1] * 5, "q99": [1] * 5}}})
+    module, spec = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=steps))
+    own = spec if steps == 10 else spec.in_loop(f"ddim-{steps}")
+    timesteps = own.sampler.timesteps.tolist()
+    assert timesteps == [first - k * stride for k in range(steps)]
+    given = torch.from_numpy(golden("cogact")["cognition"])
+    x = torch.from_numpy(golden("cogact")["noise"])
+    found = eager_policy(module, own)({"cognition": given}, Noise(x.numpy())).numpy()
+    kept = np.cumprod([1 - min(1 - signal(t + 1) / signal(t), 0.999) for t in range(100)])
+    for t, after in zip(timesteps, [*timesteps[1:], None], strict=True):
+        there, then = kept[t], 1.0 if after is None else kept[after]
+        out = module(x, torch.tensor([t, t]), given)
+        x0 = (x - (1 - there) ** 0.5 * out) / there**0.5
+        x = then**0.5 * x0 + (1 - then) ** 0.5 * out
+    np.testing.assert_allclose(found, x.detach().numpy().clip(-1, 1), atol=1e-4)
+
+
+def signal(t: int) -> float:
+    """What is left of it before timestep t of 100, as the squared cosine has it."""
+    return float(np.cos((t / 100 + 0.008) / 1.008 * np.pi / 2) ** 2)
 
 
 def test_statistics_of_one_data_set_give_the_robots_actions(tmp_path: Path) -> None:

@@ -94,6 +94,8 @@ def test_the_sampler_and_the_lengths_are_what_is_asked_for(tmp_path: Path) -> No
     assert spec.sampler.timesteps.tolist() == [75, 50, 25, 0]
     assert [(each.name, each.steps) for each in spec.loops.values()] == [("ddpm", 100)]
     assert spec.observations["prefix_mask"].shape == (600,)
+    spec = load_checkpoint_policy(path, options=LoadOptions(sampler="ddim", steps=6))[1]
+    assert spec.in_loop("ddim-6").sampler.timesteps.tolist() == [85, 68, 51, 34, 17, 0]  # the original's --ddim-steps 6
     config = {name: value for name, value in tiny.CONFIG.items() if name != "future_action_window_size"}
     assert load_checkpoint_policy(tiny.save(tmp_path, config))[1].sample == (16, 7)
     assert find_family(path, "auto").name == find_family(path, "hybrid_vla").name == "hybrid_vla"
