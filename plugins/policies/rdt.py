@@ -34,6 +34,10 @@ from .rdt_cameras import Cameras, Pictures, find_cameras
 CONFIG, WEIGHTS, PICKLED = "config.json", "model.safetensors", "pytorch_model.bin"
 _MOST, _MOST_LAYERS, _MOST_DEPTH = 2**16, 512, 16
 """Sizes above these are no policy's. Whether the weights are there for them is asked later."""
+_REMEDY = (
+    "Give the folder as RDT's save_pretrained wrote it. For another network build it with the code that trained it, and"
+    " use ttscompile.compile_denoiser(module, spec)."
+)
 _USUAL_HZ = (1.0, 66.6)
 """Rates of control that RDT was trained with."""
 
@@ -199,7 +203,7 @@ class _Denoiser(nn.Module):
 def load(directory: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
     """Rebuild a policy from its directory; see ``Family.load``."""
     where = directory / CONFIG
-    settings = Settings(read_json(where), f"{where}: ", "Give the folder as RDT's save_pretrained wrote it.")
+    settings = Settings(read_json(where), f"{where}: ", _REMEDY)
     config = read_config(settings)
     scheduler = settings.part("noise_scheduler")
     scheduler.require(prediction_type="sample")

@@ -182,7 +182,11 @@ def _read_config(path: Path, hidden: int) -> tuple[ScaleDPConfig, int]:
 def _head_settings(path: Path) -> Settings:
     """The entries of the head: ``policy_head_config`` of a whole DexVLA's, or all of them."""
     entries = read_json(path / CONFIG)
-    where, remedy = f"{path / CONFIG}: ", "Give what DexVLA's training saved, its second or third stage."
+    where = f"{path / CONFIG}: "
+    remedy = (
+        "Give what DexVLA's training saved, its second or third stage. For another network build it with the code that"
+        " trained it, and use ttscompile.compile_denoiser(module, spec)."
+    )
     if entries.get("model_type") == "scale_dp_policy":
         return Settings(entries, where, remedy)
     whole = Settings(entries, where, remedy)

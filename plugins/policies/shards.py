@@ -8,7 +8,7 @@ import torch
 from safetensors import safe_open
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.saved_weights import require_memory_for, saved_size
+from ttscompile.frontends.saved_weights import names_of, require_memory_for, saved_size
 from ttscompile.frontends.settings import read_json
 
 WHOLE, INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -49,10 +49,22 @@ def _files(directory: Path) -> Mapping[str, Path]:
 def _take(file: Path, take: Callable[[Any, str], Taken], names: list[str] | None = None) -> dict[str, Taken]:
     """Something of each tensor of a file that is named, or of all."""
     if not file.is_file():
-        raise CheckpointError(f"{file}: no such file. Copy the directory whole.")
+        raise CheckpointError(f"{file}: no such file. {_remedy(file)}")
     try:
         with safe_open(file, "pt") as opened:
             return {name: take(opened, name) for name in (opened.keys() if names is None else names)}
     except Exception as error:  # what the reader raises depends on where the file is damaged
         what = "not a safetensors file, a truncated one, or one without the tensors that its index names"
         raise CheckpointError(f"{file}: {what}: {error!s:.300}. Copy it again.") from error
+
+
+def _remedy(missing: Path) -> str:
+    """What to do without these weights: transformers puts those of a training in folders, and once pickled them."""
+    directory = missing.parent
+    saved = sorted(each.name for each in directory.glob("checkpoint-*") if each.is_dir())
+    pickled = sorted(each.name for each in directory.glob("pytorch_model*.bin"))
+    if missing.name != WHOLE or not (saved or pickled):
+        return "Copy the directory whole."
+    if saved:
+        return f"Give a folder in it that the training saved: {names_of(saved)}."
+    return f"It has {names_of(pickled)}; safetensors are expected: load the model, and save_pretrained it again."
