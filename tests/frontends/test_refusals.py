@@ -37,6 +37,8 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
         rf"\(told by its entry algo_name\)\. If that is diffusion_policy: .*{OWN_MODULE}",
     ),
     ({"model.blocks.0.ffn.fc1.weight": W, "lang_adaptor.0.weight": W}, "weights of RDT", "config.json, and model"),
+    ({"state_adaptor.0.bias": W, "act_adaptor.0.bias": W}, "an RDT2 or H-RDT", "is the module, and what the vision"),
+    ({"encoder.state_adaptor.0.bias": W, "encoder.action_adaptor.0.bias": W}, "an RDT2 or H-RDT", OWN_MODULE),
     (
         {"model": {"action_model": {"net.blocks.0.attn.qkv.weight": W}, "projector": {"a": W}}},
         "CogACT",
@@ -64,7 +66,12 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     (
         {"state_dict": {"model.inner_model.blocks.0.mlp.router.weight": W}, "pytorch-lightning_version": "2"},
         "a mixture of experts",
-        "fixed choice for each step.*chosen by the data cannot",
+        r"howto/own-denoiser\.md\. The module has to compute all experts and weigh them",
+    ),
+    (
+        {"state_dict": {"model.inner_model.tok_emb.weight": W}, "hyper_parameters": {"kind": dict, "lr": 1e-4}},
+        r"a policy of k-diffusion \(BESO or MDT, say\)",
+        "an EDMDenoiser of its inner_model",
     ),
     ({"joint_blocks.0.context_block.attn.qkv.weight": W}, r"two streams \(MM-DiT\)", "becomes one block"),
     ({"transformer_blocks.0.attn.add_q_proj.weight": W}, r"two streams \(MM-DiT\)", "becomes one block"),
@@ -102,7 +109,7 @@ NAMES = [
     ("RobomimicImagePolicy", "a policy without diffusion"),
     ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("MyDiffusionUnetImagePolicy", r".*one of these renamed\. .* the name of that class at the end of cfg\.policy\._t"),
-    ("RobotPolicy", r".*kind\. If its class adds nothing .* cfg\.policy\._target_\. Otherwise: if it denoises: Build"),
+    ("RobotPolicy", r".*kind\. If its class adds nothing .* cfg\.policy\._target_\. Otherwise: Build"),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
 ]
 
@@ -132,6 +139,7 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["config.json", "checkpoints/step-1.pt"], r"a directory of checkpoints .told by checkpoints/step-1\.pt"),
     (["config.json=model_type=Gr00tN1d7", "model-00001.safetensors"], r"N1\.7 as NVIDIA saves it.*save_pretrained"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
+    (["config.json=act_adaptor=mlp3x_silu", "pytorch_model.bin"], rf"an RDT2 or H-RDT .*{OWN_MODULE}"),
     (["config.json=policy_head_type=unet_diffusion_policy", "model.safetensors"], "DexVLA.*whose head is a U-Net"),
     (
         ["config.json=model_type=xvla", "model.safetensors"],

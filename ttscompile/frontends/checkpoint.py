@@ -63,6 +63,7 @@ _STAND_INS: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
     *((_Node, f"omegaconf.nodes.{kind}Node") for kind in ("Any", "Boolean", "Float", "Integer", "String")),
     # What omegaconf notes beside the data is never read.
     *((_Inert, name) for name in ("omegaconf.base.Metadata", "omegaconf.base.ContainerMetadata", "typing.Any")),
+    *((_Inert, f"builtins.{name}") for name in _BUILTIN_TYPES),
     (_defaults, "collections.defaultdict"),
     (_load_type, "dill._dill._load_type"),
 ]

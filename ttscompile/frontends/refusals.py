@@ -16,8 +16,8 @@ from ..core.zip_files import open_zip
 from ..errors import CheckpointError
 from .settings import read_json
 
-_BUILD = "Build the network with the code that trained it and use ttscompile.compile_denoiser(module, spec)"
-_HEAD = f"{_BUILD}: the action head is the module, and what the vision-language model gives it are its observations."
+_BUILD = "Build the network with its code and use ttscompile.compile_denoiser(module, spec): docs/howto/own-denoiser.md"
+_HEAD = f"{_BUILD}. The action head is the module, and what the vision-language model gives it are its observations."
 _RENAMED = (
     "If its class adds nothing to the original's that changes actions, save it again with the name of that class at the"
     " end of cfg.policy._target_. Otherwise:"
@@ -26,6 +26,8 @@ _DITA = "Give the .pth file with the .hydra/config.yaml that its training wrote,
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
 _DPPO = f"{_BUILD}. Of one that is fine-tuned, the module takes actor_ft in the last steps, and actor before them."
+_EXPERTS = f"{_BUILD}. The module has to compute all experts and weigh them, in place of choosing rows of the data."
+_INNER_MODEL = f"{_BUILD}. The module is an EDMDenoiser of its inner_model."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
 _INNER = "Give the folder pretrained_model in it."
 _PUT = "Put model.safetensors beside the JSON files and statistics of a LeRobot policy {}, and convert that folder."
@@ -46,10 +48,7 @@ _BY_NAME = (
     (r"\.(npz|npy|zarr|txt|json|ya?ml|md)$", "no checkpoint", "Give the file or the folder that the training saved."),
 )
 """Of files that nothing inside tells of: sign in the name, what it is, remedy."""
-_WEIGHTS = (
-    "Weights do not say how they are connected. Convert what the training saved, which holds the configuration too; or"
-    " build the network, load them into it, and use ttscompile.compile_denoiser(module, spec)."
-)
+_WEIGHTS = f"Weights do not say how they are connected. If a configuration was saved, convert both. If not: {_BUILD}."
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,9 @@ POLICIES = (
     Refusal(
         r"transformer|unet",
         "a diffusion policy with another observation encoder than those that are read, or one of these renamed",
-        f"{_RENAMED} {_BUILD}, its observation encoder inside the module: hoisting takes it out of the loop.",
+        f"{_RENAMED} {_BUILD}. Its observation encoder belongs inside the module: hoisting takes it out of the loop.",
     ),
-    Refusal(r"", "a policy of its own kind", f"{_RENAMED} if it denoises: {_BUILD}."),
+    Refusal(r"", "a policy of its own kind", f"{_RENAMED} {_BUILD}."),
 )
 """By the class name of a configuration's ``policy``, in lower case."""
 
@@ -91,6 +90,7 @@ DIRECTORIES = (
     Refusal(r"^config\.json: model_type=eo1$", "an EO-1 as its authors save it", _TRAIN.format("eo1")),
     Refusal(r"^config\.json: dof_config=", "a Wall-X as its authors save it", _TRAIN.format("wall_x")),
     Refusal(r"^config\.json: vlm_name=", "an Evo-1 as its authors save it", _TRAIN.format("evo1")),
+    Refusal(r"^config\.json: act_adaptor=", "an RDT2 or H-RDT", _HEAD),
     Refusal(r"^config\.json: policy_head_type=unet", "a DexVLA or DiVLA whose head is a U-Net", _HEAD),
     Refusal(r"^(checkpoint-|step_)\w+/config\.json$", "a directory around checkpoints", "Give one of those in it."),
     Refusal(r"\.ckpt$|^checkpoints/[^/]+\.pt$", "a directory of checkpoints", "Give one of the files in it."),
@@ -124,6 +124,7 @@ STATES = (
     Refusal(r"^(x_embedder|llm_backbone\.x_embedder)\b", "a checkpoint of HybridVLA", _HYBRID_VLA),
     Refusal(r"^qwen_vl_interface\.", "a VLA-JEPA or another of starVLA as it is saved", _TRAIN.format("vla_jepa")),
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
+    Refusal(r"(^|\.)act(ion)?_adaptor\.", "an RDT2 or H-RDT", _HEAD),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
     Refusal(
         r"^(joint_cmps|gating_network)\.", "a policy of VDD, a mixture of experts of one evaluation each", _NO_LOOP
@@ -132,12 +133,8 @@ STATES = (
     Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
     Refusal(r"(^|\.)(noise|time)_net\.", "a checkpoint of DiT-Policy", "Put its agent_config.yaml beside it."),
-    Refusal(
-        r"\.router\.|\.experts?\.\d+\.",
-        "a mixture of experts (MoDE, say)",
-        f"{_BUILD}. Experts chosen by the noise level alone become a fixed choice for each step if the module makes it"
-        " so; experts chosen by the data cannot be compiled.",
-    ),
+    Refusal(r"\.router\.|\.experts?\.\d+\.", "a mixture of experts (MoDE, say)", _EXPERTS),
+    Refusal(r"(^|\.)inner_model\.", "a policy of k-diffusion (BESO or MDT, say)", _INNER_MODEL),
     Refusal(
         r"\.add_[qkv]_proj\.|\.context_block\.|\.txt_(mlp|attn)",
         "a transformer of two streams (MM-DiT)",
