@@ -5,6 +5,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -156,6 +157,30 @@ class Normalized(nn.Module):
     def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         h = self.norm(self.first(sample.transpose(1, 2))) * obs.mean((1, 2))[:, None, None]
         return self.last(torch.tanh(h)).transpose(1, 2)
+
+
+class Masked(nn.Module):
+    """Attention without a residual, written out, with a mask of infinite numbers that stands in a buffer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.qkv, self.last = nn.Linear(2, 12), nn.Linear(4, 2)
+        self.register_buffer("seen", torch.ones(4, 4).tril())
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        q, k, v = (self.qkv(sample) * obs.mean((1, 2))[:, None, None]).chunk(3, -1)
+        scores = (q @ k.transpose(1, 2)).masked_fill(self.seen == 0, float("-inf"))
+        return self.last(torch.softmax(scores, -1) @ v)
+
+
+def test_infinite_numbers_of_a_mask_are_no_numbers_of_a_layer(tmp_path: Path) -> None:
+    """Else its record were NaN, numpy warned, and this were the first layer that differs whatever is broken."""
+    torch.manual_seed(0)
+    program = ttscompile.compile_denoiser(Masked().eval(), spec(), tmp_path)
+    golden = load_golden(load_artifact(tmp_path))
+    assert golden.layers is not None and golden.layers.shape[1] == len(layers(program))
+    assert np.isfinite(golden.layers).all()
+    assert ttscompile.verify(tmp_path).first_failure is None
 
 
 def test_a_layer_that_gives_several_values_is_not_recorded() -> None:

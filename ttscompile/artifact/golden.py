@@ -270,9 +270,9 @@ def project(array: Array, axis: int | None) -> FloatArray:
     """Random projections of each stream, float32 ``[B, DIGITS]``, whose norm is about the stream's.
 
     Args:
-        axis: of the streams; None for one stream.
+        axis: of the streams; None for a layer, as one stream, in which infinite numbers, of a mask, count as zeros.
     """
-    rows = array[None] if axis is None else np.moveaxis(array, axis, 0)
+    rows = np.where(np.isinf(array), 0, array)[None] if axis is None else np.moveaxis(array, axis, 0)
     rows = rows.reshape(len(rows), -1).astype(np.float64)
     return np.asarray(rows @ _signs(rows.shape[1]) / np.sqrt(DIGITS), np.float32)
 
