@@ -63,6 +63,7 @@ def test_the_users_module_is_not_touched() -> None:
             lambda y, t, o: y if o.sum() > 0 else -y,
             r"Denoiser at test_export.py:\d+ in <lambda>: what it does depends on",
         ),
+        (lambda y, t, o: y if torch.equal(o, o + 1) else -y, r"values of a tensor: .* by torch\.equal, .*torch\.where"),
         (lambda y, t, o: y * float(o.sum()), r"the values of a tensor: .* by a number taken out of one .*torch.where"),
         (lambda y, t, o: y * o.sum().item(), r"%item \(test_export.py:\d+ in \S+\): .* by a number taken out of one"),
         (lambda y, t, o: (y, y), "returns 2 values"),

@@ -5,11 +5,12 @@ import traceback
 from pathlib import PurePath
 
 import torch
+from torch._subclasses.fake_tensor import DataDependentOutputException
 
 ON_VALUES = (
-    "what it does depends on the values of a tensor: by an if, a while or an assert on one, by a number taken out of"
-    " one (.item(), .tolist(), float(), int()), or by a mask that picks entries (x[mask]). In place of an if or a mask"
-    " write torch.where, compute with tensors, and leave checks out."
+    "what it does depends on the values of a tensor: by an if, a while or an assert on one, by torch.equal, by a number"
+    " taken out of one (.item(), .tolist(), float(), int()), or by a mask that picks entries (x[mask]). In place of an"
+    " if or a mask write torch.where, compute with tensors, and leave checks out."
 )
 KEEPS = (
     " It keeps something of one call for the next, and a denoiser must not. Compute it in every call: what depends on"
@@ -23,7 +24,7 @@ def cause_of(error: Exception, called: str) -> str:
     """Where it is, what is wrong and what to do, and the first of torch's words, or all where nothing is known."""
     place = innermost("".join(traceback.format_tb(error.__traceback__)))
     said = f"{type(error).__name__}: {sentence(_ADVICE.split(str(error))[0])}"
-    if "data-dependent expression" in said:
+    if "data-dependent expression" in said or isinstance(error, DataDependentOutputException):
         return f"at {place}: {ON_VALUES}\nIn torch's words: {sentence(said.partition(' (unhinted')[0])}"
     general = "A denoiser must be one step (no sampling loop), without data-dependent control flow, for any batch size."
     return f"at {place}: {said}\nIt was called with {called}. {general}"
