@@ -118,3 +118,46 @@ def test_a_pass_that_breaks_the_program_is_named() -> None:
     _, program = compiled("tokens")
     with pytest.raises(PassError, match=r"^after Breaks: denoiser: constant %\S+ has no value"):
         _pass(Breaks(), program, lambda stage, notes: None)
+
+
+class Experts(nn.Module):
+    """Feed-forward networks of which a router takes two by the noise level, as MoDE's does, and weighs all instead."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.enter, self.leave, self.router = nn.Linear(2, 8), nn.Linear(8, 2), nn.Linear(1, 4)
+        self.experts = nn.ModuleList(nn.Linear(8, 8) for _ in range(8))
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        chance = self.router(timestep[:, None] / 5).softmax(-1)
+        taken = chance.topk(2)
+        weight = torch.zeros_like(chance).scatter(1, taken.indices, taken.values)
+        x = self.enter(sample) + obs.mean((1, 2))[:, None, None]
+        for layer in (self.experts[:4], self.experts[4:]):
+            x = x + sum(weight[:, i, None, None] * expert(x).tanh() for i, expert in enumerate(layer))
+        return self.leave(x)
+
+
+class Guided(Experts):
+    """Classifier-free guidance: with the condition and without it, on twice the batch."""
+
+    def forward(self, sample: torch.Tensor, timestep: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        given = torch.cat([sample, sample]), torch.cat([timestep, timestep]), torch.cat([obs, 0 * obs])
+        with_condition, without = super().forward(*given).chunk(2)
+        return without + 2 * (with_condition - without)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Experts, Guided])
+def test_weighed_experts_and_guidance_have_the_blocks_of_the_network(kind: type[Experts]) -> None:
+    """``docs/howto/own-denoiser.md`` says how both are written; experts are weighed by tables."""
+    torch.manual_seed(0)
+    module = kind().eval()
+    program = transform(module, toy_spec(obs=(3, 7)))
+    assert [block.kind for block in program.blocks] == ["feed_forward"] * 2
+    assert not any("topk" in node.op for piece in program.pieces.blocks for node in piece.graph.nodes)
+    for k, t in enumerate(program.spec.sampler.timesteps):
+        sample, obs = torch.randn(STREAMS, 4, 2), torch.randn(STREAMS, 3, 7)
+        with torch.no_grad():
+            expected = module(sample, torch.full((STREAMS,), int(t)), obs)
+        torch.testing.assert_close(evaluate_pieces(program, sample, obs, k), expected, rtol=1e-5, atol=1e-5)

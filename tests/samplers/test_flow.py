@@ -1,5 +1,6 @@
 """Flow-matching tables against plain integration in float64."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,21 @@ def test_tables_integrate(start: float, end: float, method: Any, integrate: Any,
     if steps > 1:
         other = integrate(NOISE, times[::-1], velocity)
         assert np.abs(expected - other).max() > 0.1  # the direction matters to these numbers
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_a_bound_of_the_last_step_alone_is_a_bound_of_the_finished_sample(steps: int) -> None:
+    """The table that ``docs/howto/own-denoiser.md`` makes of two; with a bound at all steps the loop is another."""
+    free, bounded = (flow_matching_table(steps, start=1.0, end=0.0, clip=clip) for clip in (None, 0.5))
+    last: dict[str, Any] = {
+        name: np.append(getattr(free, name)[:-1], getattr(bounded, name)[-1]) for name in free.COLUMNS
+    }
+    table = replace(bounded, **last)
+    expected = np.clip(euler(NOISE, np.linspace(1, 0, steps + 1), velocity), -0.5, 0.5)
+    assert table.bound == 0.5
+    assert_equal_but_for_rounding(by_table(table, NOISE, velocity), expected, terms=2 * steps)
+    if steps > 1:
+        assert np.abs(by_table(bounded, NOISE, velocity) - expected).max() > 0.01
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7])
