@@ -284,6 +284,12 @@ def _schedule(path: Path, saved: Mapping[str, Any]) -> tuple[list[float], list[f
         if not isinstance(value, Tensor) or value.ndim != 1 or not 2 < len(value) <= MOST_TIMESTEPS:
             shown = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else "none"
             raise CheckpointError(f"{path}: {name} is a vector of the timesteps; found {shown}. {_REMEDY}")
+        if value.dtype not in (torch.float32, torch.float64):
+            raise CheckpointError(
+                f"{path}: {name} is a {value.dtype} tensor; expected torch.float32, since a schedule that is rounded so"
+                " is another one. Make the Model_Cond_Diffusion anew with the betas of its training, load the weights"
+                f" {_NET}* into it, and save that."
+            )
         found.append(value.double())
     betas, signal = found[0] ** 2, found[1]
     if betas.shape != signal.shape or not ((betas > 0) & (betas < 1) & (signal > 0) & (signal < 1)).all():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,18 @@ from ttscompile.frontends.settings import Settings, read_json
 
 from .flax_files import Tree, for_torch, leaves, read_tree
 from .instruction import encoder_folders, task_tokens
-from .networks.octo_network import MASK, PADDING, TOKENS, Head, Octo, OctoConfig, OctoDenoiser, OctoObserved, Stem
+from .networks.octo_network import (
+    DEPTH,
+    MASK,
+    PADDING,
+    TOKENS,
+    Head,
+    Octo,
+    OctoConfig,
+    OctoDenoiser,
+    OctoObserved,
+    Stem,
+)
 from .networks.t5 import Words
 from .octo_loop import loop_table, schedule
 from .quantiles import STATISTICS, read_moments
@@ -117,10 +129,10 @@ def _config(settings: Settings, example: _Example, weights: Mapping[str, Tensor]
     heads = layers.number("num_attention_heads", most=_MOST)
     if width % heads:
         raise layers.refusal("num_attention_heads", f"one that divides {width}, token_embedding_size")
-    layers.require(add_position_embedding=False)
+    _built(layers).require(add_position_embedding=False)
     readouts = model.part("readouts")
     if len(readouts.values) != 1:
-        raise model.refusal("readouts", "one, for the actions")
+        raise _built(model).refusal("readouts", "one, for the actions")
     readout = str(next(iter(readouts.values)))
     stems = _stems(model, example)
     unknown = sorted(set(without) - {key for stem in stems.values() for key in stem.keys})
@@ -161,6 +173,11 @@ def _of_class(entry: Any, where: Settings, name: str, *classes: str) -> tuple[st
     return str(kind), whole.part("kwargs")
 
 
+def _built(own: Settings) -> Settings:
+    """The same where what is refused is another network, and nothing is wrong with the folder."""
+    return replace(own, remedy=_BUILD)
+
+
 def _stems(model: Settings, example: _Example) -> dict[str, Stem]:
     """The image tokenizers by name."""
     tokenizers = model.part("observation_tokenizers")
@@ -171,7 +188,7 @@ def _stems(model: Settings, example: _Example) -> dict[str, Stem]:
         own = _of_class(entry, tokenizers, str(name), "ImageTokenizer")[1]
         for key in ("task_film_keys", "use_token_learner"):
             if own.values.get(key):
-                raise own.refusal(key, "none (FiLM and token learners are not rebuilt here)")
+                raise _built(own).refusal(key, "none (FiLM and token learners are not rebuilt here)")
         keys = _matching(own, "obs_stack_keys", ["image_.*", "depth_.*"], example.observation)
         if keys:  # the original passes over a tokenizer that reads nothing
             found[str(name)] = _stem(own, example, keys)
@@ -182,7 +199,7 @@ def _stems(model: Settings, example: _Example) -> dict[str, Stem]:
 
 def _stem(own: Settings, example: _Example, keys: tuple[str, ...]) -> Stem:
     kind, encoder = _of_class(own.values.get("encoder"), own, "encoder", *_PATCHES)
-    encoder.require(use_film=False)
+    _built(encoder).require(use_film=False)
     sizes = {example.image(key)[:2] for key in keys}
     if len(sizes) != 1:
         raise own.error(f"{', '.join(keys)} have several sizes in {EXAMPLE}; expected one")
@@ -239,12 +256,12 @@ def _words(model: Settings, example: _Example, weights: Mapping[str, Tensor]) ->
     """T5's sizes are those of its weights, since the original takes them from a model on the hub, of this name."""
     tokenizers = model.part("task_tokenizers")
     if len(tokenizers.values) != 1:
-        raise model.refusal("task_tokenizers", "one, of language")
+        raise _built(model).refusal("task_tokenizers", "one, of language")
     name, entry = next(iter(tokenizers.values.items()))
     own = _of_class(entry, tokenizers, str(name), "LanguageTokenizer")[1]
     encoder = own.values.get("encoder")
     if not isinstance(encoder, str) or "t5" not in encoder:
-        raise own.refusal("encoder", "a T5: another is not rebuilt here")
+        raise _built(own).refusal("encoder", "a T5: another is not rebuilt here")
     length = example.task.get("language_instruction.input_ids", ())
     if len(length) != 2 or not 1 <= length[1] <= _MOST_TOKENS:
         raise example.error("its task has no language_instruction.input_ids [1, L]")
@@ -271,7 +288,7 @@ def _words(model: Settings, example: _Example, weights: Mapping[str, Tensor]) ->
 def _head(model: Settings, readout: str) -> Head:
     heads = model.part("heads")
     kwargs = _of_class(heads.values.get("action"), heads, "action", "DiffusionActionHead")[1]
-    kwargs.require(readout_key=f"readout_{readout}", use_map=False, use_layer_norm=True)
+    _built(kwargs).require(readout_key=f"readout_{readout}", use_map=False, use_layer_norm=True)
     bound = kwargs.values.get("max_action", 5.0)
     if type(bound) not in (int, float) or not 0 < bound <= _MOST:
         raise kwargs.refusal("max_action", "a positive number")
@@ -314,7 +331,8 @@ def _observed(config: OctoConfig, example: _Example, told: bool) -> dict[str, Ob
     found = {}
     for key in (key for stem in config.stems.values() for key in stem.keys):
         height, width, channels = example.image(key)
-        found[key] = ObservationSpec((config.window, channels, height, width), bounds=(0.0, 1.0))
+        bounds = None if key.startswith(DEPTH) else (0.0, 1.0)
+        found[key] = ObservationSpec((config.window, channels, height, width), bounds=bounds)
     if config.window > 1:
         found[PADDING] = ObservationSpec((config.window,), dtype="bool", window=False, bounds=(0.0, 1.0))
     if told:
@@ -328,7 +346,7 @@ def _task(directory: Path, settings: Settings, words: Words, options: LoadOption
     """Tokens and mask of the instruction that is compiled in; the original reads the padding's, too."""
     entry = settings.values.get("text_processor")
     own = _of_class(entry, settings, "text_processor", "HFTokenizer")[1]
-    own.require(encode_with_model=False)
+    _built(own).require(encode_with_model=False)
     name, file = own.text("tokenizer_name", "t5-base", _MOST_LETTERS), tokenizer_file(directory, options.encoders)
     folder = None if file is None else file.parent
     tokens = task_tokens(options.task or "", name, folder, words.length, words.vocabulary)

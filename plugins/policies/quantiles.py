@@ -80,10 +80,11 @@ def read_statistics(path: Path, actions: int, grippers: tuple[int, ...], state: 
 
 def read_moments(where: Path, actions: int) -> tuple[str, Affine | None]:
     """The one data set of Octo's, whose actions have mean 0 and deviation 1; else they stay so, with a warning."""
-    sets = read_json(where) if where.is_file() else {}
+    sets = {} if not where.is_file() or _is_null(where) else read_json(where)
     sets = {"its own": sets} if "action" in sets else sets  # of a training on one
     if len(sets) != 1:
-        there = f"holds {len(sets)} data sets ({names_of(sorted(sets))})" if where.is_file() else "is not there"
+        named = names_of(sorted(sets)) or "none"
+        there = f"holds {len(sets)} data sets ({named})" if where.is_file() else "is not there"
         warnings.warn(
             f"{where} {there}: actions have mean 0 and deviation 1, as the network makes them. For those of a robot,"
             " put a file there that holds its data set alone, and convert again.",
@@ -97,6 +98,12 @@ def read_moments(where: Path, actions: int) -> tuple[str, Affine | None]:
         raise settings.refusal("std", "numbers that are not negative")
     deviation = np.maximum(deviation, _LEAST_WIDTH)
     return name, Affine(np.where(mask, 1 / deviation, 1.0), np.where(mask, -mean / deviation, 0.0))
+
+
+def _is_null(where: Path) -> bool:
+    """Whether a model without statistics was saved, of which Octo writes this."""
+    with where.open("rb") as file:
+        return file.read(9).strip() == b"null"
 
 
 def _range(where: Path, name: str, entry: Any, part: str, count: int) -> Range:

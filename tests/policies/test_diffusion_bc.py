@@ -158,6 +158,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"alphabar_t": torch.zeros(2, 2)}, r"alphabar_t is a vector of the timesteps; found shape \(2, 2\)"),
     ({"alphabar_t": torch.zeros(11)}, "no schedule of DDPM"),
     ({"sqrt_beta_t": torch.full((12,), 0.1)}, "no schedule of DDPM"),
+    ({"alphabar_t": torch.full((11,), 0.5).half()}, r"alphabar_t is a torch\.float16 tensor; expected torch\.float32"),
     ({"kmeans": torch.zeros(2)}, "its entry kmeans is none of a Model_Cond_Diffusion's"),
     ({"nn_model.fc1.0.model.1.bias": torch.zeros(24, dtype=torch.int64)}, r"is a torch\.int64 tensor"),
 ]

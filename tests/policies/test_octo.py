@@ -3,6 +3,8 @@
 import builtins
 import struct
 import warnings
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -189,9 +191,30 @@ def test_whose_actions(saved: Path, tmp_path: Path) -> None:
     change(path, lambda entries: entries.update(a={"action": entries.pop("action")}, b={}))
     with pytest.warns(UserWarning, match="holds 4 data sets .*actions have mean 0 and deviation 1"):
         assert load_checkpoint_policy(folder)[1].chunk.normalizer is None
+    path.write_text("null")  # which Octo writes of a model without statistics
+    with pytest.warns(UserWarning, match=r"holds 0 data sets \(none\): actions have mean 0 and deviation 1"):
+        assert load_checkpoint_policy(folder)[1].chunk.normalizer is None
     path.unlink()
     with pytest.warns(UserWarning, match="is not there"):
         load_checkpoint_policy(folder)
+
+
+def test_depth_images_are_floats_that_the_original_takes_for_pixels(tmp_path: Path) -> None:
+    """It divides whatever a tokenizer stacks by 127.5, so pixels in the place of a depth image act as pixels do."""
+    folder = unpack(tmp_path) / "one"
+    example = folder / "example_batch.msgpack"
+    batch = msgpack.unpackb(example.read_bytes())
+    batch["observation"]["depth_primary"] = batch["observation"].pop("image_primary")
+    example.write_bytes(msgpack.packb(batch))
+    entry = ("model", "observation_tokenizers", "primary", "kwargs")
+    change(folder / "config.json", lambda entries: reduce(getitem, entry, entries).pop("obs_stack_keys"))
+    module, spec = load_checkpoint_policy(folder)
+    seen = {key: torch.from_numpy(shown("one", "all")[key]) for key in (TOKENS, MASK)}
+    seen["depth_primary"] = 255 * torch.from_numpy(shown("one", "all")["image_primary"])
+    assert list(spec.observations) == ["depth_primary", TOKENS, MASK]
+    assert spec.observations["depth_primary"].bounds is None
+    found = eager_policy(module, spec)(seen, noise("one", "all")).numpy()
+    assert np.abs(spec.chunk.unnormalized(found) - actions("one", "all")).max() < ALLOWED
 
 
 REFUSED: Refusals = {
@@ -201,7 +224,7 @@ REFUSED: Refusals = {
         ({"args": [3]}, "args is .3.; expected arguments by name"),
     ],
     "config.json/model/heads/action/kwargs": [
-        ({"use_map": True}, r"use_map is True; expected false: another is not rebuilt here"),
+        ({"use_map": True}, r"use_map is True; expected false: another is not rebuilt here\. Build the network"),
         ({"readout_key": "obs"}, r"readout_key is 'obs'; expected readout_action"),
         ({"max_action": 0}, "max_action is 0; expected a positive number"),
         ({"time_dim": 7}, "time_dim is 7; expected an even number"),
@@ -225,8 +248,8 @@ REFUSED: Refusals = {
         ({"name": "LowdimObsTokenizer"}, "primary is a LowdimObsTokenizer; expected ImageTokenizer")
     ],
     "config.json/model": [
-        ({"task_tokenizers": {}}, "task_tokenizers is {}; expected one, of language"),
-        ({"readouts": {"action": 1, "value": 1}}, "readouts is .*; expected one, for the actions"),
+        ({"task_tokenizers": {}}, r"task_tokenizers is {}; expected one, of language\. Build the network"),
+        ({"readouts": {"action": 1, "value": 1}}, r"readouts is .*; expected one, for the actions\. Build the network"),
         ({"max_horizon": 0}, "max_horizon is 0; expected a positive whole number"),
         ({"token_embedding_size": 34}, "num_attention_heads is 4; expected one that divides 34"),
     ],

@@ -22,7 +22,8 @@ from .layers import split
 from .t5 import T5, Words, word_distances
 
 TOKENS, MASK, PADDING = "language_instruction.input_ids", "language_instruction.attention_mask", "timestep_pad_mask"
-
+DEPTH = "depth_"
+"""How keys of depth images begin: floats, which the original takes for pixels of 0..255."""
 _EPSILON, _GROUPS = 1e-6, 32
 """Of flax's norms."""
 _COLOURS = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
@@ -198,7 +199,8 @@ class _Transformer(nn.Module):
         words = self._placed(f"task_{config.words.name}", known)
         groups = []
         for name, stem in config.stems.items():
-            images = torch.cat([observations[key] for key in stem.keys], 2)
+            given = [(key, observations[key]) for key in stem.keys]
+            images = torch.cat([each / 255 if key.startswith(DEPTH) else each for key, each in given], 2)
             seen = self.get_submodule(f"observation_tokenizers_{name}")(images)
             groups.append(self._placed(f"obs_{name}", seen))
         if config.repeated:
