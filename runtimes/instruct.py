@@ -34,8 +34,11 @@ class Instruct:
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
         """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is."""
-        if not isinstance(obs, Mapping) or TASK not in obs or self._told.tokens in obs:
+        if not isinstance(obs, Mapping) or self._told.tokens in obs:
             return obs
+        if TASK not in obs:
+            expected = f"a text, 'pick up the cup' say, or its tokens, {self._told.tokens!r} and {self._told.mask!r}"
+            raise ObservationError(f"the observation has no {TASK!r}; expected {expected}.")
         rest = {key: value for key, value in obs.items() if key != TASK}
         task = obs[TASK]
         own = (rest[key] for key in self._keys if key in rest)

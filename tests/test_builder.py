@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from rich.console import Console
 
 import ttscompile
 from tests.artifact.folders import contents
@@ -21,7 +23,7 @@ from ttscompile import builder
 from ttscompile.artifact.files import aside
 from ttscompile.artifact.load import load_artifact, read_manifest
 from ttscompile.calibration.state import FILE as STATE
-from ttscompile.cli import main
+from ttscompile.cli import main, summary
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError, CalibrationError, CalibrationFailedError, TtscompileError
 from ttscompile.runtimes.executor import settings
@@ -239,7 +241,9 @@ def test_the_rate_of_training_is_kept_and_decides_the_deadline(
 
 
 @pytest.mark.slow
-def test_a_checkpoint_becomes_a_policy(one_layer_checkpoint: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_becomes_a_policy(
+    one_layer_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The whole command, on one layer of the Push-T policy; and what it says is what it wrote."""
     draw = np.random.default_rng(0)
     walks = np.cumsum(draw.normal(0, 4, (24, 1, 20)), 0) + draw.uniform(200, 300, (24, 1, 20))
@@ -256,6 +260,11 @@ def test_a_checkpoint_becomes_a_policy(one_layer_checkpoint: Path, tmp_path: Pat
     (chosen,) = (row for row in record["frontier"] if row["name"] == "schedule")
     told = f"Chosen among {len(record['frontier'])} plans: {chosen['told']}"
     assert told in " ".join(result.output.split())
+    instructed = "observation['task'] = "
+    assert instructed not in result.output
+    monkeypatch.setattr(summary, "instruct_of", lambda each: each is artifact)  # of a policy that is told its task
+    summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1)
+    assert instructed in printed.getvalue()
     assert not (tmp_path / "compiled" / STATE).exists()
 
 

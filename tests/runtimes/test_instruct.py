@@ -59,7 +59,8 @@ def test_an_artifacts_own_tokenizer_is_read_when_a_text_comes(spec: Any, tmp_pat
     own: Any = SimpleNamespace(manifest=SimpleNamespace(spec=spec), tokenizer=read)
     instruct = instruct_of(own)
     assert instruct is not None
-    assert instruct({"state": STATE}) == {"state": STATE} and not reads
+    known = {"state": STATE, "tokens": np.ones((1, 3), np.int64)}
+    assert instruct(known) is known and not reads
     with pytest.raises(ArtifactChangedError, match="replaced"):
         instruct({"state": STATE, "task": "left"})
     assert instruct({"state": STATE, "task": "left"})["tokens"].tolist() == [[2, 0, 0]]
@@ -87,7 +88,11 @@ def test_a_frame_has_no_axis_of_streams(instruct: Instruct) -> None:
 def test_what_has_no_text_or_has_tokens_is_left_as_it_is(instruct: Instruct) -> None:
     for frame in ({"state": STATE}, {"task": "push", "tokens": np.ones(3, np.int64)}):
         assert instruct.of_frame(frame) is frame
-        assert instruct(frame) is frame
+    assert instruct(frame) is frame
+    with pytest.raises(
+        ObservationError, match="has no 'task'; expected a text, .*, or its tokens, 'tokens' and 'mask'"
+    ):
+        instruct({"state": STATE})
 
 
 def test_threads_get_the_tokens_of_their_own_text(instruct: Instruct) -> None:

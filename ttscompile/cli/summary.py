@@ -13,6 +13,7 @@ from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms
 from ttscompile.report import Table, facts, usage
 from ttscompile.report.summary import document
+from ttscompile.runtimes.instruct import instruct_of
 
 
 def print_artifact(artifact: Artifact, as_json: bool) -> None:
@@ -83,6 +84,7 @@ def print_frontier(artifact: Artifact, directory: Path, output: Console, threads
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
         "    policy.reset()  # a new episode",
+        *(["    observation['task'] = 'pick up the cup'  # say"] if instruct_of(artifact) else []),
         "    actions = policy.predict_action(observation)['action']",
         "",
         one_line(fingerprint()),
