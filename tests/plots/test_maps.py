@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
+from matplotlib.text import Annotation, Text
 from PIL import Image
 
 from ttscompile.core.lattice import Source
@@ -60,9 +61,20 @@ def test_steps_are_whole_numbers(steps: int) -> None:
 
 def test_a_name_that_is_moved_from_its_point_is_led_to_it() -> None:
     near = [Point("s", name, 0.1 + 1e-4 * n, 5.0 + n / 100) for n, name in enumerate("ab")]
-    texts = frontier_of(near).axes[0].texts
-    assert [text.get_text() for text in texts] == ["a", "b"]
-    assert [isinstance(text, Annotation) and text.arrow_patch is not None for text in texts] == [False, True]
+    texts = frontier_of([*near, Point("s", "c", 0.01, 50.0)]).axes[0].texts
+    assert [text.get_text() for text in texts] == ["a", "b", "c"]
+    assert [isinstance(text, Annotation) and text.arrow_patch is not None for text in texts] == [False, True, False]
+
+
+def test_names_on_both_sides_of_their_points_leave_each_other_room() -> None:
+    """That of the last point stands to its left, where that of the point before it is."""
+    points = [
+        Point("s", "a", 0.2, 9.5),
+        Point("s", "schedule", 0.0878, 20.2),
+        Point("s", "original.12@fp32", 0.0863, 26.8),
+    ]
+    boxes = [Text.get_window_extent(text) for text in frontier_of(points).axes[0].texts]  # without the line to a point
+    assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]
 
 
 def test_plans_of_one_distance_are_beside_each_other_and_no_tick_has_the_label_of_another() -> None:

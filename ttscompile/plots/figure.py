@@ -68,8 +68,14 @@ def plain_powers(axis: Axis) -> None:
 
 def beside(place: float, name: str, shift: float = 0.0) -> dict[str, Any]:
     """How to write a name beside its point: to its right, or where that would leave the frame, to its left."""
-    left = place + _CHARACTER * len(name) > 1
+    left = covered(place, name)[0] < place
     return {"xytext": (-5 if left else 5, shift), "textcoords": "offset points", "ha": "right" if left else "left"}
+
+
+def covered(place: float, name: str) -> tuple[float, float]:
+    """From where to where such a name goes, as shares of the axis."""
+    long = _CHARACTER * len(name)
+    return (place - long, place) if place + long > 1 else (place, place + long)
 
 
 def require_picture_name(path: Path) -> None:

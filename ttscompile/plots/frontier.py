@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.spec import FloatArray
 from ..measure.points import MeasuredPoint, Point
-from .figure import beside, new_figure, plain_powers, with_grid
+from .figure import beside, covered, new_figure, plain_powers, with_grid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,11 +54,13 @@ def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: st
     first, last = (log(end([p.latency_ms for p in shown], default=1.0)) for end in (min, max))
     told = shown if len(shown) <= MOST_NAMES else [p for p in shown if p in efficient]
     several = len({p.name for p in told}) < len(told)  # strategies have a plan of the same name each
-    for i, p in enumerate(told):
-        apart = [(log(p.latency_ms / other.latency_ms), log(p.distance / other.distance)) for other in told[:i]]
-        above = 4 + 12 * sum(abs(x) < 0.15 and abs(y) < 0.2 for x, y in apart)
+    taken = list[tuple[float, float, float]]()  # from where to where a name goes, and at which height
+    for p in told:
         place = (log(p.latency_ms) - first) / ((last - first) or 1.0)
         name = f"{p.series} {p.name}" if several else p.name
+        (left, right), high = covered(place, name), log(p.distance)
+        above = 4 + 15 * sum(left < b and a < right and abs(high - y) < 0.2 for a, b, y in taken)
+        taken.append((left, right, high))
         led: Any = {"arrowstyle": "-", "color": "#999999", "linewidth": 0.5} if above > 4 else None
         axes.annotate(name, (p.latency_ms, p.distance), fontsize=8, arrowprops=led, **beside(place, name, above))
     best = [point for point in efficient if point.distance > ROUNDING]
