@@ -296,12 +296,21 @@ def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
     assert all(row["low"] <= row["points"] <= row["high"] for row in plans)
 
 
+def headings(page: Path) -> set[str]:
+    """What a link to a section of a page ends with."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", each) for each in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+    return {re.sub(r"[^\w\- ]", "", each).strip().lower().replace(" ", "-") for each in plain}
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     broken = []
     for page in PAGES:
-        for link in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
-            if "://" not in link and not (page.parent / link).exists():
-                broken.append(f"{page.relative_to(ROOT)}: {link}")
+        for link, section in re.findall(r"\]\(([^)#\s]*)(?:#([^)]*))?\)", page.read_text()):
+            there = page.parent / link if link else page
+            unknown = there.suffix == ".md" and section and there.exists() and section not in headings(there)
+            if "://" not in link and (unknown or not there.exists()):
+                broken.append(f"{page.relative_to(ROOT)}: {link}#{section}")
     assert broken == []
 
 
