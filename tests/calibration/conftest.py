@@ -26,8 +26,8 @@ def _short_search() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trials, "MOST_DRAWS", trials.DRAWS)
-        patch.setattr(step_counts, "FEW", 9)
-        patch.setattr(tts, "DISTANCES", (1,))
+        patch.setattr(step_counts, "MOST_PLACEMENTS", 9)
+        patch.setattr(tts, "MOVED_BY", (1,))
         patch.setattr(regression, "EPOCHS", 10)
         yield
 

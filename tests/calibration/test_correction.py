@@ -87,7 +87,7 @@ def test_it_reads_the_observation_where_that_helps_on_other_episodes(make_task: 
         min(fitted(task, two, reads).error(two, held_out) for two in (early, late)) for reads in (False, True)
     )
     assert task.whole.reads(2) == (reading < blind)
-    correction = task.whole.correction([0, steps - 2])
+    correction = task.whole.correction_of(task.whole.plan([0, steps - 2]))
     assert correction is not None
     assert (correction.reads > 0) == task.whole.reads(2)
 

@@ -116,7 +116,7 @@ def test_errors_are_of_calls_with_the_same_noise(trials: Trials, compiled: Path)
         episode = trials.episodes[sample.stretches[stretch, 0]]
         obs = {key: array[row : row + 1] for key, array in episode.observations.items()}
         for draw in range(DRAWS):
-            noise = trials.noise(trials.artifact.manifest.spec, [trials.key(HELD_OUT, stretch, row, draw)])
+            noise = trials.noise(trials.artifact.manifest.spec, [trials.noise_key(HELD_OUT, stretch, row, draw)])
             made = []
             for each in (plan, "dense"):
                 policy.reset()

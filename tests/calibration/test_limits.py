@@ -27,12 +27,13 @@ from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules
-from ttscompile.calibration.strategies import FITTED, NAMES, strategy_of
+from ttscompile.calibration.strategies import CORRECTING, NAMES, strategy_of
 from ttscompile.calibration.targets import draw_calls, with_targets
 from ttscompile.calibration.trials import ANSWERED_BY
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.pool import Here
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.runtimes.runtime import Runtime
 from ttscompile.trajectories import load_trajectories
@@ -99,7 +100,7 @@ def test_a_limit_holds_within_an_interval(
         found, _, stopped = search_plan(search, clock)
         assert np.count_nonzero(found.schedule == Source.COMPUTE) <= 34
         assert (stopped == "time limit") == (name not in ("interval", "deepcache"))  # which have one candidate
-    more = name in FITTED or strategy_of(name).uses_pruner
+    more = name in CORRECTING or strategy_of(name).uses_pruner
     assert clock.now <= limit + (2 + more) * 480
 
 
@@ -130,12 +131,12 @@ def test_when_half_of_the_time_is_over_no_more_targets_are_made_than_needed(
     state, fresh, clock = StateFile(tmp_path, {}), StateFile(tmp_path, {}), _Hand(100.0)
     clock.now = 51.0
     with Bar(shown=False) as bar:
-        few = with_targets(runner, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
+        few = with_targets(runner, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar, Here())
         assert few.count == min(max(4, 2 * torch.get_num_threads()), 16)  # whole rounds, a worker's part is two calls
         clock.now = 0.0
         # As after an interruption.
-        again = with_targets(runner, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar)
-        whole = with_targets(runner, "calibration", calls, 3, fresh, clock.until(ANSWERED_BY), bar)
+        again = with_targets(runner, "calibration", calls, 3, state, clock.until(ANSWERED_BY), bar, Here())
+        whole = with_targets(runner, "calibration", calls, 3, fresh, clock.until(ANSWERED_BY), bar, Here())
     assert (again.count, whole.count) == (few.count, calls.count)
     assert few.path is not None
     assert whole.path is not None
@@ -236,7 +237,7 @@ def test_a_network_learns_from_more_calls_where_their_contexts_fit(
     manifest = load_artifact(compiled).manifest
     assert calls_to_learn_from(manifest, 1e6, corrects=False)[1] == MOST_CALLS
     assert calls_to_learn_from(manifest, 1e6, corrects=True)[1] == MOST_LEARNED
-    assert calls_to_learn_from(manifest, 1e6, corrects=False, distils=True)[1] == MOST_LEARNED
+    assert calls_to_learn_from(manifest, 1e6, corrects=False, trains=True)[1] == MOST_LEARNED
     large = replace(manifest, spec=replace(manifest.spec, sample=(513, 2)))
     assert calls_to_learn_from(large, 1e6, corrects=True)[1] == MOST_CALLS
     monkeypatch.setattr(arguments, "ROOM", 5000 * arguments._context_bytes(manifest))

@@ -51,7 +51,7 @@ def test_the_distance_of_known_answers(constant: Path, recording: Path, tmp_path
     assert 1 <= len(sample.calls) <= most
     apart = []
     for stretch, row in sample.calls.tolist():
-        noise = trials.noise(spec, [trials.key(sample.part, stretch, row, draw) for draw in range(DRAWS)])
+        noise = trials.noise(spec, [trials.noise_key(sample.part, stretch, row, draw) for draw in range(DRAWS)])
         assert noise.steps is not None
         answers = answer(noise.initial, noise.steps)
         apart += [np.abs(answers[i] - answers[j]).mean() for i, j in combinations(range(DRAWS), 2)]

@@ -10,7 +10,7 @@ import torch
 
 from ttscompile.calibration import step_counts, whole_steps
 from ttscompile.calibration.sparse_loop import SparseLoop
-from ttscompile.calibration.step_counts import FEW, other_placements, spacings
+from ttscompile.calibration.step_counts import MOST_PLACEMENTS, other_placements, spacings
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.whole_steps import ScheduleRuns
 from ttscompile.core.correction import Correction
@@ -123,13 +123,13 @@ def test_what_was_not_of_use_for_longest_is_forgotten_first(task: Task, counted:
 def test_where_there_are_few_placements_all_are_tried(
     steps: int, count: int, placements: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(step_counts, "FEW", FEW)
+    monkeypatch.setattr(step_counts, "MOST_PLACEMENTS", MOST_PLACEMENTS)
     others = other_placements(steps, count)
     if not placements:
         assert others is None
         return
     assert others is not None
     every = [*spacings(steps, count), *others]
-    assert len(every) == len(set(every)) == placements <= FEW
+    assert len(every) == len(set(every)) == placements <= MOST_PLACEMENTS
     assert all(len(set(one)) == count and one[0] == 0 and list(one) == sorted(one) for one in every)
     assert np.max(every) < steps

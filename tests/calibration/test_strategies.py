@@ -13,7 +13,7 @@ import pytest
 import ttscompile
 from ttscompile.calibration.pruner import paper
 from ttscompile.calibration.schedule import open_search, search_plan
-from ttscompile.calibration.strategies import DEFAULT, FITTED, NAMES, STRATEGIES, strategy_of
+from ttscompile.calibration.strategies import CORRECTING, DEFAULT, NAMES, STRATEGIES, strategy_of
 from ttscompile.calibration.strategy import Strategy
 from ttscompile.calibration.task import Found, Task
 from ttscompile.core.lattice import Source, illegal_cells
@@ -132,7 +132,7 @@ def test_names_are_given_once_and_the_first_is_the_default() -> None:
     """Each with a maker, and with what it is from."""
     assert len(set(NAMES)) == len(STRATEGIES)
     assert all(one.make().__doc__ and one.source for one in STRATEGIES)
-    assert (DEFAULT, FITTED) == ("tts", ("tts",))
+    assert (DEFAULT, CORRECTING) == ("tts", ("tts",))
     assert [one.name for one in STRATEGIES if one.baseline] == ["interval"]
 
 

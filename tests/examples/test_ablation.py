@@ -46,7 +46,7 @@ def test_pinned_calls_have_one_noise_a_window() -> None:
 
 @pytest.mark.slow
 def test_it_runs_and_every_row_keeps_the_budget(once: Once, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tts, "DISTANCES", (1,))
+    monkeypatch.setattr(tts, "MOVED_BY", (1,))
     calls, found = policies.record(tmp_path / "calls.npz", episodes=8), tmp_path / "rows.json"
     sizes = ["--learned", "70", "--judged", "14", "--minutes", "0.02", "--updates", "2", "--pinned"]
     chosen = ["--way", "searched", "--way", "head", "--direction", "all"]

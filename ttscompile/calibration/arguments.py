@@ -49,13 +49,15 @@ class CallLimits(NamedTuple):
     """If they take little of it."""
 
 
-def require_limits(validation_fraction: float, max_minutes: float) -> None:
-    """Raise CalibrationError unless some episodes are held out, others are not, and there is time."""
-    if not 0 < validation_fraction < 1 or not max_minutes > 0:
+def require_limits(fraction: float, minutes: float, distance: float | None, policy_hz: float | None) -> None:
+    """Raise CalibrationError unless some episodes are held out and others are not, and all else is above 0, or none."""
+    if not 0 < fraction < 1 or not minutes > 0:
         raise CalibrationError(
-            f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {validation_fraction} and"
-            f" {max_minutes}."
+            f"expected validation_fraction between 0 and 1 and max_minutes above 0; found {fraction} and {minutes}."
         )
+    if distance is not None and not distance > 0:
+        raise CalibrationError(f"max_distance: expected a positive number; found {distance}.")
+    require_rate(policy_hz)
 
 
 def require_rate(policy_hz: float | None) -> None:
@@ -64,8 +66,17 @@ def require_rate(policy_hz: float | None) -> None:
         raise CalibrationError(f"policy_hz: expected a positive number; found {policy_hz}.")
 
 
-def require_alone(learn: Sequence[str], strategy: str, *budgets: float | None) -> None:
-    """Raise where loops are learned, and something that they cannot keep is asked for."""
+def require_one_place(device: str | None, ray: str | None) -> None:
+    """Raise CalibrationError where both a device and a cluster are to compute."""
+    if ray is not None and device is not None:
+        raise CalibrationError(
+            f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
+            " their processors. Leave one of the two out."
+        )
+
+
+def require_loops_alone(learn: Sequence[str], strategy: str, *budgets: float | None) -> None:
+    """Raise where something is asked for that loops, which are learned, cannot keep."""
     if SCHEDULE in learn:
         raise CalibrationError("learn: expected a schedule or loops; found both. Leave one of them out.")
     if strategy != DEFAULT:
@@ -88,10 +99,10 @@ def require_directory(path: Path) -> None:
         )
 
 
-def calls_to_learn_from(manifest: Manifest, max_minutes: float, corrects: bool, distils: bool = False) -> CallLimits:
-    """How many calls a calibration of so many minutes learns from."""
+def calls_to_learn_from(manifest: Manifest, max_minutes: float, *, corrects: bool, trains: bool = False) -> CallLimits:
+    """How many calls a calibration of so many minutes learns from; ``corrects`` and ``trains``: see ``Row``."""
     spec, most = manifest.spec, MOST_CALLS
-    if distils or (corrects and may_jump(spec.sample)):
+    if trains or (corrects and may_jump(spec.sample)):
         most = int(np.clip(ROOM // _context_bytes(manifest), MOST_CALLS, MOST_LEARNED))
     fewest = min(CALLS_A_FEATURE * (FEATURES * spec.sample[0] + 1), MOST_NEEDED) if corrects else FEWEST_CALLS
     usual = int(np.clip(EVALUATIONS_A_MINUTE / spec.sampler.steps * max_minutes, fewest, most))

@@ -45,6 +45,7 @@ class Split:
 
 def split_episodes(count: int, fraction: float, seed: int) -> Split:
     """Divide episodes at random; at least one for validation, and at least one is left to learn from."""
+    # Who draws has a number of its own beside the seed: 0 here, 1 calls, 2 their noise, 3 strategies, 4 to 6 the judge.
     order = np.random.default_rng((seed, 0)).permutation(count).tolist()
     held_out = min(max(round(count * fraction), 1), count - 1)
     return Split(calibration=tuple(sorted(order[held_out:])), validation=tuple(sorted(order[:held_out])))
@@ -72,8 +73,7 @@ def load_episodes(
 
 
 WINDOW = 8
-"""Consecutive calls of an episode that stand together, where plans may read the rollout cache; fewer where episodes are
-shorter."""
+"""Consecutive calls of an episode that stand together where plans may read the rollout cache; fewer in short ones."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,6 @@ class Calls:
     def count(self) -> int:
         """N."""
         return len(self.initial)
-
-    @property
-    def device(self) -> torch.device:
-        """Where the contexts are; samples and noise are on the CPU."""
-        return next((each.device for each in self.contexts.condition.values()), self.initial.device)
 
     def parts(self, most: int) -> list[IntArray]:
         """Numbers of the calls, at most so many together; windows stay whole, however long."""
@@ -212,19 +207,14 @@ def draw_noise(spec: PolicySpec, count: int, seed: tuple[int, ...]) -> tuple[Ten
 
 
 class Actions:
-    """Finds what is executed of denoised samples, and how far two of them are apart.
-
-    Attributes:
-        size: number of executed action numbers of a call.
-    """
+    """Finds what is executed of denoised samples, and how far two of them are apart."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self._chunk = spec.chunk
-        self.size = (spec.chunk.stop - spec.chunk.start) * spec.chunk.action_dim
         self._scale = torch.from_numpy(np.array(spec.chunk.scale))
 
     def executed(self, samples: Tensor) -> Tensor:
-        """The executed part of samples ``[..., T, D]`` as ``[..., size]``, as the network has it: normalised."""
+        """The executed part of samples ``[..., T, D]`` as ``[..., Ta Da]``, as the network has it: normalised."""
         return torch.as_tensor(self._chunk.executed(samples)).flatten(-2)
 
     def errors(self, samples: Tensor, targets: Tensor, units: bool) -> FloatArray:

@@ -61,7 +61,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     kept.trials.bar.stage("timing", 1)
     times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))
     points = {name: Point("", name, scores[name].distance, times[name].median) for name in entered}
-    best = {point.name for point in efficient(list(points.values()))}
+    on_frontier = {point.name for point in efficient(list(points.values()))}
 
     def up_to(bound: float) -> list[str]:
         return [n for n, one in scores.items() if n != DENSE and near(one.distance, one.interval, bound)]
@@ -76,7 +76,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     faster = {name: times[name].median for name in allowed if ALIKE * times[name].median < times[chosen].median}
     if faster:
         named[fastest(faster, {name: scores[name].distance for name in faster})] = FAST
-    plans = {named[name]: entered[name] for name in named}
+    plans = {DENSE: kept.plans[DENSE], **{named[name]: entered[name] for name in named}}
     plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
     tried = [
         {
@@ -87,7 +87,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
             "milliseconds": times[name].median,
             "worst": max(times[name].ms),
             "near": name == DENSE or name in allowed,
-            "on_frontier": name in best,
+            "on_frontier": name in on_frontier,
             "kept": name == DENSE or name in named,
         }
         for name in sorted(entered, key=lambda one: times[one].median)
@@ -99,7 +99,6 @@ def choose(kept: Kept, request: Request) -> Frontier:
             f" {scores[chosen].distance:.2g} away, and {scores[chosen].interval[1]:.2g} at worst. Such plans lost"
             " several points of success where they were driven. Evaluate it, record more episodes, or allow more time."
         )
-    plans = {DENSE: kept.plans[DENSE], **plans}
     return Frontier(tuple(tried), plans, {named[name]: scores[name] for name in named})
 
 

@@ -32,7 +32,7 @@ from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport
 from ..runtimes.runtime import Runtime
 from .calls import LARGEST, IntArray
-from .trials import HELD_OUT, Sample, Trials
+from .trials import ELSEWHERE, HELD_OUT, Sample, Trials
 
 STREAMS = 32
 """Calls that are computed together, at most."""
@@ -188,11 +188,11 @@ def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, rounds: int = T
         for i in timer.round():
             (trials, plan), runtime = filed[i], opened[i]
             obs = trials.observation([(int(sample.stretches[stretch, 0]), row)])
-            noise = trials.noise(_loop_spec(trials, plan), [trials.key(sample.part, stretch, row, 0)])
+            noise = trials.noise(_loop_spec(trials, plan), [trials.noise_key(sample.part, stretch, row, 0)])
             if plan.otherwise is not None:
                 runtime.predict(obs, noise, plan)  # so that there is a chunk to begin with
             runtime.forget_frames()
-            if plan.tokens is not None and row and number != WARM_UP:
+            if plan.tokens is not None and row and number != WARM_UP:  # once all tokens are computed
                 runtime.frames.learn(trials.observation([(int(sample.stretches[stretch, 0]), row - 1)]))
             timer.time(i, partial(runtime.predict, obs, noise, plan))
             runtime.reset()
@@ -248,7 +248,7 @@ class _Answers:
         self._plan = plan.exact if trials.fresh else plan
         self._spec = _loop_spec(trials, self._plan)
         name, device = trials.runtime, _device(trials)
-        if trials.fresh:
+        if trials.fresh:  # what is judged is in no file yet
             name, device = "reference", None
         elif trials.device is not None and self._plan is self._plan.exact:
             name, device = "torch", str(trials.device)
@@ -274,14 +274,13 @@ class _Answers:
             goes_on = plan.tokens is not None or plan.cells is None or bool((plan.cells == Source.ROLLOUT).any())
             yield self._along(in_order if goes_on else apart)
 
-    def _call_elsewhere(self, some: Sequence[tuple[int, int]], draw: np.random.Generator) -> None:
+    def _call_elsewhere(self, some: Sequence[tuple[int, int]], random: np.random.Generator) -> None:
         """A call of another episode before each of these calls, by number and draw of noise."""
         sample, trials, others = self._sample, self._trials, list[tuple[int, int]]()
         for n, _ in some:
-            known = [i for i in range(len(trials.episodes)) if i != int(sample.episodes[n])]
-            other = int(draw.choice(known))
+            other = int(random.choice([i for i in range(len(trials.episodes)) if i != int(sample.episodes[n])]))
             others.append((other, min(int(sample.calls[n, 1]) - 1, trials.episodes[other].calls - 1)))
-        keys = [(2, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
+        keys = [trials.noise_key(ELSEWHERE, n, row, r) for (n, r), (_, row) in zip(some, others, strict=True)]
         self._runtime.predict(trials.observation(others), trials.noise(self._spec, keys), self._plan)
 
     def _along(self, runs: Sequence[tuple[int, int, int]], after_another: bool = False) -> FloatArray:
@@ -290,14 +289,14 @@ class _Answers:
         Several runs are the streams of a batch. A run's first call is the first of an episode, or comes after one of
         another, drawn at random: as if the world had changed.
         """
-        sample, draws = self._sample, np.random.default_rng((self._trials.seed, 6))
+        sample, random = self._sample, np.random.default_rng((self._trials.seed, 6))
         made = np.empty((len(sample.calls), sample.draws, *self._spec.sample), np.float32)
         numbers = {(stretch, row): n for n, (stretch, row) in enumerate(sample.calls.tolist())}
         asked = [(*run, draw) for run in runs for draw in range(sample.draws)]
         for some in (asked[i : i + self._streams] for i in range(0, len(asked), self._streams)):
             self._runtime.reset()
             if after_another:
-                self._call_elsewhere([(numbers[stretch, row], draw) for stretch, row, _, draw in some], draws)
+                self._call_elsewhere([(numbers[stretch, row], draw) for stretch, row, _, draw in some], random)
             for step in range(max(last - first for _, first, last, _ in some) + 1):
                 # A run that is over goes on with its last call, whose answer nobody reads.
                 calls = [(stretch, min(first + step, last), draw) for stretch, first, last, draw in some]
@@ -312,7 +311,7 @@ class _Answers:
         """The next call of streams: the stretch, row and draw of each. Reports are kept of those that are scored."""
         trials, sample = self._trials, self._sample
         obs = trials.observation([(int(sample.stretches[stretch, 0]), row) for stretch, row, _ in calls])
-        noise = trials.noise(self._spec, [trials.key(sample.part, *call) for call in calls])
+        noise = trials.noise(self._spec, [trials.noise_key(sample.part, *call) for call in calls])
         found, report = self._runtime.predict(obs, noise, self._plan)
         self.reports += [(report, i) for i in scored]
         return found

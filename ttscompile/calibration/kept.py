@@ -145,7 +145,7 @@ class Kept:
 
     def _no_better(self, trials: Trials, score: Score, margin: float | None) -> str | None:
         """Why a plan does not take the place of the best one so far."""
-        if margin == float("inf"):
+        if margin == float("inf"):  # asked for, whatever it costs
             return None
         if self.default not in self.scores:
             self.scores[self.default] = judge(self.trials, self.plan)

@@ -20,7 +20,7 @@ from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..trajectories import recorded_rate
 from ..verification.record_golden import record_plans
-from .arguments import calls_to_learn_from, require_alone, require_directory, require_limits, require_rate
+from .arguments import calls_to_learn_from, require_directory, require_limits, require_loops_alone, require_one_place
 from .budget import DISTANCE, ERROR, LATENCY, goal_of
 from .calls import FRACTION, digest_of, load_episodes, window_of
 from .choose import choose
@@ -28,7 +28,7 @@ from .clock import Clock
 from .judge import Score, other_noise, other_observations
 from .kept import Kept
 from .progress import Bar
-from .proposer import LOOPS, Request, Row, rows_of
+from .proposer import LOOPS, Proposer, Request, Row, rows_of
 from .schedule import FINISHED, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
@@ -199,54 +199,46 @@ def calibrate(
         RuntimeUnavailableError: torch does not have the device.
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
     """
-    wall = ray is not None or device not in (None, "cpu")
+    wall = ray is not None or device not in (None, "cpu")  # others work, and this process waits
     begun = Clock(wall=wall)
     seed = integer(seed, "seed", CalibrationError)
     rank, updates = integer(rank, "rank", CalibrationError, 1), integer(updates, "updates", CalibrationError, 1)
     if max_intervals is not None:
         max_intervals = integer(max_intervals, "max_intervals", CalibrationError, 1)
-    if max_distance is not None and not max_distance > 0:
-        raise CalibrationError(f"max_distance: expected a positive number; found {max_distance}.")
-    require_rate(policy_hz)
-    if ray is not None and device is not None:
-        raise CalibrationError(
-            f"expected a device or a cluster; found device {device!r} and ray {ray!r}: workers of a cluster compute on"
-            " their processors. Leave one of the two out."
-        )
+    require_limits(validation_fraction, max_minutes, max_distance, policy_hz)
+    require_one_place(device, ray)
     torch_device = None if device is None else device_of(device)
     asked = (target_sparsity, target_flops, latency_ms, max_action_error, threads)
     goal_of(*asked)  # what cannot be is refused before anything is read
     rows, strategy_row = rows_of(tuple(learn)), strategy_of(strategy)
     chooses, anew = LOOPS in learn, any(row.anew for row in rows)
     if chooses:
-        require_alone(learn, strategy, target_sparsity, target_flops, max_action_error)
-    require_limits(validation_fraction, max_minutes)
-    require_directory(Path(path))
+        require_loops_alone(learn, strategy, target_sparsity, target_flops, max_action_error)
+    directory = Path(path)
+    require_directory(directory)
     # All the while: a second calibration would undo the first.
-    with locked(Path(path)), opened_pool(ray) as pool, exact_arithmetic(torch_device):
-        artifact = load_artifact(Path(path))
+    with locked(directory), opened_pool(ray) as pool, exact_arithmetic(torch_device):
+        artifact = load_artifact(directory)
         if anew:  # that of an earlier calibration would judge this one's plans
             artifact = replace(artifact, envelope=None)
         view = view_of(artifact, base_of(artifact))
         goal = goal_of(*asked, usual=usual_sparsity(view.manifest.steps))
-        request = Request(
-            goal, strategy, correct, intervals=max_intervals, rank=rank, updates=updates, margin=max_distance
-        )
-        if chooses:  # its bound is of what is chosen in the end, and not of each that learns
+        request = Request(goal, strategy, correct, max_intervals, rank, updates, margin=max_distance)
+        if chooses:  # the distance is that of what is chosen in the end, and not of each that learns
             request = replace(request, margin=None, deadline_ms=latency_ms, by_time=True, threads=goal.threads)
             if max_distance is not None:
                 request = replace(request, bound=max_distance, farthest=max_distance)
-        made = [(row, row.make(request)) for row in rows]
-        for _, proposer in made:
+        proposers = [row.make(request) for row in rows]
+        for proposer in proposers:
             if (reason := proposer.applies(artifact)) is not None:
                 raise CalibrationError(reason)
         episodes = load_episodes(artifact.manifest.spec, trajectories, observation, artifact.tokenizer)
-        corrects = correct or any(row.corrects for row in rows if row.name != SCHEDULE)
-        corrects |= strategy_row.fits_correction and SCHEDULE in learn
+        corrects = correct or any(row.corrects for row in rows) or (SCHEDULE in learn and strategy_row.fits_correction)
         rate = policy_hz or recorded_rate(trajectories) or (artifact.manifest.calibration or {}).get("policy_hz")
-        limits = calls_to_learn_from(view.manifest, max_minutes, corrects, any(row.trains for row in rows))
+        trains = any(row.trains for row in rows)
+        limits = calls_to_learn_from(view.manifest, max_minutes, corrects=corrects, trains=trains)
         settings = {
-            # Of what replaces no plans, these too: what is learned is learned for one of them.
+            # Where plans stay, these too: what is learned is learned for one of them.
             "model": (artifact.manifest.model_identity if anew else artifact.manifest.identity)[:16],
             "trajectories": digest_of(episodes),
             "budget": goal.record(),
@@ -262,7 +254,7 @@ def calibrate(
             "rank": rank,
             "updates": updates,
         }
-        state = StateFile(Path(path), settings)
+        state = StateFile(directory, settings)
         if not (resume and state.load()):
             state.remove()
         # The number stays whatever time there is to go on.
@@ -272,22 +264,17 @@ def calibrate(
         with Bar(progress) as bar:
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": torch_device, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
-            _warn(trials, rows, strategy_row, corrects)
+            _warn_of_recordings(trials, rows, strategy_row, corrects)
+            # Where a distance was allowed, no plan that is kept is too far away to be the default.
             kept = Kept(trials, anew, FARTHEST if max_distance is None else np.inf)
-            takes = np.cumsum([row.takes for row in rows])
-            for (row, proposer), share in zip(made, takes / takes[-1], strict=True):
-                kept.hear(row.name, proposer, clock.until(float(share)))
-            if not kept.learned:
-                why = " ".join(f"{name!r} {reason}" for name, reason in kept.refused.items())
-                raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
-            for name, reason in kept.refused.items():
-                bar.warn(f"{name!r} is left out: it {reason}")
+            _hear(kept, rows, proposers, clock)
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.keep_only(frontier.plans, frontier.scores, SCHEDULE)
             else:
                 kept.judge_changed(artifact.plans)
-        schedule = next((one for _, one in made if isinstance(one, Schedule)), Schedule(request))
+        # Where no schedule is learned: what one would have been asked for.
+        schedule = next((one for one in proposers if isinstance(one, Schedule)), Schedule(request))
         asked_of_default = {n: one for n, one in ((DISTANCE, max_distance), (LATENCY, latency_ms)) if one is not None}
         result = CalibrationResult(
             learned=tuple(row.name for row in rows),
@@ -309,24 +296,42 @@ def calibrate(
             held_out=digest_of([episodes[n] for n in trials.split.validation]),
             frontier=() if frontier is None else frontier.tried,
         )
-        if result.stopped == TIME_LIMIT:
-            bar.warn(
-                f"a search was cut short, since {max_minutes:g} minutes were over: with more, plans may be nearer to"
-                " the original."
-            )
-        if result.doubtful:
-            bar.warn(
-                f"plan {kept.default!r} is {result.plans[kept.default].distance:.2f} of what other noise changes from"
-                f" the original; above {FARTHEST:g} scores may fall. Allow more time or computed cells, or record more."
-            )
-        _write(Path(path), artifact, result, kept, anew)
+        _warn_of_result(bar, result, max_minutes)
+        _write(directory, artifact, result, kept, anew)
         state.remove()
         return result
 
 
-def _warn(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
-    bar, view, fewest = trials.bar, trials.runner.view, trials.limits.fewest
-    if (warning := few_steps(view.manifest)) is not None:
+def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock: Clock) -> None:
+    """Have each proposer judged, in its share of the time. Raises CalibrationFailedError: nothing was kept."""
+    takes = np.cumsum([row.takes for row in rows])
+    for row, proposer, share in zip(rows, proposers, takes / takes[-1], strict=True):
+        kept.hear(row.name, proposer, clock.until(float(share)))
+    if not kept.learned:
+        why = " ".join(f"{name!r} {reason}" for name, reason in kept.refused.items())
+        raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
+    for name, reason in kept.refused.items():
+        kept.trials.bar.warn(f"{name!r} is left out: it {reason}")
+
+
+def _warn_of_result(bar: Bar, result: CalibrationResult, max_minutes: float) -> None:
+    if result.stopped == TIME_LIMIT:
+        bar.warn(
+            f"a search was cut short, since {max_minutes:g} minutes were over: with more, plans may be nearer to the"
+            " original."
+        )
+    if result.doubtful:
+        bar.warn(
+            f"plan {result.default_plan!r} is {result.plans[result.default_plan].distance:.2f} of what other noise"
+            f" changes from the original; above {FARTHEST:g} scores may fall. Allow more time or computed cells, or"
+            " record more."
+        )
+
+
+def _warn_of_recordings(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
+    """Warn, before anything is learned, of what makes it learn little."""
+    bar, fewest = trials.bar, trials.limits.fewest
+    if (warning := few_steps(trials.runner.view.manifest)) is not None:
         bar.warn(warning)
     consecutive = any(row.consecutive or (row.name == SCHEDULE and strategy.consecutive) for row in rows)
     window = window_of(trials.episodes, trials.split)

@@ -52,8 +52,8 @@ class Proposal:
         weights: of blocks, by the name that the plan has for them.
         starts: loops that begin with the chunk of the call before, by the name that the plan has for them.
         margin: by how much further from the original than the plan that it was made from it may be: the upper limit of
-            the difference over episodes counts (``judge.further``). For plans that cost less. None: it has to be
-            nearer.
+            the difference over episodes counts (``judge.further``). For plans that cost less; infinite for one that was
+            asked for whatever it costs. None: it has to be nearer.
         beside: kept under its name, and not a candidate for the default.
         refusal: says of its score, and of the scores of what was kept so far by name, why it is not what was asked for;
             None if it is. Asked whether or not it is ``beside``.
@@ -151,7 +151,7 @@ class Row:
         what: what it learns: the end of a sentence.
         maker: where the class or function is that makes a ``Proposer`` of a ``Request``, as ``module:name`` below
             ``ttscompile``.
-        corrects: whether it fits corrections, which need many calls to learn from.
+        corrects: whether it fits corrections, which need many calls to learn from; of a schedule its strategy says so.
         trains: whether it trains a network on the calls, for which more of them are better.
         consecutive: whether it learns from consecutive calls too (``Trials.windows``).
         anew: whether the plans of an earlier calibration go: all that follows is made from what it proposes.
@@ -177,13 +177,7 @@ LOOPS = "loops"
 """The proposer after which the default is chosen among all plans that were kept (``choose``)."""
 
 PROPOSERS = (
-    Row(
-        SCHEDULE,
-        "which steps are computed, with corrections and jumps",
-        "calibration.schedule:Schedule",
-        corrects=True,
-        anew=True,
-    ),
+    Row(SCHEDULE, "which steps are computed, with corrections and jumps", "calibration.schedule:Schedule", anew=True),
     Row(
         LOOPS,
         "which loop, and how few of its steps; the default is chosen at the end",
@@ -195,7 +189,13 @@ PROPOSERS = (
     Row("pruner", "gates for each observation", "calibration.proposers.pruner:Pruner", consecutive=True),
     Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
     Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
-    Row("weights", "low-rank updates of later steps' weights", "calibration.proposers.weights:Weights", True, True),
+    Row(
+        "weights",
+        "low-rank updates of later steps' weights",
+        "calibration.proposers.weights:Weights",
+        corrects=True,
+        trains=True,
+    ),
     Row("start", "how many steps a call needs that begins with the chunk before", "calibration.proposers.start:Start"),
 )
 """In the order in which they propose, whatever the order in which they are asked for."""

@@ -39,8 +39,8 @@ class Runner:
 
     Attributes:
         correction: of the sampler's steps, for all that is run but ``run_dense``; None for none.
-        axes: of the streams in each block's residual.
-        alike: whether all blocks have residuals of one type.
+        types: of each block's residual, and ``axes``: of the streams in it.
+        alike: whether all blocks have residuals of one type, so that one tensor can hold their sum.
     """
 
     def __init__(self, view: View, device: torch.device | None = None) -> None:
@@ -48,7 +48,7 @@ class Runner:
         self.view = view
         self.model = ReferenceModel.from_view(view, device)
         types = {name: pieces.condition.types()[name] for name in pieces.condition.outputs}
-        self._axes = {name: one.batch_axis for name, one in types.items() if one.batch_axis is not None}
+        self._context_axes = {name: one.batch_axis for name, one in types.items() if one.batch_axis is not None}
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
         self.alike = len({block.type for block in blocks}) == 1
@@ -72,8 +72,8 @@ class Runner:
         index = torch.as_tensor(chosen_calls)
         there = index.to(self.model.device)
         condition = dict(calls.contexts.condition)
-        for name in self._axes.keys() & condition:
-            own, axis = condition[name], self._axes[name]
+        for name in self._context_axes.keys() & condition:
+            own, axis = condition[name], self._context_axes[name]
             if consecutive:
                 condition[name] = own.narrow(axis, int(chosen_calls[0]), len(index))
             else:
@@ -103,14 +103,14 @@ class Runner:
             raise IllegalPlanError("expected consecutive calls, or plans that read nothing of an earlier call.")
         with torch.no_grad():
             if plan.ndim == 2:
-                return last(self._samples(plan[None], calls))
+                return last(self._following(plan[None], calls))
             parts = calls.parts(STREAMS)
-            return torch.cat([last(self._samples(plan[part], self.select(calls, part))) for part in parts])
+            return torch.cat([last(self._following(plan[part], self.select(calls, part))) for part in parts])
 
     def run_dense(self, calls: Calls) -> Tensor:
         """What the dense policy answers, and how it gets there: the sample after each step, ``[N, K, T, D]``."""
         with torch.no_grad():
-            return torch.stack(list(self.corrected(None)._samples(self._dense, calls)), 1)
+            return torch.stack(list(self.corrected(None)._following(self._dense, calls)), 1)
 
     def logits(self, calls: Calls, weights: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
         """What the pruner says with these constants, ``[N, K, blocks, 4]``."""
@@ -119,12 +119,12 @@ class Runner:
             return np.asarray(self.model.logits(calls.contexts, tensors).numpy(), dtype=np.float32)
 
     def samples(self, calls: Calls, blocks: Blocks) -> Iterator[Tensor]:
-        """The sample ``[N, T, D]`` after each step, with the runner's correction."""
+        """The sample ``[N, T, D]`` after each step; ``blocks`` says what the blocks make of the stem's stream."""
         loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction)
         return (carried.sample for carried in loop)
 
-    def _samples(self, plans: PlanArray, calls: Calls) -> Iterator[Tensor]:
-        """The same with one plan for all calls, or one for each: ``[1 or N, K, blocks]``."""
+    def _following(self, plans: PlanArray, calls: Calls) -> Iterator[Tensor]:
+        """``samples`` of blocks that follow one plan for all calls, or one for each: ``[1 or N, K, blocks]``."""
         caches = StreamCaches()
         total: Tensor | None = None  # what all blocks add together, as long as nothing is computed
         previous: PlanArray | None = None
@@ -216,12 +216,13 @@ def rollout_reads(column: PlanArray, window: int) -> tuple[IntArray, IntArray]:
     return reading, latest[reading]
 
 
-def latest_before(column: PlanArray, window: int) -> IntArray:
-    """For each call the last one before it, in its window, that computed a cell; -1 where none did. ``[N]`` twice."""
-    computed = np.where(column == Source.COMPUTE, np.arange(len(column)), -1).reshape(-1, window)
+def latest_before(cells: PlanArray, window: int) -> IntArray:
+    """For each call the last one before it, in its window, that computed a cell; -1 where none did: ``[N, ...]``."""
+    numbers = np.arange(len(cells)).reshape(-1, *[1] * (cells.ndim - 1))
+    computed = np.where(cells == Source.COMPUTE, numbers, -1).reshape(-1, window, *cells.shape[1:])
     before = np.full_like(computed, -1)
     before[:, 1:] = np.maximum.accumulate(computed, axis=1)[:, :-1]
-    return before.reshape(-1)
+    return before.reshape(cells.shape)
 
 
 def whole_windows(numbers: IntArray, window: int) -> bool:

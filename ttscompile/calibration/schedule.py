@@ -15,7 +15,7 @@ from .clock import Clock
 from .judge import Score
 from .proposer import Proposal, Proposals, Proposer, Request
 from .step_counts import BESIDE_SHARE, SAFE, SpacedSchedules, budget_of_error, plans_beside
-from .strategies import FITTED, strategy_of
+from .strategies import CORRECTING, strategy_of
 from .task import Found, Search, Task
 from .trials import Trials, base_of
 
@@ -115,8 +115,8 @@ class Schedule(Proposer):
             return f"{told}. Learn which parts may have eight bits: --learn precision."
         if goal.kind == ERROR and not self._strategy.fits_correction:
             return (
-                f"max_action_error needs strategy {' or '.join(map(repr, FITTED))}; found {self._strategy.name!r}. Give"
-                " this strategy a target_sparsity, a target_flops or a latency_ms."
+                f"max_action_error needs strategy {' or '.join(map(repr, CORRECTING))}; found {self._strategy.name!r}."
+                " Give this strategy a target_sparsity, a target_flops or a latency_ms."
             )
         if self.request.correct and self._strategy.fits_correction:
             return f"strategy {self._strategy.name!r} fits a correction of its own. Leave correct out."
@@ -136,7 +136,7 @@ class Schedule(Proposer):
         budget = self._budget(trials, view, clock)
         calls = trials.windows if self._strategy.consecutive else trials.calls
         small = calls.count > trials.limits.usual
-        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small)
+        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small=small)
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)
@@ -147,14 +147,14 @@ class Schedule(Proposer):
         if request.correct:
             found = task.corrected(found)
         while True:
-            self.budget, kept = budget, False
+            self.budget = budget
             # The last cells of the budget are rounded up to a whole step, in the baseline's favour.
             baseline = replace(plan, cells=uniform_plan(steps, blocks, -(-budget.cells // blocks)))
             yield Proposal(UNIFORM, baseline, beside=True)
             made = replace(plan, cells=found.schedule, correction=found.correction)
             kept = yield Proposal(SCHEDULE, made, found.notes, margin=float("inf"), refusal=self._refusal)
             full = budget.cells // blocks
-            more = full + max(1, full // 4)
+            more = full + max(1, full // 4)  # where the error is kept on calls to learn from, and not on held-out ones
             if kept or request.goal.kind != ERROR or more > steps // 2:
                 break
             best = crowded.best(more, f"{more} steps")
@@ -220,7 +220,7 @@ class Schedule(Proposer):
             return (
                 f"saves {score.flops_saved:.4f} of the FLOPs of a dense call; the target is {goal.value:g}: its blocks"
                 " cost more than the average. Raise the target a little, or take strategy"
-                f" {' or '.join(map(repr, FITTED))}, which computes whole steps."
+                f" {' or '.join(map(repr, CORRECTING))}, which computes whole steps."
             )
         if goal.kind == ERROR and score.error is not None and not score.error <= goal.value:
             return (

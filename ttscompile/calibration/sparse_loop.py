@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,6 +64,11 @@ class Place:
     jumps: Mapping[int, Layers] = field(default_factory=dict)
 
     @property
+    def batches(self) -> tuple[_Batch, ...]:
+        """Of all calls, the fitted ones first."""
+        return *self.fitted, *self.judged
+
+    @property
     def samples(self) -> Tensor:
         """Those of the judged calls, ``[N, T, D]``."""
         return torch.cat([batch.sample for batch in self.judged])
@@ -70,7 +76,12 @@ class Place:
     @property
     def held(self) -> list[Tensor]:
         """The samples and residuals of it; places share those that nothing changed between them."""
-        return [tensor for batch in (*self.fitted, *self.judged) for tensor in batch.held]
+        return [tensor for batch in self.batches for tensor in batch.held]
+
+    def forked(self, **fields: Any) -> Place:
+        """Another one with other fields, whose batches go on without moving those of this one."""
+        fitted, judged = (tuple(batch.fork() for batch in part) for part in (self.fitted, self.judged))
+        return replace(self, fitted=fitted, judged=judged, **fields)
 
 
 class SparseLoop:
@@ -107,21 +118,23 @@ class SparseLoop:
             return tuple(_Batch(runner, runner.select(calls, part, consecutive=True), sums) for part in parts)
 
         self.begin = Place(0, batches(fitted), batches(judged))
+        # Where an axis of all calls is cut into those of the batches.
+        self._ends: list[int] = np.cumsum([len(batch.sample) for batch in self.begin.batches])[:-1].tolist()
 
     def after(self, place: Place, rows: PlanArray, pool: ThreadPoolExecutor) -> Place:
         """The place after one step more, of one row of a plan for all calls, ``[1, blocks]``, or one for each."""
-        batches, anchor = [batch.fork() for batch in (*place.fitted, *place.judged)], bool(anchors_of(rows[:, None])[0])
-        ends = np.cumsum([len(batch.sample) for batch in batches])[:-1]
-        own = [rows] * len(batches) if len(rows) == 1 else np.split(rows, ends)
-        list(pool.map(partial(_Batch.predict, k=place.step), batches, own))
-        fitted, judged, solved = tuple(batches[: len(place.fitted)]), tuple(batches[len(place.fitted) :]), place.solved
-        if self._components is not None:
-            read, missing = (torch.cat(column, 1) for column in zip(*map(_Batch.missing, fitted), strict=True))
-            solved = (*solved, solve(read.double(), self._components.values, missing.double(), self._groups))
-            added = solved[-1].bias + torch.einsum("nf,fdt->dnt", self._known, solved[-1].observed)
-            for batch, part in zip(batches, added.tensor_split(ends.tolist(), dim=1), strict=True):
-                batch.correct(solved[-1].weight, part, anchor)
-        return Place(place.step + 1, fitted, judged, solved, (*place.anchors, anchor), place.jumps)
+        anchor = bool(anchors_of(rows[:, None])[0])
+        there = place.forked(step=place.step + 1, anchors=(*place.anchors, anchor))
+        own = [rows] * len(there.batches) if len(rows) == 1 else np.split(rows, self._ends)
+        list(pool.map(partial(_Batch.predict, k=place.step), there.batches, own))
+        if self._components is None:
+            return there
+        read, missing = (torch.cat(column, 1) for column in zip(*map(_Batch.missing, there.fitted), strict=True))
+        solved = solve(read.double(), self._components.values, missing.double(), self._groups)
+        added = solved.bias + torch.einsum("nf,fdt->dnt", self._known, solved.observed)
+        for batch, part in zip(there.batches, added.tensor_split(self._ends, dim=1), strict=True):
+            batch.correct(solved.weight, part, anchor)
+        return replace(there, solved=(*place.solved, solved))
 
     def end(self, plan: PlanArray) -> Place:
         """The place after the last step of a plan ``[K, blocks]``, or of one for each call, ``[N, K, blocks]``."""
@@ -146,21 +159,18 @@ class SparseLoop:
 
     def _jumped(self, place: Place) -> Place | None:
         """The place after the jump that ends there; None if that does not hold."""
-        batches = [batch.fork() for batch in (*place.fitted, *place.judged)]
-        fitted, judged = tuple(batches[: len(place.fitted)]), tuple(batches[len(place.fitted) :])
-        known = torch.cat([self._known, torch.cat([batch.history for batch in batches])], 1)
-        missing = torch.cat([batch.left for batch in fitted])
-        landing = place.step - 1
+        known = torch.cat([self._known, torch.cat([batch.history for batch in place.batches])], 1)
+        missing, landing = torch.cat([batch.left for batch in place.fitted]), place.step - 1
         fitted_terms = (fit(known[: len(missing)], missing, self._episodes, landing) for fit in TERMS)
         held = [one for one in fitted_terms if one is not None]
         if not held:
             return None
         layers, added = min(held, key=lambda one: float((missing - one[1]).square().mean()))
         added = torch.cat([added, through(layers, known[len(missing) :])])
-        ends = np.cumsum([len(batch.sample) for batch in batches])[:-1].tolist()
-        for batch, part in zip(batches, added.tensor_split(ends), strict=True):
+        there = place.forked(jumps={**place.jumps, landing: layers})
+        for batch, part in zip(there.batches, added.tensor_split(self._ends), strict=True):
             batch.add(part)
-        return replace(place, fitted=fitted, judged=judged, jumps={**place.jumps, landing: layers})
+        return there
 
     def correction(self, place: Place) -> Correction | None:
         """What was fitted, at the place after the last step of a loop with corrections; None if that is no numbers."""
@@ -170,6 +180,7 @@ class SparseLoop:
         columns = zip(*place.solved, strict=True)
         weights, biases, observed = (np.stack([each.numpy() for each in column]) for column in columns)
         observed = np.ascontiguousarray(observed.transpose(1, 0, 2, 3))
+        # Fitted to components of mean 0; a call reads them with their center, so that is taken out of what is added.
         biases = biases - np.einsum("f,fkdt->kdt", self._components.center, observed)[:, :, None]
         anchors, reading = np.array(place.anchors), self._components.reading
         without = Correction(anchors, weights, biases.astype(np.float32), reading, observed)
@@ -182,7 +193,7 @@ class SparseLoop:
         )
         inner[:, -1] -= self._components.center @ inner[:, : reading.shape[1]]
         found = (np.isfinite(layer).all() for layer in (inner, middle, outer))
-        if not reading.shape[1]:
+        if not reading.shape[1]:  # nothing is read, and a jump says of how many numbers
             reading = np.zeros((self._numbers, 0), np.float32)
         return replace(without, reading=reading, inner=inner, middle=middle, outer=outer) if all(found) else None
 

@@ -25,7 +25,7 @@ CROWDING = (3.0, 2.0, 4.0, 1.5, 1.0, 2.5, 3.5, 5.0, 0.6, 0.4)
 tried, since time may end the search: late steps mattered most wherever it was measured. Of 3 steps among 16 the first
 is 0, 11, 15, with a third less error on Push-T than 0, 8, 14, which 2.0 is."""
 
-FEW = 128
+MOST_PLACEMENTS = 128
 """Where there are no more placements, a search tries them all: those of three steps among 16 are 105."""
 
 
@@ -45,8 +45,8 @@ def spacings(steps: int, full_steps: int, crowding: Sequence[float] = CROWDING) 
 
 
 def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | None:
-    """All other schedules of ``full_steps`` of the steps, step 0 among them; None if there are more than ``FEW``."""
-    if comb(steps - 1, full_steps - 1) > FEW:
+    """All other schedules of ``full_steps`` of the steps, step 0 among them; None for over ``MOST_PLACEMENTS``."""
+    if comb(steps - 1, full_steps - 1) > MOST_PLACEMENTS:
         return None
     every = ((0, *rest) for rest in combinations(range(1, steps), full_steps - 1))
     return sorted(set(every) - set(spacings(steps, full_steps)), reverse=True)  # late steps first, see CROWDING
@@ -55,7 +55,7 @@ def other_placements(steps: int, full_steps: int) -> list[tuple[int, ...]] | Non
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """Numbers of computed steps that an error budget is tried with, before bisection between two of them."""
 
-TRIED = (1.0, 2.0, 3.0, 4.0)
+FEWER_CROWDINGS = (1.0, 2.0, 3.0, 4.0)
 """Those of ``CROWDING`` that are tried while only the number of steps is in question."""
 
 SAFE, FAST = "safe", "fast"
@@ -133,7 +133,7 @@ def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: in
         return CalibrationFailedError(f"{what}: {', '.join(told)}. The artifact is as it was. {otherwise}.")
 
     def enough(full: int) -> bool:
-        best = crowded.best(full, f"{full} steps", TRIED)
+        best = crowded.best(full, f"{full} steps", FEWER_CROWDINGS)
         if best is None:
             what = f"the time limit ended the search for a plan with an action error of at most {goal.value:g}"
             raise failed(what, "Allow more time, or a larger error")

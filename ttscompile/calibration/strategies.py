@@ -25,7 +25,7 @@ STRATEGIES: tuple[Strategy, ...] = (
 
 NAMES = tuple(one.name for one in STRATEGIES)
 
-FITTED = tuple(one.name for one in STRATEGIES if one.fits_correction)
+CORRECTING = tuple(one.name for one in STRATEGIES if one.fits_correction)
 """Names of those that fit a correction."""
 
 DEFAULT = NAMES[0]

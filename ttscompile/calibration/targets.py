@@ -24,18 +24,11 @@ TARGETS_AT_ONCE = 16
 
 
 def with_targets(
-    runner: Runner,
-    name: str,
-    calls: Calls,
-    least: int,
-    state: StateFile,
-    clock: Clock,
-    bar: Bar,
-    pool: Pool | None = None,
+    runner: Runner, name: str, calls: Calls, fewest: int, state: StateFile, clock: Clock, bar: Bar, pool: Pool
 ) -> Calls:
     """The calls with what the dense policy answers to them; the first of them where the clock's time ends before.
 
-    ``least`` of them are needed whatever the time; ``name`` is what they are called in the state.
+    ``fewest`` of them are needed whatever the time; ``name`` is what they are called in the state.
     """
     known = state.get("targets").get(name)
     sample = calls.initial.shape[1:]
@@ -47,7 +40,7 @@ def with_targets(
     rounds, key = dense_rounds(runner, calls, len(path), pool), f"{name} targets"
     # A calibration that was interrupted later goes on with as many as it had then.
     count = min(calls.count, int(state.progress.get(key, calls.count)))
-    while len(path) < count and (len(path) < least or clock.left() > 0):
+    while len(path) < count and (len(path) < fewest or clock.left() > 0):
         path = torch.cat([path, next(rounds)])
         state.put("targets", {**state.get("targets"), name: path.numpy()})
         state.save(seconds=clock.elapsed())

@@ -67,9 +67,9 @@ class Task:
 
     @classmethod
     def of(
-        cls, runner: Runner, calls: Calls, budget: int, seed: int, pool: Pool | None = None, small: bool = False
+        cls, runner: Runner, calls: Calls, budget: int, seed: int, pool: Pool | None = None, *, small: bool = False
     ) -> Task:
-        """The task of finding a plan; ``pool`` and ``small`` are those of ``WholeSteps``."""
+        """The task; ``pool`` and ``small`` are those of ``WholeSteps``, and a budget of 0 is one to be known later."""
         actions, whole = Actions(runner.view.manifest.spec), WholeSteps(runner, calls, seed, pool, small)
         return cls(runner, actions, calls, budget, seed, runner.view.pruner, whole)
 
@@ -86,8 +86,9 @@ class Task:
 
         The notes get the steps, how many numbers of the condition the correction reads, and how many jumps it has.
         """
-        correction = self.whole.correction(steps)
-        return Found(self.whole.plan(steps), {"steps": list(steps), **_of_correction(correction), **notes}, correction)
+        plan = self.whole.plan(steps)
+        correction = self.whole.correction_of(plan)
+        return Found(plan, {"steps": list(steps), **_of_correction(correction), **notes}, correction)
 
     def corrected(self, found: Found) -> Found:
         """What a strategy found, with corrections where they are better: of the schedule, and of the pruner's plans.

@@ -67,10 +67,10 @@ EPISODES = 16
 STRETCH = 32
 """Consecutive calls of an episode that they are among, at most: a plan that goes on from call to call makes all."""
 
-LEARNED, HELD_OUT = "learned", "held out"
-"""The two parts of the episodes: what is learned from, and what is judged on."""
+LEARNED, HELD_OUT, ELSEWHERE = "learned", "held out", "elsewhere"
+"""The two parts of the episodes, to learn from and to judge on; and calls of another episode before those of a part."""
 
-_NUMBERS = {LEARNED: 0, HELD_OUT: 1}
+_NUMBERS = {LEARNED: 0, HELD_OUT: 1, ELSEWHERE: 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,20 +187,19 @@ class Trials:
     @property
     def envelope(self) -> Envelope | None:
         """Of the observations that were learned from; None where none were, or their condition is not read."""
-        for calls in self._calls.values():
-            condition = self.runner.model.condition(calls.contexts)
-            most = min(COMPONENTS, numbers_of([tuple(condition.shape[1:])]))
-            return envelope_of(condition, calls.episodes, most) if most else None
-        return None
+        if (calls := next(iter(self._calls.values()), None)) is None:
+            return None
+        condition = self.runner.model.condition(calls.contexts)
+        most = min(COMPONENTS, numbers_of([tuple(condition.shape[1:])]))
+        return envelope_of(condition, calls.episodes, most) if most else None
 
     def _to_learn_from(self, window: int) -> Calls:
         if window not in self._calls:
             fewest, loop = self.limits.fewest, self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
-            most = self._affordable(name)
+            most, until = self._affordable(name), self.clock.until(self.until_share)
             calls = draw_calls(self.runner, self.episodes, self.split, most, self.seed, window)
-            work = self.state, self.clock.until(self.until_share), self.bar, self.pool
-            self._calls[window] = with_targets(self.runner, name, calls, fewest, *work)
+            self._calls[window] = with_targets(self.runner, name, calls, fewest, self.state, until, self.bar, self.pool)
             if self.clock.left() < 0:
                 self.bar.warn(
                     f"{self.clock.limit / 60:g} minutes were over when the calls to learn from had been answered:"
@@ -259,20 +258,17 @@ class Trials:
         return normalized(spec, observed(spec, self.episodes, places))
 
     def noise(self, spec: PolicySpec, keys: Sequence[tuple[int, ...]]) -> Noise:
-        """The noise of some calls, the same numbers for every plan.
+        """The noise of calls with these keys (``noise_key``), the same numbers for every plan.
 
         As many as the original's horizon has are drawn for every step, so that a loop of as many steps has the same,
         and any loop begins alike.
-
-        Args:
-            keys: of each call, what tells it from others: part, stretch, row and draw.
         """
         drawn = [noise_of_any_horizon(spec, np.random.default_rng((self.seed, 5, *key)), 1) for key in keys]
         draws = [one.steps for one in drawn if one.steps is not None]
         return Noise(np.concatenate([one.initial for one in drawn]), np.concatenate(draws, 1) if draws else None)
 
-    def key(self, part: str, stretch: int, row: int, draw: int) -> tuple[int, ...]:
-        """See ``noise``."""
+    def noise_key(self, part: str, stretch: int, row: int, draw: int) -> tuple[int, ...]:
+        """What ``noise`` tells a call from others by."""
         return _NUMBERS[part], stretch, row, draw
 
     def _draws(self, part: str, calls: int) -> int:
@@ -307,7 +303,7 @@ class Trials:
         view = view_of(self.artifact, DENSE)
         spec = view.manifest.spec
         asked = [(int(s), int(row), draw) for s, row in calls for draw in range(draws)]
-        noise = self.noise(spec, [self.key(part, *one) for one in asked])
+        noise = self.noise(spec, [self.noise_key(part, *one) for one in asked])
         places = [(int(stretches[s, 0]), row) for s, row, _ in asked]
         key = f"{part} answers"
         kept = self.state.get(key)

@@ -16,7 +16,7 @@ from ..core.lattice import PlanArray
 from .step_counts import other_placements, spacings
 from .task import Array, Found, Task
 
-DISTANCES = (8, 4, 2, 1)
+MOVED_BY = (8, 4, 2, 1)
 """How far a step is moved, in either direction. All steps are tried at one distance before the next."""
 
 
@@ -35,7 +35,7 @@ class Tts:
         self.loss = float("nan")
         others = other_placements(model.steps, self._full)
         self._family = [*spacings(model.steps, self._full), *(others or ())]
-        self._moves = [(distance, i) for distance in DISTANCES for i in range(1, self._full)] if others is None else []
+        self._moves = [(distance, i) for distance in MOVED_BY for i in range(1, self._full)] if others is None else []
         self.intervals = len(self._family) + len(self._moves)
         self._found: Found | None = None
 

@@ -115,16 +115,12 @@ class WholeSteps:
         """The errors of a schedule, and ``_pace``: what is done for a candidate, wherever that is."""
         reads = self.reads(len(steps))
         clock = Clock()
-        errors = min((self._error_with(steps, with_) for with_ in (reads, None)), key=lambda found: found.normalised)
+        errors = min((self._error_with(steps, one) for one in (reads, None)), key=lambda found: found.normalised)
         self._pace = max(self._pace, clock.elapsed() / len(steps))
         return errors, self._pace
 
-    def correction(self, steps: Sequence[int]) -> Correction | None:
-        """The correction of a schedule, fitted on all calls; None where the schedule is better without."""
-        return self.correction_of(self.plan(steps))
-
     def correction_of(self, plan: PlanArray | MakePlans) -> Correction | None:
-        """The same for any plan ``[K, blocks]``, or for whatever makes plans ``[N, K, blocks]`` of N calls."""
+        """Of a plan ``[K, blocks]``, or of what makes plans of calls, fitted on all calls; None if better without."""
         plans = _plans(plan, self._calls)
         reads = self.reads(max(1, int(anchors_of(plans).sum())))  # of whole steps, those that are computed
         fitted = fit_correction(self._runner, _plans(plan, self._fitted), self._fitted, reads)
@@ -196,7 +192,7 @@ class WholeSteps:
         return self._pace * full_steps
 
     def correcting(self, full_steps: int) -> float:
-        """Seconds that ``correction`` of a schedule takes, by the comparisons so far; 0 before any."""
+        """Seconds that ``correction_of`` a schedule takes, by the comparisons so far; 0 before any."""
         share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
         return (1 + 2 * share) * self.comparing(full_steps)  # without jumps, and with them
 
@@ -245,8 +241,8 @@ class ScheduleRuns:
     places where they may part are kept. All placements of three steps among 16 take a third of the evaluations so.
     """
 
-    def __init__(self, loop: SparseLoop, steps: int, blocks: int, bytes_: int = BYTES) -> None:
-        self._loop, self._steps, self._bytes = loop, steps, bytes_
+    def __init__(self, loop: SparseLoop, steps: int, blocks: int, most_bytes: int = BYTES) -> None:
+        self._loop, self._steps, self._most_bytes = loop, steps, most_bytes
         self._computed: PlanArray = np.full((1, blocks), Source.COMPUTE, np.int8)
         self._idle: PlanArray = np.full((1, blocks), Source.TIMESTEP, np.int8)
         self._kept: dict[tuple[int, ...], list[Place]] = {}
@@ -256,7 +252,7 @@ class ScheduleRuns:
         *before, last = steps
         with workers() as pool:
             for count in range(1, len(before) + 1):
-                self._go(tuple(before[:count]), steps[count], pool)
+                self._keep_places(tuple(before[:count]), steps[count], pool)
             place = self._loop.after(self._parting(tuple(before), last), self._computed, pool)
             while place.step < self._steps:
                 place = self._loop.after(place, self._idle, pool)
@@ -267,7 +263,7 @@ class ScheduleRuns:
         """Where a schedule is before a step, after having computed some."""
         return self._kept[before][step - before[-1] - 1] if before else self._loop.begin
 
-    def _go(self, steps: tuple[int, ...], to: int, pool: ThreadPoolExecutor) -> None:
+    def _keep_places(self, steps: tuple[int, ...], to: int, pool: ThreadPoolExecutor) -> None:
         """Compute the last of these steps, and no other one up to a later step; keep all places from there to that."""
         places = self._kept.pop(steps, [])
         self._kept[steps] = places  # the last of them is the one that was of use last
@@ -282,6 +278,6 @@ class ScheduleRuns:
             for steps, places in self._kept.items()
         }
         for steps in list(held):
-            if sum(held.values()) <= self._bytes:
+            if sum(held.values()) <= self._most_bytes:
                 return
             del held[steps], self._kept[steps]

@@ -153,7 +153,7 @@ def test_a_small_network_is_searched_with_more_calls_than_its_rules_were_tried_o
 
     def told(runner: Runner, calls: Calls, budget: int, seed: int, pool: Pool, small: bool = False) -> Task:
         learned.append((calls.count, small))
-        return of(runner, calls, budget, seed, pool, small)
+        return of(runner, calls, budget, seed, pool, small=small)
 
     monkeypatch.setattr(loops, "calls_to_learn_from", lambda *_, corrects: CallLimits(8, 16, 16))
     monkeypatch.setattr(loops, "MOST_NEEDED", 16)

@@ -34,9 +34,9 @@ from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..schedule import open_search, resumed_search
-from ..step_counts import COUNTS, TRIED, SpacedSchedules
+from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules
 from ..task import Found, Task
-from ..trials import Trials
+from ..trials import LEARNED, Trials
 
 HOPELESS = 5.0
 """A number of steps is not searched any further if the error of its crowded schedules, as a share of what other noise
@@ -86,7 +86,7 @@ class Loops(Proposer):
         """See ``Proposer``. Of a policy of one step all cells, for what is learned after it."""
         if max(loop.steps for loop in trials.artifact.manifest.spec.all_loops.values()) == 1:
             self.told = "one evaluation gives the actions: there is nothing to reuse between steps"
-            yield Proposal(f"{ORIGINAL}.1", replace(plan, precision={}, repair=True), margin=float("inf"))
+            yield Proposal(_name(ORIGINAL, 1), replace(plan, precision={}, repair=True), margin=float("inf"))
             return
         costs = {loop: self._cost(trials, loop, clock) for loop in trials.artifact.manifest.spec.all_loops}
         close, far = self._by_distance(trials, costs)
@@ -144,7 +144,7 @@ class Loops(Proposer):
         task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
         if small and clock.left() > 0:
-            task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small), clock=clock)
+            task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small=small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         reached = False  # what is wanted; then one number of steps more is tried
         for number, count in enumerate(counts):
@@ -173,7 +173,7 @@ class Loops(Proposer):
         for number, count in enumerate(counts):
             if number and (task.clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
                 break
-            quick = crowded.best(count, f"{loop}, {count} steps", TRIED)
+            quick = crowded.best(count, f"{loop}, {count} steps", FEWER_CROWDINGS)
             if quick is None:  # no time; a search gives something
                 task.clock.cut = True
                 return hopeful or [count]
@@ -192,8 +192,8 @@ class Loops(Proposer):
         return [n for n, score in scores if score is None or score.distance <= REACH * wanted] or counts[-1:]
 
     def _proposal(self, task: Task, loop: str, count: int, found: Found) -> Proposal:
-        self._tasks[_name(loop, count)] = task
         name, made = _name(loop, count), Plan(loop, found.schedule, found.correction, repair=True)
+        self._tasks[name] = task
         return Proposal(name, made, found.notes, beside=True, refusal=partial(self._refusal, name))
 
     def _judged(self, proposal: Proposal, cost: float) -> Proposals:
@@ -265,14 +265,14 @@ class Loops(Proposer):
         for precision in ({}, *([dict.fromkeys(record.kept, record.name)] if record is not None else [])):
             plans = [Plan(loop, uniform_plan(steps, blocks, n), precision=precision) for n in (1, more)]
             runtime = open_runtime(artifact, "onnxruntime", self.request.threads, None, plans[0])
-            noise = trials.noise(view_of(artifact, plans[0]).manifest.spec, [(0, 0, 0, 0)])
+            noise = trials.noise(view_of(artifact, plans[0]).manifest.spec, [trials.noise_key(LEARNED, 0, 0, 0)])
             one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
             found.append((one, max(most - one, 0.0) / max(more - 1, 1)))
         return min(found)
 
 
 def _name(loop: str, count: int) -> str:
-    return f"{loop.replace('+', '')}.{count}"
+    return f"{loop.replace('+', '')}.{count}"  # in the name of a plan a + is before a part
 
 
 def _ending(clock: Clock, seconds: float) -> Clock:

@@ -128,7 +128,7 @@ class Student:
         """The calls as far as nothing of them is trained."""
         parts = [np.arange(i, min(i + PART, calls.count)) for i in range(0, calls.count, PART)]
         with workers() as pool:
-            carried = list(pool.map(self._until, [self.runner.select(calls, part) for part in parts]))
+            carried = list(pool.map(self._carried_to_begin, [self.runner.select(calls, part) for part in parts]))
         return Lesson(calls, Carried(*(torch.cat(each) for each in zip(*carried, strict=True))))
 
     def update(self, lesson: Lesson, passed: float) -> float:
@@ -185,7 +185,7 @@ class Student:
         order = np.random.default_rng((self._seed, 6, turn)).permutation(count)
         return np.asarray(order[place * size : (place + 1) * size])
 
-    def _until(self, calls: Calls) -> Carried:
+    def _carried_to_begin(self, calls: Calls) -> Carried:
         loop = self._loop(calls)
         with torch.no_grad():
             return deque((next(loop) for _ in range(self.begin)), maxlen=1).pop()

@@ -228,8 +228,8 @@ class Paper(NothingAfter):
     def _compare(self) -> None:
         task, calls, values = self._task, self._compared, self._priced()
         plans = legal(pruner_plan(self._logits(values, calls).numpy()), calls.window)
-        error = float(task.actions.errors(task.runner.run(plans, calls), calls.targets, units=False).mean())
-        if self._interval:
+        error = task.error(plans, calls)
+        if self._interval:  # before any update these are whole steps
             self.trained = min(self.trained, error)
         if not error >= self.loss:  # also if nothing was measured before
             self._best, self.loss = values, error

@@ -86,10 +86,7 @@ def legal(wished: PlanArray, window: int) -> PlanArray:
 
 def written(plans: PlanArray, window: int) -> BoolArray:
     """Which cells an earlier call of its window computed, bool ``[N, K, blocks]``."""
-    computed: BoolArray = (plans == Source.COMPUTE).reshape(-1, window, *plans.shape[1:])
-    earlier = np.zeros_like(computed)
-    earlier[:, 1:] = np.logical_or.accumulate(computed, axis=1)[:, :-1]
-    return np.asarray(earlier.reshape(plans.shape))
+    return np.asarray(latest_before(plans, window) >= 0)
 
 
 def _earlier(column: PlanArray, computed: Tensor, axis: int, window: int) -> Tensor | None:
