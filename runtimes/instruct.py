@@ -33,7 +33,11 @@ class Instruct:
         return self._read(ObservationError)
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The observation with tokens and mask of its ``task``, a text or one for each stream; or as it is."""
+        """The observation with tokens and mask of its ``task``, a text or one for each stream; as it is if it has them.
+
+        Raises:
+            ObservationError: it has neither, or the task is no text, or one without the state that it is told with.
+        """
         if not isinstance(obs, Mapping) or self._told.tokens in obs:
             return obs
         if TASK not in obs:

@@ -85,7 +85,7 @@ def test_a_frame_has_no_axis_of_streams(instruct: Instruct) -> None:
         instruct.of_frame({"state": STATE, "task": ["push"]})
 
 
-def test_what_has_no_text_or_has_tokens_is_left_as_it_is(instruct: Instruct) -> None:
+def test_tokens_are_left_as_they_are_and_a_call_needs_them_or_a_text(instruct: Instruct) -> None:
     for frame in ({"state": STATE}, {"task": "push", "tokens": np.ones(3, np.int64)}):
         assert instruct.of_frame(frame) is frame
     assert instruct(frame) is frame
