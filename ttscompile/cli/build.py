@@ -33,7 +33,7 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 @click.argument("checkpoint", type=PATH_OR_HUB)
 @trajectories_options(
     required=False,
-    what="Learn from these recorded episodes; without any, from those of the policy's training, if it says which.",
+    what="Learn from these recorded episodes; without any, from those of its training, if CHECKPOINT says which.",
 )
 @click.option("-o", "--output", "directory", required=True, type=PATH, help="Write the artifact into this folder.")
 @number_option(

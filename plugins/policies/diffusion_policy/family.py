@@ -66,9 +66,11 @@ def recordings(path: Path) -> str | None:
     """The data set of the training, where it lay then; see ``Family``."""
     refuse_file(path)
     config = _config(read_checkpoint(path))
-    named = next((each for key in ("zarr_path", "dataset_path") if (each := config.get(f"task.dataset.{key}"))), None)
-    if named is None or Path(str(named)).exists():
-        return named if named is None else str(named)
+    named = config.get("task.dataset.zarr_path") or config.get("task.dataset.dataset_path")
+    if not named:
+        return None
+    if Path(str(named)).exists():
+        return str(named)
     raise CheckpointError(
         f"{path}: it was trained on {named!s:.200}, and there is no such file here. Run this in the folder where the"
         " training ran, or give recorded episodes of its robot, with --trajectories."

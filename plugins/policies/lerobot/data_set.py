@@ -20,12 +20,10 @@ def recordings(directory: Path) -> str | None:
     data = read_json(directory / NOTE).get("dataset") if (directory / NOTE).is_file() else None
     name, root = (data.get("repo_id"), data.get("root")) if isinstance(data, dict) else (None, None)
     folders = [Path(root)] if isinstance(root, str) else []
-    if not isinstance(name, str):
-        name = ""
-    if _NAME.fullmatch(name):
+    if isinstance(name, str) and _NAME.fullmatch(name):
         folders.append(_home() / name)
     here = (str(folder) for folder in folders if (folder / "meta" / "info.json").is_file())
-    return next(here, f"{DATA_SETS}{name}" if name else None)
+    return next(here, f"{DATA_SETS}{name}" if isinstance(name, str) else None)
 
 
 def _home() -> Path:
