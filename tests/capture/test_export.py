@@ -166,7 +166,7 @@ def test_what_an_attribute_raises_is_told() -> None:
         ttscompile.compile_denoiser(module, toy_spec())
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.trace:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace")  # whose class torch has changed
 def test_torchscript_is_refused() -> None:
     module = Denoiser(lambda y, t, o: y)
     module.linear = torch.jit.trace(module.linear, torch.zeros(1, 4, 2))

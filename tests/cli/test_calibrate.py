@@ -84,7 +84,8 @@ def test_a_plan_that_is_far_off_is_written_and_a_failed_check(monkeypatch: pytes
     monkeypatch.setattr("ttscompile.calibrate", lambda *_, **__: SimpleNamespace(doubtful=doubtful), raising=False)
     result = run(*COMMAND)
     assert result.exit_code == doubtful
-    assert "identity" in result.stdout
+    assert "All about it: ttscompile inspect out\nidentity " in result.stdout
+    assert len(result.stdout.splitlines()) < 15, "the verdict, and not all that inspect shows"
 
 
 def test_every_strategy_can_be_asked_for(asked: list[Any]) -> None:

@@ -1,6 +1,7 @@
 """``ttscompile predict``: observations of words, files and pictures; the chunk as a table, as JSON and as a picture."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from tests.families import cameras
 from tests.once import Once
 from ttscompile import ObservationSpec
 from ttscompile.cli import main
-from ttscompile.cli.predict import observed
+from ttscompile.cli.predict import _option, observed
+from ttscompile.core.tokenizer import Instruction
 from ttscompile.errors import ObservationError
 from ttscompile.runtimes.policy import CompiledPolicy
 
@@ -135,7 +137,7 @@ def test_a_state_among_several_vectors_is_refused() -> None:
         (["--state", "1,2,3"], "observation 'obs' has the wrong shape: expected float32 [B, 2]"),
         (["--state", "1,x"], "expected numbers with commas between"),
         (["--state", "1,nan"], "must be finite"),
-        ([], "missing: ['obs']"),
+        ([], "the observation lacks obs (--state NUMBER,..). Give it so, or arrays by key: --observation FILE.npz."),
         (["--state", "1,2", "--image", "front"], "expected NAME=FILE"),
         (["--state", "1,2", "--image", "front=nowhere.png"], "nowhere.png"),
         (["--state", "1,2", "--task", "push"], "the policy reads no text; compiled in is 'none'"),
@@ -149,6 +151,12 @@ def test_bad_input_ends_with_2_and_one_error(toy_compiled: Path, words: list[str
     assert result.stderr.lower().count("error: ") == 1
 
 
+def test_tokens_are_given_by_the_task_where_a_text_gives_them() -> None:
+    spec = cameras.policy("shared", told=True)[1]
+    assert _option("mask", spec) == "--observation FILE.npz"
+    assert _option("mask", replace(spec, instruction=Instruction("tokens", "mask", new_line=False))) == "--task TEXT"
+
+
 def test_pictures_state_and_an_archive_together(once: Once, tmp_path: Path) -> None:
     artifact = once.folder("seeing", cameras.compile_seeing) / "artifact"
     shown = picture(tmp_path / "a.png", cameras.SIDE, cameras.SIDE)
@@ -158,4 +166,5 @@ def test_pictures_state_and_an_archive_together(once: Once, tmp_path: Path) -> N
     told = json.loads(run(artifact, *words, "--observation", tmp_path / "rest.npz", "--json").stdout)
     assert np.isfinite(told["actions"]).all()
     assert told["notes"][-1] == "state: one frame stands for all 2 that are read" and len(told["notes"]) == 3
-    assert "missing: ['mask', 'tokens']" in run(artifact, *words).stderr
+    assert "the observation lacks tokens (--observation FILE.npz), mask (--obs" in run(artifact, *words).stderr
+    assert "lacks left (--image left=FILE), right (--image right=FILE), state (--state" in run(artifact).stderr

@@ -17,6 +17,8 @@ from tests.runtimes.toys import toy_program
 from ttscompile.artifact import load_artifact
 from ttscompile.core.correction import Correction, no_correction
 from ttscompile.core.lattice import Source
+from ttscompile.measure import machine
+from ttscompile.runtimes.onnxruntime.sessions import EXACT_INTEGERS
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp" / "main.cpp"
 CALLS = 5
@@ -80,6 +82,16 @@ def test_an_episode_is_what_python_computes(program: Path, tmp_path: Path, strea
     found = np.array([[float(number) for number in line.split()] for line in result.stdout.splitlines()])
     np.testing.assert_allclose(found, np.stack(expected), rtol=1e-6)
     assert re.fullmatch(r"(call \d: [\d.]+ ms\n){5}", result.stderr)
+
+
+def test_it_looks_for_the_processors_that_python_looks_for() -> None:
+    """Those on which sums of eight-bit products are exact without the option."""
+    source = SOURCE.read_text()
+    assert set(re.findall(r'word == "(\w+)"', source)) == set(machine._DOT_PRODUCTS)
+    assert (
+        f'if (!has_integer_dot_product()) check(ort->AddSessionConfigEntry(options, "{EXACT_INTEGERS}", "1"));'
+        in source
+    )
 
 
 def test_what_is_wrong_is_said(program: Path, tmp_path: Path) -> None:

@@ -90,6 +90,14 @@ def test_the_bound_on_the_sample_is_kept_or_refused(payload: Build, save: Save) 
         load_checkpoint_policy(save(built), options=LoadOptions(sampler="dpmsolver++", steps=8))
     spec = load_checkpoint_policy(save(built), options=LoadOptions(sampler="ddim", steps=8))[1]
     assert (spec.sampler.clip, spec.loops["ddim-8"].clip) == (2, 2)
+    scheduler["thresholding"] = True  # which diffusers has instead
+    for sampler in ("ddim", "dpmsolver++"):
+        spec = load_checkpoint_policy(save(built), options=LoadOptions(sampler=sampler, steps=8))[1]
+        assert (spec.sampler.clip, spec.loops[f"{sampler}-8"].clip) == (1, 1)
+        scheduler["sample_max_value"] = 2.0
+        with pytest.raises(SpecError, match="thresholding=True depends on the whole sample"):
+            load_checkpoint_policy(save(built), options=LoadOptions(sampler=sampler, steps=8))
+        scheduler["sample_max_value"] = 1.0
 
 
 @pytest.mark.parametrize(
@@ -108,6 +116,21 @@ def test_a_policy_of_the_solver_gets_no_bound_that_it_had_not(
     own |= {"thresholding": True, "sample_max_value": 1.5}
     with pytest.raises(SpecError, match="thresholding=True depends on the whole sample"):
         load_checkpoint_policy(save(built), options=LoadOptions(sampler=sampler, steps=5))
+
+
+@pytest.mark.parametrize("own", ["UniPCMultistepScheduler", "DEISMultistepScheduler", "EulerDiscreteScheduler"])
+@pytest.mark.parametrize(("sampler", "first"), [("ddim", 15), ("dpmsolver++", 16)])
+def test_nor_does_one_of_another_solver(payload: Build, save: Save, own: str, sampler: str, first: int) -> None:
+    """Those of diffusers leave the predicted sample as it is, but for thresholding."""
+    built = payload()
+    scheduler = built["cfg"]["policy"]["noise_scheduler"] = BETAS | {"_target_": f"diffusers.{own}"}
+    for changes, bound, at in (({}, None, first), ({"thresholding": True}, 1, {"ddim": 15}.get(sampler, 19))):
+        path = save(payload_with(built, changes))
+        table = load_checkpoint_policy(path, options=LoadOptions(sampler=sampler, steps=4))[1].sampler
+        assert (table.clip, table.timesteps[0]) == (bound, at)
+    scheduler["sample_max_value"] = 1.5
+    with pytest.raises(SpecError, match="thresholding=True depends on the whole sample"):
+        load_checkpoint_policy(save(built), options=LoadOptions(sampler=sampler, steps=4))
 
 
 def payload_with(built: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

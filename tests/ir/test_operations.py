@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrizations, parametrize
 
 from tests.ir.meta import assert_types
 from tests.ir.operation_examples import EXAMPLES
@@ -161,6 +162,23 @@ def test_a_network_with_an_operation_without_a_row_is_refused_at_capture() -> No
 
     with pytest.raises(CaptureError, match=r"ndtri.*test_operations.py:\d+ in forward.* has no row"):
         capture(Uncommon([]), toy_spec(sample=(4, 1), obs=(4, 6)))
+
+
+@pytest.mark.slow
+def test_an_operation_that_makes_a_weight_is_refused_with_the_remedy() -> None:
+    class Narrow(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.leave = parametrizations.orthogonal(nn.Linear(6, 1))
+
+        def forward(self, sample: Tensor, timestep: Tensor, obs: Tensor) -> Tensor:
+            return sample + timestep[:, None, None] * self.leave(obs)
+
+    network, spec = Narrow(), toy_spec(sample=(4, 1), obs=(4, 6))
+    with pytest.raises(CaptureError, match=r"householder.*where it makes a weight, call torch.nn.*remove_param"):
+        capture(network, spec)
+    parametrize.remove_parametrizations(network.leave, "weight")
+    assert len(capture(network, spec)[1]) >= 2
 
 
 def _nodes(has: str) -> list[tuple[Graph, Node]]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import ttscompile
-from tests.commands import done
+from tests.commands import as_json, done
 from tests.once import Once
 from tests.plans import base_plan
 from ttscompile import Noise, Plan
@@ -144,6 +144,18 @@ def test_a_timing_says_that_its_calls_begin_with_a_chunk(warm: CompiledPolicy, w
     assert [one.otherwise for one in measured] == [None, None, "full", "full"]
     assert "'warm' was timed with the chunk of the call before; the first call of" in timing_remarks(measured)
     assert "with the chunk" not in timing_remarks(measured[:2])
+
+
+def test_predict_says_why_its_call_is_of_another_plan(whole: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "obs.npz", **drawn(0, 1)[0])
+    for words, note in (
+        ((), "plan 'warm' begins with the chunk of the call before; a first call has none, and computes plan 'full'"),
+        (("--plan", "dense"), None),
+        (("--plan", "full"), None),
+    ):
+        told = as_json("predict", whole, "--observation", tmp_path / "obs.npz", *words)
+        assert told["plan"] == (words[-1] if words else "full")
+        assert told["notes"] == [one for one in (note,) if one is not None]
 
 
 def test_a_page_of_an_episode_leaves_the_first_call_out(whole: Path, tmp_path: Path) -> None:

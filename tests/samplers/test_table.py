@@ -57,6 +57,8 @@ CASES: list[tuple[type[Any], dict[str, Any], int, dict[str, Any]]] = [
     (DDIMScheduler, {}, 10, {"eta": 0.7}),
     (DDIMScheduler, {}, 10, {"eta": 1.0, "use_clipped_model_output": True}),
     (DDIMScheduler, {"prediction_type": "v_prediction"}, 10, {}),
+    (DDPMScheduler, {"thresholding": True, "clip_sample_range": 2.0}, 25, {}),
+    (DDIMScheduler, {"thresholding": True, "clip_sample": False, "dynamic_thresholding_ratio": 0.5}, 10, {}),
 ]
 
 
@@ -191,7 +193,8 @@ def test_bounds_that_differ_are_refused() -> None:
 @pytest.mark.parametrize(
     ("scheduler_class", "settings", "message"),
     [
-        (DDPMScheduler, {"thresholding": True}, "thresholding=True"),
+        (DDPMScheduler, {"thresholding": True, "sample_max_value": 2.0}, "thresholding=True"),
+        (DDIMScheduler, {"thresholding": True, "sample_max_value": 0.5}, "makes it a clip"),
         (DDPMScheduler, {"variance_type": "learned_range"}, "variance_type='learned_range'"),
         (DDIMScheduler, {"rescale_betas_zero_snr": True, "timestep_spacing": "trailing"}, "not finite"),
         (DPMSolverMultistepScheduler, {"thresholding": True, "sample_max_value": 1.5}, "makes it a clip"),

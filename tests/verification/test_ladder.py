@@ -54,7 +54,7 @@ def test_a_sound_artifact_holds(sound: Path) -> None:
     found = ttscompile.verify(sound)
     assert [rung.name for rung in found.rungs] == LADDER
     assert {rung.name: rung.told for rung in found.rungs[:-1] if rung.status == FAILED} == {}
-    assert {rung.name for rung in found.rungs if rung.status == SKIPPED} == {"sparsity error"}
+    assert {rung.name for rung in found.rungs[:-1] if rung.status == SKIPPED} == {"sparsity error"}
     assert all(rung.figure is not None and rung.figure < PROMISED for rung in found.rungs[2:7]), "exports are exact"
     assert found.identity == read_manifest(sound).identity
     assert found.map is not None
@@ -300,7 +300,7 @@ def test_a_record_of_another_policy_is_refused(artifact: Path) -> None:
 def test_episodes_are_judged_by_what_other_noise_would_change(artifact: Path, recording: Path) -> None:
     found = ttscompile.verify(artifact, [recording], calls=8)
     rung = found.rung("sparsity error")
-    assert rung.details["calls"] >= 8
+    assert 8 <= rung.details["calls"] <= 32 and " (few: more than 32 say more): " in rung.told
     assert set(rung.details["plans"]) == {"schedule", "other", "pruner"}
     assert rung.tolerance == rung.details["other_noise"]
     assert rung.status == PASSED, rung.told

@@ -238,8 +238,10 @@ class _Converter:
         value, target = fx_node.meta.get("val"), fx_node.target
         if value is None or isinstance(value, torch.SymInt | torch.SymBool | int | bool):
             return None  # sizes are solved by _size; assertions on them hold by construction
+        line = _source(fx_node)
+        where = f"%{fx_node.name} ({line})"
         if isinstance(value, torch.SymFloat):
-            raise CaptureError(f"%{fx_node.name} ({_source(fx_node)}): {ON_VALUES}")
+            raise CaptureError(f"{where}: {ON_VALUES}")
         source: Any = next(iter(fx_node.args), None)
         whole = source if target is operator.getitem else fx_node
         if whole.target in _SPLITS and len(whole.meta["val"]) == 1:  # one part is what was split
@@ -251,21 +253,15 @@ class _Converter:
             # Values have no strides here: a view of whatever layout is a reshape.
             op = _RESHAPE if target in _VIEWS else str(target).replace("lift_fresh_copy", "clone")  # of torch.tensor(1)
         else:
-            raise CaptureError(
-                f"%{fx_node.name} ({_source(fx_node)}) calls {target}, which is no ATen operation."
-                " Replace the custom or higher-order operation (cond, scan, autocast region) by plain tensor code."
-            )
+            remedy = "Replace the custom or higher-order operation (cond, scan, autocast region) by plain tensor code."
+            raise CaptureError(f"{where} calls {target}, which is no ATen operation. {remedy}")
         values = value if isinstance(value, tuple | list) else (value,)
         if any(v.is_complex() for v in values):
-            raise CaptureError(
-                f"%{fx_node.name} ({_source(fx_node)}) computes with complex numbers, which an artifact cannot hold."
-                " Write the rotary embedding with cosine and sine: left * cos - right * sin, right * cos + left * sin."
-            )
+            remedy = "the rotary embedding with cosine and sine: left * cos - right * sin, right * cos + left * sin."
+            raise CaptureError(f"{where} computes with complex numbers, which an artifact cannot hold. Write {remedy}")
         if any(v.dtype is torch.bfloat16 for v in values):
-            raise CaptureError(
-                f"%{fx_node.name} ({_source(fx_node)}) computes in bfloat16, for which onnxruntime has no arithmetic."
-                " Weights are captured as float32: cast to the dtype of a weight, or not at all."
-            )
+            remedy = "Weights are captured as float32: cast to the dtype of a weight, or not at all."
+            raise CaptureError(f"{where} computes in bfloat16, for which onnxruntime has no arithmetic. {remedy}")
         name = fx_node.name
         while name in self.taken:  # by a weight or an observation: a buffer ``cos`` beside the operation
             name += "_"
@@ -277,7 +273,7 @@ class _Converter:
             args=tuple(self._argument(fx_node, a) for a in fx_node.args),
             kwargs=tuple((k, self._argument(fx_node, a)) for k, a in sorted(fx_node.kwargs.items())),
             types=tuple(self._type(fx_node, v) for v in values),
-            source=_source(fx_node),
+            source=line,
         )
 
     def _argument(self, fx_node: torch.fx.Node, argument: Any) -> Argument:

@@ -99,6 +99,6 @@ def calibrate(
         result = ttscompile.calibrate(
             directory, trajectories=list(trajectories), observation=sources, **budget_and_search
         )
-    print_artifact(load_artifact(directory), as_json)
+    print_artifact(load_artifact(directory), as_json, whole=False)
     if result.doubtful:
         raise click.exceptions.Exit(Status.FAILED)

@@ -15,12 +15,14 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.cli.options import artifact_argument, json_option, seed_option
 from ttscompile.cli.output import print_identity, print_json, progress, results, say
 from ttscompile.cli.types import FILE, PATH, PICTURE, TEXT
-from ttscompile.core.spec import ObservationSpec
+from ttscompile.core.spec import ObservationSpec, PolicySpec
 from ttscompile.errors import ObservationError, needing
 from ttscompile.plots.figure import write_picture
 from ttscompile.plots.frontier import plot_chunk
 from ttscompile.runtimes.load import open_policy
 from ttscompile.trajectories.episodes import read_npz
+
+TASK = "--task TEXT"
 
 
 def _pictures(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, Path]:
@@ -90,12 +92,18 @@ def predict(
         compiled = f"the policy reads no text; compiled in is {spec.source.get('task', 'none')!r:.100}"
         told = compiled if spec.instruction is None else "the artifact has no tokenizer; name one by --tokenizer PATH"
         raise ObservationError(f"{directory}: --task {task!r:.100}: {told}. Or give tokens in --observation FILE.npz.")
+    options = {key: _option(key, spec) for key in spec.observations if key not in obs}
+    if told := ", ".join(f"{key} ({how})" for key, how in options.items() if task is None or how != TASK):
+        raise ObservationError(f"the observation lacks {told}. Give it so, or arrays by key: --observation FILE.npz.")
     with progress().status("loading"):
         policy = open_policy(artifact, seed=seed, plan=plan, tokenizer=tokenizer)
     chunk = policy.predict_action(obs if task is None else {**obs, "task": task})["action_pred"][0]
     report, executed = policy.last_report, range(spec.chunk.start, spec.chunk.stop)
     assert report is not None  # a call was made
     notes = [f"{key}: one frame stands for all {spec.observations[key].frames} that are read" for key in repeated]
+    if policy.info.follows:
+        asked = f"plan {policy.info.default_plan!r} begins with the chunk of the call before"
+        notes.append(f"{asked}; a first call has none, and computes plan {report.plan_name!r}")
     told, identity = f"plan {report.plan_name!r}, seed {seed}", artifact.manifest.identity
     if as_json:
         how = {"plan": report.plan_name, "seed": seed, "executed": [executed.start, executed.stop], "notes": notes}
@@ -142,6 +150,12 @@ def observed(
         given[key] = array
     whole = {key: _window(array, specs[key]) if key in specs else (array, False) for key, array in given.items()}
     return {key: array for key, (array, _) in whole.items()}, [key for key, (_, one) in whole.items() if one]
+
+
+def _option(key: str, spec: PolicySpec) -> str:
+    """The option that gives this observation."""
+    one, others = spec.observations[key], "--observation FILE.npz" if spec.instruction is None else TASK
+    return f"--image {key}=FILE" if one.image else "--state NUMBER,.." if np.dtype(one.dtype).kind == "f" else others
 
 
 def _camera(name: str, specs: Mapping[str, ObservationSpec]) -> str:

@@ -16,22 +16,23 @@ from ttscompile.report.summary import document
 from ttscompile.runtimes.instruct import instruct_of
 
 
-def print_artifact(artifact: Artifact, as_json: bool) -> None:
-    """What an artifact is: as tables, or as one JSON document."""
+def print_artifact(artifact: Artifact, as_json: bool, whole: bool = True) -> None:
+    """What an artifact is: as tables, all or those of its plans alone, or as one JSON document."""
     if as_json:
         print_json(document(artifact))
     else:
-        print_summary(artifact, results())
+        print_summary(artifact, results(), whole)
 
 
-def print_summary(artifact: Artifact, console: Console) -> None:
-    """What an artifact is, as the tables of its page: what it does first, then what it is made of."""
+def print_summary(artifact: Artifact, console: Console, whole: bool = True) -> None:
+    """What an artifact is, as the tables of its page: what it does first, then, if ``whole``, what it is made of."""
     manifest = artifact.manifest
     source = ", ".join(f"{k} {v}" for k, v in manifest.spec.source.items()) or "a module"
     rows = [("identity", manifest.short_identity), ("made from", source), *facts.policy(artifact).tables[0].rows]
     about = table("artifact", str(artifact.path), rows=rows)
     about.columns[1].justify = "left"
-    console.print(about)
+    if whole:
+        console.print(about)
     print_facts(console, facts.plan_table(artifact))
     record = manifest.calibration
     if record is None:
@@ -40,6 +41,9 @@ def print_summary(artifact: Artifact, console: Console) -> None:
         print_facts(console, facts.score_table(record))
         for line in facts.remarks(record):
             console.print(Padding(line, (0, 0, 0, 2)))  # as a row it would squeeze the figures
+    if not whole:
+        say(console, "", f"All about it: ttscompile inspect {artifact.path}")
+        return print_identity(manifest.identity, console)
     for made in (facts.block_table(manifest), *facts.hoisting(artifact).tables, usage.usage_table(artifact)):
         print_facts(console, made)
     console.print(Padding(usage.told_unused(artifact), (0, 0, 0, 2)))

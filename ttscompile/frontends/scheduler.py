@@ -93,25 +93,19 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
             raise CheckpointError(f"{where}: predict_epsilon contradicts {found}.")
     unknown = sorted(set(given).difference(*_SETTINGS.values()))
     if unknown and name == own_name:
-        raise CheckpointError(
-            f"{where} has settings that diffusers' {own} does not know: {', '.join(unknown)}."
-            " Remove them from the configuration if they are not needed, and save the checkpoint again."
-        )
-    if name == DPM and own_name != DPM:
-        given = _for_dpm_solver(given, where)
-    elif name != DPM == own_name:
-        bounds = bool(given.get("thresholding"))  # the only bound that it has, and one that is not at 1 is refused
-        given |= {"clip_sample": bounds, "thresholding": bounds and given.get("sample_max_value", 1) != 1}
+        told = f"{', '.join(unknown)}. Remove them from the configuration if they are not needed, and save it again"
+        raise CheckpointError(f"{where} has settings that diffusers' {own} does not know: {told}.")
+    if name != own_name:  # of diffusers, DDPM and DDIM have a bound where nothing is said, and nothing else has
+        given["clip_sample"] = own_name != DPM and given.get("clip_sample", own[:4] in ("DDPM", "DDIM", ""))
+        given = _for_dpm_solver(given, where) if name == DPM else given
     if spacing is not None:
         given["timestep_spacing"] = spacing
     trained = given.get("num_train_timesteps", 1000)
     if type(trained) is not int or not 1 <= trained <= MOST_TIMESTEPS:
         raise CheckpointError(f"{where}: num_train_timesteps is {trained!r:.80}; expected 1 to {MOST_TIMESTEPS}.")
     if steps is None and trained > MOST_STEPS:
-        raise CheckpointError(
-            f"{where}: num_train_timesteps is {trained}, and a call would take as many steps; expected {MOST_STEPS} at"
-            " most. Give a number of steps: steps= in Python, --steps on the command line."
-        )
+        found = f"num_train_timesteps is {trained}, and a call would take as many steps; expected {MOST_STEPS} at most"
+        raise CheckpointError(f"{where}: {found}. Give fewer: steps= in Python, --steps on the command line.")
     try:
         scheduler = _CLASSES[name](**{key: value for key, value in given.items() if key in _SETTINGS[name]})
         return sampler_table(
@@ -132,19 +126,20 @@ def _own_class(settings: Mapping[str, Any]) -> str:
 
 
 def _for_dpm_solver(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Settings of DPM-Solver++ for a network that was trained with DDPM or DDIM on these.
+    """Settings of DPM-Solver++ for a network that was trained with another scheduler on these.
 
     DDPM and DDIM bound the predicted sample (``clip_sample``), DPM-Solver++ has no such setting. Its dynamic
     thresholding with a largest value of 1, the default, is the same bound. Configurations of DDPM and DDIM say nothing
     about the spacing of this solver.
     """
-    clips, bound = settings.get("clip_sample", True), settings.get("clip_sample_range", 1.0)
-    if clips and bound != 1:
+    thresholds, bound = settings.get("thresholding"), settings.get("clip_sample_range", 1.0)
+    clips, most = thresholds or settings["clip_sample"], settings.get("sample_max_value", 1) if thresholds else 1
+    if clips and bound != 1 and not thresholds:
         found = f"clip_sample_range is {bound!r:.80}"
         raise SpecError(f"{where}: {found}; sampler {DPM} bounds the sample at 1 or not at all. Use ddpm or ddim.")
     blows_up = not clips and settings.get("prediction_type", "epsilon") == "epsilon"
     changed = {"timestep_spacing": "leading" if blows_up else "trailing", "variance_type": None}
-    return {**settings, **changed, "thresholding": bool(clips), "sample_max_value": 1.0}
+    return {**settings, **changed, "thresholding": bool(clips), "sample_max_value": most}
 
 
 def _step_arguments(

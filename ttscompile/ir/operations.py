@@ -76,8 +76,9 @@ def operation(op: str, where: str = "a graph") -> Operation:
     """The row of ``aten.NAME.OVERLOAD``. Raises CaptureError: there is none; says ``where``."""
     row = find_operation(op)
     if row is None:
-        what = f"operation {op!r} of {where} has no row in the table of operations, so nothing is known of it."
-        raise CaptureError(f"{what} Write it with other operations, or add it to ttscompile/ir/operations.py.")
+        what = f"operation {op!r} of {where} has no row in the table of operations, so nothing is known of it. Write it"
+        weights = "where it makes a weight, call torch.nn.utils.parametrize.remove_parametrizations first"
+        raise CaptureError(f"{what} with other operations, or add it to ttscompile/ir/operations.py; {weights}.")
     return row
 
 

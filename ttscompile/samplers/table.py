@@ -85,6 +85,7 @@ class _Chains:
         made: list[torch.Tensor] = []
         for k, timestep in enumerate(self._scheduler.timesteps):
             given.append(made[-1] if follow and k else samples[k])
+            where = f"sampler {self.name}: its step at timestep {int(timestep)}"
             own: Any = {"variance_noise": noise[k]} if self.multistep else {"generator": _generator(seeds[k])}
             try:
                 result = self._scheduler.step(outs[k], timestep, given[-1], **own, **self._step_arguments)
@@ -94,16 +95,11 @@ class _Chains:
                 meant.append(x0.double())
                 made.append(result.prev_sample.double())
             except Exception as error:
-                raise SpecError(
-                    f"sampler {self.name}: its step at timestep {int(timestep)} failed: {str(error).rstrip('.')}. Use a"
-                    " DDPM, DDIM or DPMSolverMultistep scheduler; arguments given to step:"
-                    f" {sorted(self._step_arguments)}."
-                ) from error
+                told = f"{where} failed: {str(error).rstrip('.')}. Use a DDPM, DDIM or DPMSolverMultistep scheduler"
+                raise SpecError(f"{told}; arguments given to step: {sorted(self._step_arguments)}.") from error
             if not (torch.isfinite(meant[-1]).all() and torch.isfinite(made[-1]).all()):
-                raise SpecError(
-                    f"sampler {self.name}: its step at timestep {int(timestep)} gives values that are not finite."
-                    " Check the betas (rescale_betas_zero_snr needs v_prediction)."
-                )
+                remedy = "Check the betas (rescale_betas_zero_snr needs v_prediction)"
+                raise SpecError(f"{where} gives values that are not finite. {remedy}.")
         return torch.stack(given), torch.stack(meant), torch.stack(made)
 
     def numbers(self, samples: Array, outs: Array) -> tuple[Array, Array]:
@@ -230,11 +226,9 @@ def _refuse_known(scheduler: Any) -> None:
         remedy = "Use DPMSolverMultistepScheduler.from_config(scheduler.config), which has the same betas."
         raise SpecError(f"sampler {name}: no table can be measured of its steps. {remedy}")
     # With a largest value of 1, dynamic thresholding is a plain clip to -1..1.
-    if config.get("thresholding") and not (_is_multistep(scheduler) and config.get("sample_max_value") == 1):
-        raise SpecError(
-            f"sampler {name}: thresholding=True depends on the whole sample; set it to False, or for DPM-Solver++"
-            " sample_max_value to 1, which makes it a clip."
-        )
+    if config.get("thresholding") and config.get("sample_max_value") != 1:
+        told = "depends on the whole sample; set it to False, or sample_max_value to 1, which makes it a clip"
+        raise SpecError(f"sampler {name}: thresholding=True {told}.")
     if str(config.get("variance_type", "")).startswith("learned"):
         raise SpecError(
             f"sampler {name}: variance_type={config['variance_type']!r} needs a network with twice the channels;"
@@ -279,20 +273,17 @@ def sampler_table(
         raise SpecError(f"sampler {name_of}: {steps} denoising steps are not possible: {error}") from error
     timesteps = torch.as_tensor(scheduler.timesteps)
     if timesteps.shape != (steps,):
-        raise SpecError(
-            f"sampler {name_of} has {len(timesteps)} timesteps for {steps} steps; use another number of steps or"
-            " timestep spacing, or another sampler: DDPM, DDIM, DPM-Solver++."
-        )
+        remedy = "use another number of steps or timestep spacing, or another sampler: DDPM, DDIM, DPM-Solver++"
+        raise SpecError(f"sampler {name_of} has {len(timesteps)} timesteps for {steps} steps; {remedy}.")
     rescale, x = getattr(scheduler, "scale_model_input", None), _draw(1)
     if rescale is not None and not torch.equal(rescale(x, timesteps[0]), x):
         raise SpecError(f"sampler {name_of} rescales the sample before the network; use DDPM, DDIM or DPM-Solver++.")
     if _is_multistep(scheduler):
         distinct = len(set(torch.as_tensor(scheduler.sigmas[:-1]).tolist()))
         if distinct != steps:
-            raise SpecError(
-                f"sampler {name or name_of}: {scheduler.config.timestep_spacing!r} timestep spacing gives {steps} steps"
-                f" only {distinct} different noise levels. Use fewer steps, or 'trailing' spacing."
-            )
+            found = f"sampler {name or name_of}: {scheduler.config.timestep_spacing!r} timestep spacing gives {steps}"
+            remedy = "Use fewer steps, or 'trailing' spacing"
+            raise SpecError(f"{found} steps only {distinct} different noise levels. {remedy}.")
     chains = _Chains(scheduler, steps, step_arguments or {})
     rows = _measure(chains)
     _verify(chains, rows)

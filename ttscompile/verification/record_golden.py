@@ -101,10 +101,8 @@ class _Recorder:
         initial, sample, given, predicted = (each[..., :kept, :] for each in (initial, sample, given, predicted))
         draws = None if draws is None else draws[..., :kept, :]
         if not (np.isfinite(predicted).all() and np.isfinite(sample).all()):
-            raise CaptureError(
-                "the module's prediction on a random observation within the range of its normaliser is not a number."
-                " Look for NaN in its weights, and check normaliser and sampler."
-            )
+            found = "the module's prediction on a random observation within the range of its normaliser is not a number"
+            raise CaptureError(f"{found}. Look for NaN in its weights, and check normaliser and sampler.")
         seen = {key: expand(stored, spec.observations[key].shape) for key, stored in self._observations.items()}
         actions, flops = spec.chunk.unnormalized(sample, spec.chunk.reference(seen)), program.dense_flops
         evaluated = _spread(steps, EVALUATIONS)

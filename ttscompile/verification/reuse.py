@@ -119,7 +119,8 @@ def check_episodes(
         before = f"more than {factor:g} times the {promised:.3g} that calibration measured on held-out calls"
         reasons.append(f"worse than calibrated, {before}")
     details |= {"promised": promised, "promised_p90": promised_p90, "reasons": reasons}
-    made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}: {found}"
+    made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}"
+    made += f"{f' (few: more than {FEW} say more)' * (calls <= FEW)}: {found}"
     if reasons:
         made += f". This is {'; and '.join(reasons)}"
     remedy = "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such"
