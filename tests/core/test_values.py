@@ -1,4 +1,4 @@
-"""Images of any size are resized as torch, openpi and torchvision do it."""
+"""Images of any size are resized as torch, openpi, Pillow and torchvision do it."""
 
 from pathlib import Path
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch.nn import functional
 
 from ttscompile import ObservationSpec
@@ -27,6 +28,23 @@ def test_it_is_torchs_bilinear_with_a_black_rest(size: tuple[int, int], fit: str
     before = (left, up) if fit == "start" else (left // 2, up // 2)
     expected = functional.pad(resized, (before[0], left - before[0], before[1], up - before[1]))[:, None]
     np.testing.assert_allclose(fitted(image, spec), expected.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(30, 50), (40, 48), (3, 40), (480, 640), (11, 13), (20, 7)])
+def test_in_bytes_it_is_pillows_bilinear_filter(size: tuple[int, int]) -> None:
+    """To the bit, as openpi's client resizes what a camera gives; halves, of which (40, 48) has many, go up.
+
+    Of these sizes Pillow 13 begins with the columns, too, as those before it do with any; openpi's is 11.
+    """
+    spec = ObservationSpec((1, 3, 20, 24), bounds=(0.0, 1.0), fit="bytes")
+    image = np.random.RandomState(0).randint(0, 256, (*size, 3), np.uint8)
+    ratio = max(size[1] / 24, size[0] / 20)
+    small = max(int(size[0] / ratio), 1), max(int(size[1] / ratio), 1)
+    resized = Image.fromarray(image).resize((small[1], small[0]), Image.Resampling.BILINEAR)
+    whole = Image.new("RGB", (24, 20))
+    whole.paste(resized, ((24 - small[1]) // 2, (20 - small[0]) // 2))
+    found = fitted(np.moveaxis(image, -1, 0)[None, None] / np.float32(255), spec)
+    np.testing.assert_array_equal(np.rint(found[0, 0] * 255), np.moveaxis(np.asarray(whole), -1, 0))
 
 
 def test_the_rest_has_a_colour() -> None:

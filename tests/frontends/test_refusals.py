@@ -53,9 +53,9 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
     (
         {"itr": 9, "model": {"actor_ft.mlp_mean.layers.0.l1.weight": W, "actor.a": W}},
         "a policy of DPPO",
-        "actor before",
+        r"with the \.hydra/config\.yaml",
     ),
-    ({"epoch": 9, "model": {"network.time_mlp.1.weight": W}, "ema": {}}, "a policy of DPPO", OWN_MODULE),
+    ({"epoch": 9, "model": {"network.time_mlp.1.weight": W}, "ema": {}}, "a policy of DPPO", "its training wrote"),
     ({"model": {"nn_model.fc1.0.model.0.weight": W}}, "of Diffusion BC without its schedule", "Model_Cond_Di"),
     (
         {"nets": {"nets": {"policy.noise_pred_net.blocks.0.attn.qkv.weight": W}}},
@@ -104,10 +104,9 @@ def test_torch_files(tmp_path: Path, payload: dict[str, Any], what: str, remedy:
 
 
 NAMES = [
-    ("DiffusionUnetTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
+    ("DiffusionUnetVideoPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
-    ("DiffusionTransformerTimmPolicy", "a diffusion policy with another observation encoder.*inside the module"),
     ("MyDiffusionUnetImagePolicy", r".*one of these renamed\. .* the name of that class at the end of cfg\.policy\._t"),
     ("RobotPolicy", r".*kind\. If its class adds nothing .* cfg\.policy\._target_\. Otherwise: Build"),
     ("MyPolicy", f"a policy of its own kind.*{OWN_MODULE}"),
@@ -131,7 +130,8 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["step_10/pretrained_model/config.json"], "around what lerobot saved.*Give the folder pretrained_model in it"),
     (["checkpoints/000200/pretrained_model/config.json"], "told by checkpoints/000200/pretrained_model.*in it"),
     (["meta/info.json", "data/chunk-000/file-000.parquet"], "a data set of LeRobot, not a policy.*with --trajectories"),
-    (["params/_METADATA", "params/manifest.ocdbt", "assets/norm.json"], "a JAX checkpoint.*Convert it to PyTorch"),
+    (["default/_METADATA", "default/manifest.ocdbt"], "a JAX checkpoint.*Convert it to PyTorch"),
+    (["_METADATA", "manifest.ocdbt"], "a JAX checkpoint.*of openpi, give the folder with params in it"),
     (["model.msgpack"], "a JAX checkpoint"),
     (["manifest.json", "weights.safetensors"], "compiled already.*ttscompile.load"),
     (["checkpoints/latest.ckpt", ".hydra/config.yaml"], "a directory of checkpoints.*latest.ckpt"),
@@ -145,8 +145,8 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
         ["config.json=model_type=xvla", "model.safetensors"],
         "an X-VLA .*beside the JSON files .* a LeRobot policy xvla,",
     ),
-    (["config.json=paligemma_variant=gemma_2b", "model.safetensors"], "openpi .*beside .* LeRobot policy pi0 or pi05,"),
-    (["30000/model.safetensors", "30000/metadata.pt"], r"openpi .told by 30000/metadata\.pt"),
+    (["30000/model.safetensors", "30000/metadata.pt"], r"around checkpoints of openpi .*30000/metadata\.pt.*one of"),
+    (["9/params/_METADATA", "9/_CHECKPOINT_METADATA"], r"around checkpoints of openpi .told by 9/params/_METADATA"),
     (["config.json=model_type=eo1", "model.safetensors"], "an EO-1 .*No tool makes LeRobot's eo1"),
     (["config.json=dof_config=7", "model.safetensors"], "a Wall-X .*No tool makes LeRobot's wall_x"),
     (["config.json=vlm_name=InternVL3", "mp_rank_00_model_states.pt"], "an Evo-1 .*No tool makes LeRobot's evo1"),

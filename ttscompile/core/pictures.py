@@ -1,5 +1,7 @@
 """Resizing images in numpy as the originals do it: with their proportions, or to a whole shape."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,22 +12,21 @@ _BEND = -0.5
 """Of the cubic filter, as Pillow has it."""
 
 
-def proportional(array: FloatArray, height: int, width: int, centre: bool, fill: tuple[float, ...] = ()) -> FloatArray:
+def proportional(array: FloatArray, height: int, width: int, fit: str, fill: tuple[float, ...] = ()) -> FloatArray:
     """Images ``[..., C, h, w]`` as large as fit, and black beside them, as openpi and LeRobot resize them.
-
-    Bilinear, without smoothing what becomes smaller.
 
     Args:
         array: in 0..1.
-        centre: whether they are in the middle, rather than at the bottom and the right.
+        fit: ``start``: at the bottom and the right, bilinear, without smoothing what becomes smaller; ``centre``: so in
+            the middle; ``bytes``: there, as Pillow's bilinear filter resizes bytes.
         fill: what is beside them in place of black, a number for each of the C channels.
     """
     before = array.shape[-2:]
     ratio = max(before[1] / width, before[0] / height)
     rows, columns = (max(int(n / ratio), 1) for n in before)
-    small = _bilinear(_bilinear(array, rows, -2), columns, -1)
+    small = _in_steps(array, rows, columns) if fit == "bytes" else _bilinear(_bilinear(array, rows, -2), columns, -1)
     top, left = height - rows, width - columns
-    if centre:
+    if fit != "start":
         small = np.clip(small, 0, 1)  # openpi clips what it resized
         top, left = top // 2, left // 2
     whole = np.zeros((*array.shape[:-2], height, width), np.float32)
@@ -55,6 +56,18 @@ def averaged(array: FloatArray, height: int, width: int) -> FloatArray:
     """Images ``[..., h, w]`` that fill the shape: each pixel the mean of all that it touches, as PyTorch's ``area``."""
     rows, columns = (_means(*each) for each in zip(array.shape[-2:], (height, width), strict=True))
     return np.asarray(rows @ array @ columns.T, np.float32)
+
+
+def _in_steps(array: FloatArray, rows: int, columns: int) -> FloatArray:
+    """Columns first, bytes after each, halves up; shares in steps of 2 ** -22, so every sum is exact."""
+    pixels: npt.NDArray[np.floating[Any]] = np.rint(in_bytes(array) * np.float32(255))
+    for axis, count in ((-1, columns), (-2, rows)):
+        before = pixels.shape[axis]
+        away = np.arange(before) + 0.5 - before / count * (np.arange(count)[:, None] + 0.5)
+        shares = np.maximum(1 - np.abs(away) / max(before / count, 1), 0)
+        shares = np.floor(shares / shares.sum(1, keepdims=True) * 2**22 + 0.5) / 2**22
+        pixels = np.floor((pixels @ shares.T if axis == -1 else shares @ pixels) + 0.5)
+    return np.asarray(pixels / 255, np.float32)
 
 
 def _means(before: int, count: int) -> FloatArray:

@@ -52,9 +52,9 @@ class ObservationSpec:
             each entry of the last axis; None if that is not known. Integers outside it are refused: they are rows of an
             embedding. So are images (``image``). A vector may stray from it. Kept as tuples.
         fit: of an image: one of another size is resized to this shape (``core.values``). With ``start`` and ``centre``
-            it keeps its proportions, and the rest is black: after it, or on both sides. With ``stretch`` it fills the
-            shape, and is rounded to 256 steps, whatever its size. With ``average`` it fills the shape, too, each pixel
-            the mean of those that it touches. None: no other size is taken.
+            it keeps its proportions, and the rest is black: after it, or on both sides; likewise with ``bytes``, in 256
+            steps. With ``stretch`` it fills the shape, in such steps whatever its size. With ``average`` it fills the
+            shape, too, each pixel the mean of those that it touches. None: no other size is taken.
         fill: of an image that keeps its proportions: what is beside it in place of black, a number for each channel.
         recorded: the arrays of a recording of frames that it is made of, in order, where none has its name: ``NAME``,
             or ``NAME:N``, the first N numbers of one (``trajectories.load_trajectories``).
@@ -65,7 +65,7 @@ class ObservationSpec:
     dtype: DType = "float32"
     window: bool = True
     bounds: tuple[float | tuple[float, ...], float | tuple[float, ...]] | None = None
-    fit: Literal["start", "centre", "stretch", "average"] | None = None
+    fit: Literal["start", "centre", "bytes", "stretch", "average"] | None = None
     fill: tuple[float, ...] = field(default=(), metadata=OMITTED)
     recorded: tuple[str, ...] = field(default=(), metadata=OMITTED)
 

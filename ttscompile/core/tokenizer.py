@@ -39,17 +39,19 @@ class StateInWords:
         first: ``[D]``, what is subtracted from it.
         width: ``[D]``, what the rest is divided by; not zero.
         ranged: whether that is the width of a range, which becomes -1..1, and not a deviation.
+        double: whether that is computed in float64, as openpi does; else in float32, as LeRobot does.
     """
 
     key: str
     first: tuple[float, ...]
     width: tuple[float, ...]
     ranged: bool
+    double: bool = field(default=False, metadata=OMITTED)
 
     def __call__(self, state: npt.NDArray[np.float32]) -> str:
         """The words of one state ``[D]``; below -1 it is -1, and beyond 1 the last part."""
-        first, width = np.asarray(self.first, np.float32), np.asarray(self.width, np.float32)
-        # In the order in which LeRobot computes it: an end of a range is an edge of a part, and rounding would move it.
+        first, width = np.array([self.first, self.width], np.float64 if self.double else np.float32)
+        # In the order in which both compute it: an end of a range is an edge of a part, and rounding would move it.
         inside = 2 * (state - first) / width - 1 if self.ranged else (state - first) / width
         return " ".join(map(str, np.digitize(inside, _PARTS) - 1))
 
@@ -131,10 +133,8 @@ class Tokenizer:
         try:
             import tokenizers
         except ModuleNotFoundError as missing:
-            remedy = "Install 'ttscompile[tokens]', or give tokens in place of text"
-            raise self._error(
-                f"{path}: text needs the package tokenizers, which is not installed. {remedy}."
-            ) from missing
+            remedy = "which is not installed. Install 'ttscompile[tokens]', or give tokens in place of text"
+            raise self._error(f"{path}: text needs the package tokenizers, {remedy}.") from missing
         try:
             made = _clip(path) if clip else tokenizers.Tokenizer.from_file(str(path))
         except Exception as damaged:  # of damaged files the package raises plain Exception

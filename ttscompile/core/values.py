@@ -85,8 +85,6 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
         return array
     array = array.copy()  # another thread may write into the caller's
     check_values(array, replace(spec, normalizer=None), what, error)  # what is resized is clipped, and looks right
-    if spec.fit == "stretch":
-        return stretched(array, height, width)
-    if spec.fit == "average":
-        return averaged(array, height, width)
-    return proportional(array, height, width, spec.fit == "centre", spec.fill)
+    if spec.fit in ("stretch", "average"):
+        return (stretched if spec.fit == "stretch" else averaged)(array, height, width)
+    return proportional(array, height, width, spec.fit, spec.fill)

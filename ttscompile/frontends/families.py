@@ -58,8 +58,7 @@ AS_SAVED = LoadOptions()
 
 def as_converted(source: Mapping[str, str], encoders: str | os.PathLike[str] | None = None) -> LoadOptions:
     """The options that decide what a policy observes, as a source tells them: its task, and cameras left out."""
-    without = source.get(WITHOUT)
-    cameras = without.split(", ") if without else None
+    cameras = source[WITHOUT].split(", ") if source.get(WITHOUT) else None
     return LoadOptions(task=source.get("task"), encoders=encoders, without_cameras=cameras)
 
 
@@ -73,27 +72,27 @@ class Family:
         reads: what the user gives, for messages; begins with an article.
         detect: whether a path looks like one of this family's, told by names, first bytes or an entry of a JSON file.
             The first row of ``FAMILIES`` that says so takes it; where several would, the narrower one stands first.
-        module: of ``policies``; imported when one of its functions is called, with torch. ``load(path, options)`` gives
-            network and ``PolicySpec``, or a CheckpointError or SpecError. It may have four more. ``examine(path, spec,
-            encoders)`` says what goes wrong without an error, in place of the look at normalisers.
-            ``files_beside(path, spec, text)`` gives the files by which the program that trained a policy takes the
-            compiled one in its place; none where it cannot take this one. ``tokenizer_file(path, encoders)`` finds what
-            makes an instruction the policy's tokens. ``recordings(path)`` says where the recorded episodes are that it
-            was trained on, as ``-t`` takes it; None where the checkpoint does not say.
+        module: of ``policies``, called as the format unless told otherwise; imported when it is needed, with torch. Its
+            ``load(path, options)`` gives network and ``PolicySpec``, or a CheckpointError or SpecError. It may have
+            four more. ``examine(path, spec, encoders)`` says what goes wrong without an error, in place of the look at
+            normalisers. ``files_beside(path, spec, text)`` gives the files by which the program that trained a policy
+            takes the compiled one in its place; none where it cannot take this one. ``tokenizer_file(path, encoders)``
+            finds what makes an instruction the policy's tokens. ``recordings(path)`` says where the recorded episodes
+            are that it was trained on, as ``-t`` takes it; None where the checkpoint does not say.
         options: names of ``LoadOptions`` that it takes; the others are refused.
     """
 
     name: str
     title: str
     reads: str
-    kind: Literal["file", "directory"]
     detect: Callable[[Path], bool]
-    module: str
+    kind: Literal["file", "directory"] = "file"
+    module: str = ""
     options: frozenset[str] = DIFFUSION_OPTIONS
 
     def function(self, name: str) -> Any:
         """A function of its module; None where it has none of this name."""
-        return getattr(import_module(f"..policies.{self.module}", __package__), name, None)
+        return getattr(import_module(f"..policies.{self.module or self.name}", __package__), name, None)
 
     def load(self, path: Path, options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
         """Load a checkpoint of this family."""
@@ -124,6 +123,7 @@ def _begins_with(path: Path, word: bytes) -> bool:
         return word in file.read(2**20)
 
 
+_OPENPI = ("metadata.pt", "params/_METADATA", "assets/**/norm_stats.json")
 FAMILIES = (
     Family(
         name="lerobot",
@@ -140,24 +140,25 @@ FAMILIES = (
         reads="a directory that DexVLA's training saved, with config.json and safetensors",
         kind="directory",
         detect=lambda path: "scale_dp_policy" in map(_config(path).get, ("policy_head_type", "model_type")),
-        module="scaledp",
     ),
     Family(
         name="dit_policy",
         title="DiT-Policy",
         reads="a .ckpt file of DiT-Policy with agent_config.yaml beside it",
-        kind="file",
         detect=lambda path: path.is_file() and (path.parent / "agent_config.yaml").is_file(),
-        module="dit_policy",
     ),
     Family(
         name="dita",
         title="Dita",
         reads="a .pth file of Dita with .hydra/config.yaml in its folder or in the one above",
-        kind="file",
         detect=lambda at: at.suffix == ".pth" and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
-        module="dita",
         options=DIFFUSION_OPTIONS | {"task", "encoders"},
+    ),
+    Family(
+        name="dppo",
+        title="DPPO",
+        reads="a state_N.pt of DPPO with .hydra/config.yaml in its folder or in the one above",
+        detect=lambda at: at.match("state_*.pt") and any((p / ".hydra/config.yaml").is_file() for p in at.parents[:2]),
     ),
     Family(
         name="rdt",
@@ -165,8 +166,15 @@ FAMILIES = (
         reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
         kind="directory",
         detect=lambda path: "lang_adaptor" in _config(path),
-        module="rdt",
         options=DIFFUSION_OPTIONS | {"encoders", "without_cameras"},
+    ),
+    Family(
+        name="openpi",
+        title="openpi",
+        reads="a folder that openpi's training or its converter to PyTorch saved, with model.safetensors and assets",
+        kind="directory",
+        detect=lambda path: "paligemma_variant" in _config(path) or any(any(path.glob(sign)) for sign in _OPENPI),
+        options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
     Family(
         name="octo",
@@ -174,38 +182,30 @@ FAMILIES = (
         reads="a folder that Octo's save_pretrained wrote, with config.json and example_batch.msgpack",
         kind="directory",
         detect=lambda path: (path / "example_batch.msgpack").is_file(),
-        module="octo",
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
     Family(
         name="cogact",
         title="CogACT",
         reads="a .pt file of CogACT",
-        kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"action_model"),
-        module="cogact",
     ),
     Family(
         name="hybrid_vla",
         title="HybridVLA",
         reads="a .pt file of HybridVLA that was trained with use_diff",
-        kind="file",
         detect=lambda path: path.suffix == ".pt" and path.is_file() and _begins_with(path, b"proprio_embedder"),
-        module="hybrid_vla",
     ),
     Family(
         name="diffusion_bc",
         title="Diffusion BC",
         reads="a state_dict of Diffusion BC, a Model_Cond_Diffusion's, in a file",
-        kind="file",
         detect=lambda path: path.is_file() and _begins_with(path, b"mab_over_sqrtmab"),
-        module="diffusion_bc",
     ),
     Family(
         name="diffusion_policy",
         title="Diffusion Policy",
         reads="a .ckpt file of Diffusion Policy",
-        kind="file",
         # Every file that no other family takes: its module names what a file is that is none of its own.
         detect=lambda path: not path.is_dir(),
         module="diffusion_policy.family",

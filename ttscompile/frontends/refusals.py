@@ -22,24 +22,20 @@ _RENAMED = (
     "If its class adds nothing to the original's that changes actions, save it again with the name of that class at the"
     " end of cfg.policy._target_. Otherwise:"
 )
-_DITA = "Give the .pth file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
+_HYDRA = "Give the file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
 _GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
-_DPPO = f"{_BUILD}. Of one that is fine-tuned, the module takes actor_ft in the last steps, and actor before them."
 _EXPERTS = f"{_BUILD}. The module has to compute all experts and weigh them, in place of choosing rows of the data."
 _INNER_MODEL = f"{_BUILD}. The module is an EDMDenoiser of its inner_model."
 _RDT = "Give the folder that RDT's save_pretrained wrote: config.json, and model.safetensors or pytorch_model.bin."
-_INNER = "Give the folder pretrained_model in it."
-_PUT = "Put model.safetensors beside the JSON files and statistics of a LeRobot policy {}, and convert that folder."
+_INNER, _ONE = "Give the folder pretrained_model in it.", "Give one of those in it."
+_PUT = "Put model.safetensors beside the JSON files and statistics of a LeRobot policy xvla, and convert that folder."
 _TRAIN = f"No tool makes LeRobot's {{}} of it: train one with LeRobot. Or: {_HEAD}"
-_JAX = f"Convert it to PyTorch with the tool of its project (openpi: convert_jax_model_to_pytorch.py). {_BUILD}."
+_JAX = f"Convert it to PyTorch with the tool of its project; of openpi, give the folder with params in it. {_BUILD}."
 _HYBRID_VLA = "Give the .pt file of its folder checkpoints, as its training saved it."
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
-_NO_LOOP = (
-    "There is no denoising loop to compile. Export its network with torch.onnx.export and run it with onnxruntime, or"
-    " use torch.compile."
-)
+_NO_LOOP = "There is no denoising loop to compile. Use torch.compile, or torch.onnx.export and then onnxruntime."
 _GGUF = "llama.cpp and vla.cpp run such files. Convert the checkpoint that it was made from, if that denoises actions."
 MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _BY_NAME = (
@@ -81,25 +77,25 @@ DIRECTORIES = (
     Refusal(r"^manifest\.json$", _ARTIFACT, _LOAD),
     Refusal(r"^meta/info\.json$", "a data set of LeRobot, not a policy", "Give it with --trajectories."),
     Refusal(r"^adapter_config\.json$", "a PEFT adapter without the config.json of its policy", MERGE),
+    Refusal(r"^[^/]+/(metadata\.pt|params/_METADATA)$", "a directory around checkpoints of openpi", _ONE),
     Refusal(r"(^|/)(_(CHECKPOINT_)?METADATA|manifest\.ocdbt)$|\.msgpack$", "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model(/config\.json)?$", "a directory around what lerobot saved", _INNER),
     Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
-    Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT.format("xvla")),
-    Refusal(r"^config\.json: paligemma_|(^|/)metadata\.pt$", "a pi0 or pi0.5 of openpi", _PUT.format("pi0 or pi05")),
+    Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT),
     Refusal(r"^config\.json: model_type=eo1$", "an EO-1 as its authors save it", _TRAIN.format("eo1")),
     Refusal(r"^config\.json: dof_config=", "a Wall-X as its authors save it", _TRAIN.format("wall_x")),
     Refusal(r"^config\.json: vlm_name=", "an Evo-1 as its authors save it", _TRAIN.format("evo1")),
     Refusal(r"^config\.json: act_adaptor=", "an RDT2 or H-RDT", _HEAD),
     Refusal(r"^config\.json: policy_head_type=unet", "a DexVLA or DiVLA whose head is a U-Net", _HEAD),
-    Refusal(r"^(checkpoint-|step_)\w+/config\.json$", "a directory around checkpoints", "Give one of those in it."),
+    Refusal(r"^(checkpoint-|step_)\w+/config\.json$", "a directory around checkpoints", _ONE),
     Refusal(r"\.ckpt$|^checkpoints/[^/]+\.pt$", "a directory of checkpoints", "Give one of the files in it."),
     Refusal(r"\.(safetensors|bin|pth?)$", "a directory of weights", _WEIGHTS),
 )
 """By the path of a file in a directory, three levels deep, or an entry of its ``config.json``."""
 
 ENTRIES = (
-    Refusal(r"^parameter$", "a checkpoint of Dita", _DITA),
+    Refusal(r"^parameter$", "a checkpoint of Dita", _HYDRA),
     Refusal(r"^algo_name$", "a checkpoint of robomimic", f"If that is diffusion_policy: {_BUILD}. If not: {_NO_LOOP}"),
 )
 """By an entry of a torch checkpoint."""
@@ -126,10 +122,8 @@ STATES = (
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)act(ion)?_adaptor\.", "an RDT2 or H-RDT", _HEAD),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
-    Refusal(
-        r"^(joint_cmps|gating_network)\.", "a policy of VDD, a mixture of experts of one evaluation each", _NO_LOOP
-    ),
-    Refusal(r"^(actor_ft|network)\.(time_embedding|time_mlp|mlp_mean)\.", "a policy of DPPO", _DPPO),
+    Refusal(r"^(joint_cmps|gating_network)\.", "a policy of VDD, experts of one evaluation each", _NO_LOOP),
+    Refusal(r"^(actor_ft|network)\.(time_embedding|time_mlp|mlp_mean)\.", "a policy of DPPO", _HYDRA),
     Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
     Refusal(r"(^|\.)(noise|time)_net\.", "a checkpoint of DiT-Policy", "Put its agent_config.yaml beside it."),

@@ -64,7 +64,7 @@ def require_memory_for(path: Path, sizes: Iterable[tuple[int, bool]]) -> None:
     """The same of tensors that the file at ``path`` has: how many numbers each has, and whether it is float32."""
     sizes = list(sizes)
     numbers, copied = sum(count for count, _ in sizes), BYTES_A_COPY * sum(n for n, single in sizes if not single)
-    (folder, room), there = _room(), memory_bytes()
+    (folder, room), there = disk_room(), memory_bytes()
     need = BYTES_A_WEIGHT * numbers + copied * (not _LEAST_MAPPED <= copied <= room)
     if need > there:
         disk = f"{copied / 2**30:.1f} GiB of it can be on disk: {folder} has no room, so set TMPDIR. Or: "
@@ -119,7 +119,7 @@ def _copies(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     if size < _LEAST_MAPPED:
         return {name: value.detach().to(torch.float32) for name, value in weights.items()}
     try:
-        with tempfile.TemporaryFile(dir=_room()[0]) as file:
+        with tempfile.TemporaryFile(dir=disk_room()[0]) as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a disk that is full later would end the process
             numbers = torch.frombuffer(mmap.mmap(file.fileno(), size), dtype=torch.float32)
     except (OSError, AttributeError):  # macOS does not reserve
@@ -131,7 +131,7 @@ def _copies(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return found
 
 
-def _room() -> tuple[str, int]:
+def disk_room() -> tuple[str, int]:
     """Where large files for a while are put, and the bytes there; ``/tmp`` is memory on many machines."""
     large = Path("/var/tmp")  # noqa: S108 - what tempfile makes there has no name
     folder = os.environ.get("TMPDIR") or (str(large) if large.is_dir() else tempfile.gettempdir())

@@ -33,7 +33,8 @@ _VISION = "paligemma_with_expert.paligemma.model.vision_tower."
 _TEXT = "paligemma_with_expert.paligemma.model.language_model."
 _EXPERT = "paligemma_with_expert.gemma_expert.model."
 _HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
-_UNREAD = (".gemma_expert.lm_head.weight", ".language_model.norm.weight", ".embed_tokens.position_ids")
+UNREAD = (".gemma_expert.lm_head.weight", ".language_model.norm.weight", ".embed_tokens.position_ids")
+TOKENIZER = "google/paligemma-3b-pt-224"
 _VISION_HEADS = 16
 """Of PaliGemma's SigLIP; the weights do not say."""
 
@@ -42,47 +43,77 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     """Rebuild a policy from its directory and the entries of its ``config.json``; see ``Family.load``."""
     shared = vla.read_vla_config(directory, entries, options)
     (shared, processors), adaptive = vla.read_vla_processors(shared), entries["type"] == "pi05"
-    if adaptive and options.task is not None:
+    weights = named_weights(read_weights(shared, options, *UNREAD))
+    told: Instruction | None = Instruction(TOKENS, MASK, processors.new_line)
+    if adaptive:
+        stated = processors.state_in_prompt and shared.state_dim > 0
+        told = told_with(_state_in_words(shared, processors)) if stated else None
+    return built(shared, processors, read_config(shared, weights, adaptive), weights, told, options)
+
+
+def built(
+    shared: LeRobotConfig,
+    processors: Processors,
+    config: PiConfig,
+    weights: Mapping[str, Tensor],
+    told: Instruction | None,
+    options: LoadOptions,
+    fit: vla.Fit = "centre",
+) -> tuple[nn.Module, PolicySpec]:
+    """Network and specification of a policy, whoever saved it; see ``Family.load``.
+
+    Args:
+        weights: as ``named_weights`` gives them.
+        told: how a task becomes tokens; None where no text alone does.
+        fit: of the images, see ``ObservationSpec``.
+    """
+    directory, adaptive = shared.directory, config.adaptive
+    if options.task is not None and (told is None or told.state is not None):
         raise CheckpointError(
             f"{directory}: a pi05 policy reads its state as part of the instruction, at every call; no task can be"
             " compiled in. Leave the task out, and give it at each call."
         )
-    weights = _weights(shared, options)
-    try:
-        config = read_config(shared, weights, adaptive)
-    except CheckpointError as error:
-        raise CheckpointError(f"{directory}: {error}") from error
     network = filled(lambda: Pi(config), weights, CONFIG, directory)
     length = shared.settings.number("tokenizer_max_length", 200 if adaptive else 48, MOST)
     sizes, task = {"actions": config.actions, "tokens": length, "vocabulary": config.vocabulary}, None
-    if options.task is not None:
-        name = str(processors.tokenizer.get("tokenizer_name") or "google/paligemma-3b-pt-224")
+    if options.task is not None and told is not None:
+        name = str(processors.tokenizer.get("tokenizer_name") or TOKENIZER)
         found = find_encoder(name, encoder_folders(options.encoders, directory), "paligemma")
-        text = options.task if options.task.endswith("\n") or not processors.new_line else f"{options.task}\n"
-        task = torch.tensor([task_tokens(text, name, found, length, config.vocabulary)])
+        task = torch.tensor([task_tokens(told.line(options.task), name, found, length, config.vocabulary)])
     encoder = vla.Gathered(shared, processors, Prefix(network), config.state, task, config.trained_prefix > 0)
     side = config.vision.image_size
-    told = _with_state(shared, processors) if processors.state_in_prompt and shared.state_dim else None
-    spec = vla.vla_spec(shared, processors, (side, side), "centre", sizes, options, told=told)
+    spec = vla.vla_spec(shared, processors, (side, side), fit, sizes, options, told=told)
     if adaptive:  # the network reads no state but in the instruction; actions may be relative to it
-        unread = () if told or spec.chunk.relative else (processors.renamed.get(STATE, STATE),)
+        read = spec.chunk.relative or (told is not None and told.state is not None)
+        unread = () if read else (processors.renamed.get(STATE, STATE),)
         others = {key: each for key, each in spec.observations.items() if key not in unread}
-        spec = replace(spec, observations=others, instruction=told, trained_prefix=config.trained_prefix)
+        instruction = None if told is None else spec.instruction
+        spec = replace(spec, observations=others, instruction=instruction, trained_prefix=config.trained_prefix)
     return EncodedDenoiser(encoder, Expert(network)).eval(), spec
 
 
-def _with_state(shared: LeRobotConfig, processors: Processors) -> Instruction:
-    """How pi0.5 is told its task, as lerobot's step writes it: with the state in words."""
+def _state_in_words(shared: LeRobotConfig, processors: Processors) -> StateInWords:
     key, own, count = processors.renamed.get(STATE, STATE), processors.normalizers.get(STATE), shared.state_dim
     first, width = ([0.0] * count, [1.0] * count) if own is None else (own.first.tolist(), own.width.tolist())
-    state = StateInWords(key, tuple(first), tuple(width), own is not None and own.mode != "MEAN_STD")
+    return StateInWords(key, tuple(first), tuple(width), own is not None and own.mode != "MEAN_STD")
+
+
+def told_with(state: StateInWords) -> Instruction:
+    """How pi0.5 is told its task, as openpi's tokenizer and lerobot's step write it: with the state in words."""
     around, after = ("Task: ", f", State: {IN_WORDS};"), ("Action: ",)
     return Instruction(TOKENS, MASK, False, around=around, after=after, spaced=True, state=state)
 
 
 def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: bool) -> PiConfig:
     """Sizes and variant."""
-    settings = shared.settings
+    try:
+        return _read_config(shared, weights, adaptive)
+    except CheckpointError as error:
+        raise CheckpointError(f"{shared.directory}: {error}") from error
+
+
+def _read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: bool) -> PiConfig:
+    settings, rounded = shared.settings, shared.settings.choice("dtype", "float32", "bfloat16") == "bfloat16"
     patch = _shape(weights, f"{_VISION}embeddings.patch_embedding.weight", 4)
     resolution = settings.size("image_resolution", [224, 224], MOST_PIXELS) or (224, 224)
     vla.require_square(settings, "image_resolution", resolution, patch[2])
@@ -108,7 +139,8 @@ def read_config(shared: LeRobotConfig, weights: Mapping[str, Tensor], adaptive: 
         actions=vla.padded_size(settings, "max_action_dim", shared.action_dim),
         periods=(vla.positive_number(settings, "min_period", 4e-3), vla.positive_number(settings, "max_period", 4.0)),
         trained_prefix=delay,
-        rounded=settings.choice("dtype", "float32", "bfloat16") == "bfloat16",
+        rounded=rounded,
+        rounded_words=rounded,
     )
 
 
@@ -140,10 +172,10 @@ def _shape(weights: Mapping[str, Tensor], name: str, axes: int) -> tuple[int, ..
     return tuple(value.shape)
 
 
-def _weights(shared: LeRobotConfig, options: LoadOptions) -> dict[str, Tensor]:
-    """The weights under the names of ``Pi``, whichever transformers saved them, lerobot or openpi's converter."""
+def named_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Saved weights under the names of ``Pi``, whichever transformers saved them, lerobot or openpi."""
     found = {}
-    for name, value in read_weights(shared, options, *_UNREAD).items():
+    for name, value in weights.items():
         short = name.removeprefix("model.").replace(".vision_tower.vision_model.", ".vision_tower.")
         if not short.startswith(f"{_VISION}head."):
             found[short] = value

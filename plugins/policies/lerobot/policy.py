@@ -1,6 +1,7 @@
 """What is around the network of every LeRobot policy: its observations, its sampler, its chunk and its weights."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 from torch import nn
@@ -125,8 +126,13 @@ def read_weights(config: LeRobotConfig, options: LoadOptions, *without: str) -> 
     adapter, directory = read_adapter(config.directory, config.settings), config.directory
     if adapter is None and options.base is not None:
         raise CheckpointError(f"{directory}: the option base is for an adapter; found a whole policy. Leave it out.")
-    path = (directory if adapter is None else find_base(adapter, options.base)) / WEIGHTS
+    weights = saved_weights(directory if adapter is None else find_base(adapter, options.base), *without)
+    return weights if adapter is None else merged(directory, adapter, weights, without)
+
+
+def saved_weights(directory: Path, *without: str) -> dict[str, torch.Tensor]:
+    """The weights in a directory as float32, without those ``left_out``."""
+    path = directory / WEIGHTS
     require_memory(path, without)
     saved = {name: value for name, value in read_tensors(path).items() if not left_out(name, without)}
-    weights = as_float32(saved, f"{path}: ")
-    return weights if adapter is None else merged(directory, adapter, weights, without)
+    return as_float32(saved, f"{path}: ")

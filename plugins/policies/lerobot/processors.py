@@ -79,7 +79,7 @@ _LEAST_STD = 1e-30
 
 @dataclass(frozen=True)
 class Statistics:
-    """How one feature is normalised: its mode, and the two statistics that the mode names, float32.
+    """How one feature is normalised: its mode, and the two statistics that the mode names, float32; openpi's float64.
 
     Attributes:
         mode: ``MEAN_STD``, ``MIN_MAX``, ``QUANTILES`` or ``QUANTILE10``.

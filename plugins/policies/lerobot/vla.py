@@ -3,7 +3,7 @@
 Sources: ``lerobot.policies.common`` of huggingface/lerobot 0.6, and openpi, where it is from.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +34,8 @@ from .config import MOST, STATE, LeRobotConfig, read_lerobot_config
 from .policy import MASK, TOKENS, integration_steps, language_inputs, policy_spec
 from .processors import Normalizer, Processors, read_processors
 
+Fit = Literal["start", "centre", "bytes", "stretch", "average"]
+"""Of images, see ``ObservationSpec``."""
 _EMPTY = "observation.images.empty_camera_"
 """How lerobot calls a camera that the checkpoint knows and no robot has."""
 
@@ -62,16 +64,20 @@ def read_vla_config(
             "use_visual_memory or use_proprioceptive_memory is set: the policy reads frames of seconds before, which"
             " is not compiled; expected false"
         )
-    without = set(options.without_cameras or ())
-    unknown = sorted(without - set(config.cameras))
-    kept = [key for key in config.cameras if not key.startswith(_EMPTY) and key not in without]
-    if unknown or not kept:
-        told = (
-            f"the cameras are {', '.join(config.cameras) or 'none'}; {', '.join(unknown) or 'all'} cannot be left out"
-        )
-        raise CheckpointError(f"{directory}: {told}. A policy needs a camera that it was trained with.")
+    kept = kept_cameras(directory, config.cameras, options)
     features = {key: each for key, each in config.features.items() if key in kept or key not in config.cameras}
     return replace(config, features=features)
+
+
+def kept_cameras(directory: Path, cameras: Collection[str], options: LoadOptions) -> list[str]:
+    """The cameras without those that the robot lacks."""
+    without = set(options.without_cameras or ())
+    unknown = sorted(without - set(cameras))
+    kept = [key for key in cameras if not key.startswith(_EMPTY) and key not in without]
+    if unknown or not kept:
+        told = f"the cameras are {', '.join(cameras) or 'none'}; {', '.join(unknown) or 'all'} cannot be left out"
+        raise CheckpointError(f"{directory}: {told}. A policy needs a camera that it was trained with.")
+    return kept
 
 
 def read_vla_processors(config: LeRobotConfig) -> tuple[LeRobotConfig, Processors]:
@@ -95,7 +101,7 @@ def vla_spec(
     config: LeRobotConfig,
     processors: Processors,
     image: tuple[int, int] | None,
-    fit: Literal["start", "centre", "stretch", "average"],
+    fit: Fit,
     sizes: Mapping[str, int],
     options: LoadOptions,
     table: Make | None = None,
@@ -222,7 +228,7 @@ class Gathered(nn.Module):
         images = [observations[name][:, -1] * 2 - 1 for name in self.images]
         state = None
         if self.missing is not None:
-            state = self.normalizer(observations[self.state])[:, -1]
+            state = self.normalizer(observations[self.state])[:, -1].to(images[0].dtype)  # statistics may be float64
             state = functional.pad(state, (0, self.missing)) if self.missing >= 0 else state[:, : self.missing]
         if self.task is None:
             tokens, mask = (observations[name.replace(".", "_")] for name in (TOKENS, MASK))

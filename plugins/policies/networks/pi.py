@@ -25,8 +25,9 @@ class PiConfig:
         actions: numbers of an action, padded.
         periods: shortest and longest of the timestep's waves.
         trained_prefix: see ``PolicySpec``; pi0.5 alone may have one.
-        rounded: whether frequencies of rotary positions and the scale of words are rounded to bfloat16. LeRobot casts
-            them with a policy of this ``dtype``, and what it trained knows no others.
+        rounded: whether frequencies of rotary positions are rounded to bfloat16. LeRobot and openpi's PyTorch cast
+            them with a policy that they train in it, which knows no others.
+        rounded_words: whether the scale of words is, which LeRobot alone casts.
     """
 
     vision: SiglipConfig
@@ -38,6 +39,7 @@ class PiConfig:
     periods: tuple[float, float]
     trained_prefix: int = 0
     rounded: bool = False
+    rounded_words: bool = False
 
     @property
     def adaptive(self) -> bool:
@@ -148,9 +150,9 @@ class Prefix(nn.Module):
         super().__init__()
         model = network.paligemma_with_expert.paligemma.model
         self.channels, self.width = network.config.text.channels, network.config.text.width
-        scale, rounded = math.sqrt(self.width), network.config.rounded
-        self.scale = float(torch.tensor(scale, dtype=torch.bfloat16, device="cpu")) if rounded else scale
-        self.register_buffer("rates", _rates(network.config.text, rounded), persistent=False)
+        scale, config = math.sqrt(self.width), network.config
+        self.scale = float(torch.tensor(scale, dtype=torch.bfloat16, device="cpu")) if config.rounded_words else scale
+        self.register_buffer("rates", _rates(config.text, config.rounded), persistent=False)
         self.vision_model, self.language_model = model.vision_tower, model.language_model
         self.projector = model.multi_modal_projector.linear
         self.state_proj: nn.Module | None = None if network.config.adaptive else network.state_proj
