@@ -33,10 +33,10 @@ from ttscompile.frontends.settings import Settings
 from .instruction import NAME_FOLDER, encoder_folders, find_encoder, language_model_folder, task_tokens
 from .loops import ddim_loops
 from .networks.clip import ClipText, TextConfig, encoder_config
-from .networks.dinov2 import DinoConfig, own_names
 from .networks.dita_head import DitaHead
 from .networks.dita_tokens import IMAGE, MASK, TOKENS, WORDS, WRIST, Observed, PictureConfig, Pictures, Words
 from .networks.qformer import CHANNELS
+from .networks.timm_vit import DinoConfig, own_names
 from .quantiles import STATISTICS, read_statistics
 from .shards import read_part
 from .yaml_files import read_yaml
@@ -198,8 +198,8 @@ def _pictures(settings: Settings, saved: _Saved, frames: int, width: int) -> Pic
         num_hidden_layers=saved.count(f"{_TOWER}blocks."),
         num_attention_heads=width // CHANNELS,
         grid=_grid(settings, saved.shape(f"{_TOWER}pos_embed", 3)[1], patch),
-        registers=saved.shape(f"{_TOWER}reg_token", 3)[1],
         patch_size=patch,
+        before=1 + saved.shape(f"{_TOWER}reg_token", 3)[1],
     )
     wrist = any(name.startswith(_WRIST) for name in saved.weights)
     if latents is None:

@@ -138,6 +138,14 @@ def test_pictures_in_a_codec_of_another_library(tmp_path: Path) -> None:
         load_trajectories([store], LOW, 3, SOURCES)
 
 
+def test_poses_that_are_not_those_of_the_policy(tmp_path: Path) -> None:
+    """As UMI records them, whatever else is there; with or without pictures in a codec of another library."""
+    store = as_zarr(tmp_path, robot0_demo_start_pose=np.zeros((9, 6)))
+    (store / "data" / "img" / ".zarray").write_text("{}")
+    with pytest.raises(TrajectoryError, match=r"of UMI has the robot's poses, .* newest one\. So save the .* \.npz"):
+        load_trajectories([store], LOW, 3, SOURCES)
+
+
 def test_a_zarr_array_of_nothing_but_its_size_is_refused(tmp_path: Path) -> None:
     store = as_zarr(tmp_path)
     shutil.rmtree(store / "data" / "state")

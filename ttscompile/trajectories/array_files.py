@@ -33,6 +33,9 @@ def zarr_recording(path: Path) -> Recording:
     with one_error(f"{path}: cannot be read as a replay buffer of Diffusion Policy", hint):
         store: Any = zarr.storage.ZipStore(path, mode="r") if path.is_file() else str(path)
         group = zarr.open_group(store, mode="r")
+        if "data/robot0_demo_start_pose" in group:
+            told = "a data set of UMI has the robot's poses, and its policies observe them relative to the newest one"
+            raise TrajectoryError(f"{path}: {told}. So {AS_NPZ}")
         data: Any = group["data"]
         ends = group["meta/episode_ends"]
         names = tuple(sorted(name for name, _ in data.arrays()))
@@ -100,8 +103,7 @@ def _hdf5_blocks(path: Path, demos: list[str], name: str) -> Iterator[Array]:
         arrays = [_inside(path, file, f"data/{demo}/obs/{name}") for demo in demos]
         for array in arrays:
             _require_plain_hdf5(path, array)
-        total = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
-        require_proportion(path, total, path.stat().st_size)
+        require_proportion(path, sum(math.prod(a.shape) * a.dtype.itemsize for a in arrays), path.stat().st_size)
         for array in arrays:
             yield from blocks(array)
 
@@ -122,10 +124,8 @@ def _inside(path: Path, file: Any, name: str) -> Any:
 
 def _group(path: Path, file: Any, name: str) -> Any:
     """A group; an array in its place could have rows without end."""
-    import h5py
-
     found = _inside(path, file, name)
-    if not isinstance(found, h5py.Group):
+    if not hasattr(found, "keys"):
         raise TrajectoryError(f"{path}: {name!r} is an array; expected a group of a data set of robomimic.")
     return found
 

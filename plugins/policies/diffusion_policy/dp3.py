@@ -9,7 +9,7 @@ Source: ``DP3`` and ``SimpleDP3`` of YanjieZe/3D-Diffusion-Policy (Ze et al., ar
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import torch
@@ -32,7 +32,13 @@ _WIDTHS = (64, 128, 256)
 _COLOURED_WIDTHS = (*_WIDTHS, 512)
 
 
-class PointNet(nn.Module):
+class Extractor(nn.Module):
+    """Points ``[N, points, channels]`` to a vector ``[N, width]``."""
+
+    width: int
+
+
+class PointNet(Extractor):
     """Points to a vector: an MLP of each point, the largest of each feature over all points, and a linear layer.
 
     Args:
@@ -64,7 +70,7 @@ class PointNet(nn.Module):
 class PointCloudEncoder(nn.Module):
     """Points and the robot's state to one vector for each observed step."""
 
-    def __init__(self, extractor: PointNet, channels: int, state: int) -> None:
+    def __init__(self, extractor: Extractor, channels: int, state: int) -> None:
         super().__init__()
         self.extractor, self.channels = extractor, channels
         self.state_mlp = nn.Sequential(nn.Linear(state, _STATE_WIDTH), nn.ReLU(), nn.Linear(_STATE_WIDTH, _STATE_WIDTH))
@@ -88,29 +94,59 @@ _CONDITIONS = {
 }
 _AXES = {POINTS: 2, STATE: 1, ROBOT: 2}
 """What the network reads of an observation, and how many axes each has."""
-_MOST_POINTS = 2**16
+MOST_POINTS = 2**16
 """Of a cloud, which the weights do not limit; in use are 512 to 4096."""
-_PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
+PLACES = ("use_down_condition", "use_mid_condition", "use_up_condition")
 _ENCODER_KEYS = {"shape_meta", "encoder_output_dim", "use_pc_color", "pointnet_type", "pointcloud_encoder_cfg"}
 _UNUSED = {"crop_shape", "use_point_crop"}  # of the policy: one has no image, the other is for its environments
-_KNOWN = {*DEFAULTS, *_PLACES, *_ENCODER_KEYS, *_UNUSED, "condition_type", "obs_as_global_cond"}
+_KNOWN = {*DEFAULTS, *PLACES, *_ENCODER_KEYS, *_UNUSED, "condition_type", "obs_as_global_cond"}
 
 
 def full(saved: Saved) -> Rebuilt:
     """``DP3``."""
-    return _rebuilt(saved, 2)
+    return on_points(saved, _NAME, _KNOWN, _AXES, _encoder)
 
 
 def simple(saved: Saved) -> Rebuilt:
     """``SimpleDP3``, whose U-Net has half as many blocks."""
-    return _rebuilt(saved, 1)
+    return on_points(saved, _NAME, _KNOWN, _AXES, _encoder, blocks=1)
 
 
-def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
+def on_points(
+    saved: Saved,
+    name: str,
+    known: Collection[str],
+    axes: Mapping[str, int],
+    encoder: Callable[[Settings, Observed, Weights], PointCloudEncoder],
+    blocks: int = 2,
+) -> Rebuilt:
+    """A U-Net behind an encoder of points.
+
+    Args:
+        saved: the policy.
+        name: of its project, for messages.
+        known: settings of ``cfg.policy`` that its class has, beside those that all have.
+        axes: what its encoder reads of an observation, and how many axes each has.
+        encoder: makes that, with its weights, of the settings and of what is observed.
+        blocks: of a level of the U-Net.
+    """
+    network = conditioned(saved, name, known) | {"blocks": blocks}
+    action_dim, every = read_shape_meta(
+        saved.settings
+    )  # the original looks at no type, and some of its tasks say low_dimx
+    observed = {key: _as_given(key, *each, saved.weights) for key, each in every.items() if key in axes}
+    made = encoder(saved.settings, observed, saved.weights)
+    rebuilt = behind_encoder(saved, made, made.width, observed, action_dim, network, known)
+    tell_of_steps(saved)
+    return rebuilt
+
+
+def conditioned(saved: Saved, name: str, known: Collection[str]) -> dict[str, Any]:
+    """Settings of the U-Net, but for its channels; whatever in ``cfg.policy`` is not known is refused."""
     settings = saved.settings
-    unknown = sorted(set(saved.policy) - _KNOWN - COMMON_KEYS)
+    unknown = sorted(set(saved.policy) - set(known) - COMMON_KEYS)
     if unknown:
-        raise CheckpointError(f"cfg.policy has settings that {_NAME} does not know: {', '.join(unknown)}. {_CHANGED}")
+        raise CheckpointError(f"cfg.policy has settings that {name} does not know: {', '.join(unknown)}. {_CHANGED}")
     if not settings.flag("obs_as_global_cond", True):
         raise settings.error("obs_as_global_cond is false; expected true, without which the original cannot run either")
     condition = settings.values.get("condition_type", "film")
@@ -120,13 +156,12 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
             " cross_attention_* cannot run: they put a timestep without an axis of observed steps beside observations"
             " with one"
         )
-    action_dim, every = read_shape_meta(settings)  # the original looks at no type, and some of its tasks say low_dimx
-    observed = {key: _as_given(key, *each, saved.weights) for key, each in every.items() if key in _AXES}
-    encoder = _encoder(settings, observed, saved.weights)
-    network: dict[str, Any] = {name: saved.policy.get(name, default) for name, default in DEFAULTS.items()}
-    network |= _CONDITIONS[condition]
-    network |= {"blocks": blocks, "conditioned": tuple(settings.flag(name, True) for name in _PLACES)}
-    rebuilt = behind_encoder(saved, encoder, encoder.width, observed, action_dim, network, _KNOWN)
+    network: dict[str, Any] = {key: saved.policy.get(key, default) for key, default in DEFAULTS.items()}
+    return network | _CONDITIONS[condition] | {"conditioned": tuple(settings.flag(key, True) for key in PLACES)}
+
+
+def tell_of_steps(saved: Saved) -> None:
+    """Warn where the steps are others than in the original's environment."""
     scheduler = saved.policy["noise_scheduler"]
     if scheduler.get("prediction_type") == "sample" and str(scheduler.get("_target_")).endswith("DDIMScheduler"):
         warnings.warn(
@@ -135,7 +170,6 @@ def _rebuilt(saved: Saved, blocks: int) -> Rebuilt:
             " the original under a later diffusers.",
             stacklevel=2,
         )
-    return rebuilt
 
 
 def _as_given(key: str, kind: str, shape: tuple[int, ...], weights: Weights) -> tuple[str, tuple[int, ...]]:
@@ -152,15 +186,8 @@ def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointC
     coloured = settings.flag("use_pc_color", False)
     settings.choice("pointnet_type", "pointnet")
     cloud = settings.part("pointcloud_encoder_cfg")
-    for key, axes in _AXES.items():
-        if key == ROBOT and key not in observed:
-            continue
-        shape = observed[key][1] if key in observed else ()
-        channels = COLOURED if coloured else PLACE
-        if len(shape) != axes or (axes == 2 and (shape[1] < channels or max(shape) > _MOST_POINTS)):
-            found = f"{list(shape)}" if key in observed else "missing"
-            wanted = f"[points, {channels}], {_MOST_POINTS} points at most" if axes == 2 else "[length]"
-            raise settings.error(f"shape_meta.obs.{key} is {found}; expected the shape {wanted}")
+    channels = COLOURED if coloured else PLACE
+    require_shapes(settings, observed, _AXES, channels)
     # Only the PointNet without colours can do without the last layer.
     projected = cloud.flag("use_projection", True) or coloured
     features = cloud.number("out_channels", 1024) if projected else None
@@ -171,7 +198,23 @@ def _encoder(settings: Settings, observed: Observed, weights: Weights) -> PointC
     if settings.number("encoder_output_dim", 256) != extractor.width:
         found = f"encoder_output_dim is {settings.values.get('encoder_output_dim', 256)}"
         raise settings.error(f"{found}; expected {extractor.width}, which its PointNet gives")
-    encoder = PointCloudEncoder(extractor, COLOURED if coloured else PLACE, state)
+    return filled(PointCloudEncoder(extractor, channels, state), settings, weights)
+
+
+def require_shapes(settings: Settings, observed: Observed, axes: Mapping[str, int], channels: int) -> None:
+    """Raise unless all that an encoder of points reads is there, but for points of the robot, and of its shape."""
+    for key, count in axes.items():
+        if key == ROBOT and key not in observed:
+            continue
+        shape = observed[key][1] if key in observed else ()
+        if len(shape) != count or (count == 2 and (shape[1] < channels or max(shape) > MOST_POINTS)):
+            found = f"{list(shape)}" if key in observed else "missing"
+            wanted = f"[points, {channels}], {MOST_POINTS} points at most" if count == 2 else "[length]"
+            raise settings.error(f"shape_meta.obs.{key} is {found}; expected the shape {wanted}")
+
+
+def filled(encoder: PointCloudEncoder, settings: Settings, weights: Weights) -> PointCloudEncoder:
+    """An encoder of points with its weights."""
     found_weights = {key: value for key, value in weights.items() if key.startswith(_PREFIX)}
     require_weights(
         {_PREFIX + name: value for name, value in encoder.state_dict().items()},

@@ -41,10 +41,14 @@ _POLICIES: Mapping[str, Callable[[Saved], Rebuilt]] = {
     "DiffusionUnetImagePolicy": _row("unet", "images"),
     "DP3": _row("dp3", "full"),
     "SimpleDP3": _row("dp3", "simple"),
+    "DiffusionPointcloudPolicy": _row("idp3", "points"),
+    "DiffusionImagePolicy": _row("idp3", "images"),
     "KarrasUnetHybridImagePolicy": _row("consistency_policy", "teacher"),
     _STUDENT: _row("consistency_policy", "student"),
     "TEDiUnetLowdimPolicy": _row("streaming", "low_dim"),
     "TEDIUnetHybridImagePolicy": _row("streaming", "on_images"),
+    "DiffusionUnetTimmPolicy": _row("umi", "unet"),
+    "DiffusionTransformerTimmPolicy": _row("umi", "transformer"),
 }
 """By the class name of the original policy."""
 
@@ -69,6 +73,11 @@ def recordings(path: Path) -> str | None:
     named = config.get("task.dataset.zarr_path") or config.get("task.dataset.dataset_path")
     if not named:
         return None
+    if str(config.get("policy._target_")).endswith("TimmPolicy"):
+        raise CheckpointError(
+            f"{path}: it was trained on {named!s:.200}, whose poses are the robot's, and observes poses relative to the"
+            " newest one. Record what the policy observes: an .npz with an array for each key, with --trajectories."
+        )
     if Path(str(named)).exists():
         return str(named)
     raise CheckpointError(
@@ -100,7 +109,8 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
     saved = Saved(config, Settings(policy, "cfg.policy."), weights)
     rebuilt = _POLICIES[name](saved)
     # The original slices action_pred[:, start : start + Ta], which ends with the horizon.
-    stop = min(rebuilt.start + saved.settings.number("n_action_steps"), rebuilt.sample[0])
+    executed = rebuilt.executed or saved.settings.number("n_action_steps")
+    stop = min(rebuilt.start + executed, rebuilt.sample[0])
     step_arguments = {key: policy[key] for key in policy if key not in COMMON_KEYS | rebuilt.known}
     scheduler, steps = policy["noise_scheduler"], policy.get("num_inference_steps")
     if rebuilt.make is None:
@@ -120,5 +130,6 @@ def build(payload: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, 
             normalizer=affine(weights, "action", rebuilt.action_dim),
         ),
         source={**source, **loops.source},
+        trained_prefix=rebuilt.prefix,
     )
     return rebuilt.module.eval(), spec

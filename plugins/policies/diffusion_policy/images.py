@@ -6,7 +6,7 @@ Source: ``MultiImageObsEncoder`` and ``get_resnet`` of real-stanford/diffusion_p
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from torch import nn
@@ -83,19 +83,19 @@ _PREFIX = "obs_encoder."
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the colours of ImageNet
 
 
-def encoder_settings(settings: Settings) -> Settings:
-    """``cfg.policy.obs_encoder``."""
+def encoder_settings(settings: Settings, encoder: str = _ENCODER, known: Collection[str] = _KNOWN) -> Settings:
+    """``cfg.policy.obs_encoder``, which has to be of this class, and to have no other settings."""
     values = settings.values.get("obs_encoder")
     found = str(values.get("_target_")).rpartition(".")[2] if isinstance(values, dict) else f"{values!r:.80}"
-    if found != _ENCODER or not isinstance(values, dict):
+    if found != encoder or not isinstance(values, dict):
         raise CheckpointError(
-            f"cfg.policy.obs_encoder is {found}; expected {_ENCODER}. Use ttscompile.compile_denoiser(module, spec) on"
+            f"cfg.policy.obs_encoder is {found}; expected {encoder}. Use ttscompile.compile_denoiser(module, spec) on"
             " a network of your own, its observation encoder inside the module."
         )
-    unknown = sorted(set(values) - _KNOWN)
+    unknown = sorted({*values} - {*known})
     if unknown:
         raise CheckpointError(
-            f"cfg.policy.obs_encoder has settings that {_ENCODER} does not know: {', '.join(unknown)}. The encoder was"
+            f"cfg.policy.obs_encoder has settings that {encoder} does not know: {', '.join(unknown)}. The encoder was"
             " changed; use ttscompile.compile_denoiser(module, spec)."
         )
     return Settings(values, f"{settings.where}obs_encoder.", settings.remedy)

@@ -145,6 +145,8 @@ class Rebuilt:
         known: names of the settings of ``cfg.policy`` that were read, beside those that all have. The others are what
             the policy hands to every step of its scheduler.
         make: its loop, where ``noise_scheduler`` is none of diffusers'.
+        executed: how many actions are; None where ``n_action_steps`` says so.
+        prefix: see ``PolicySpec.trained_prefix``.
     """
 
     module: nn.Module
@@ -155,6 +157,8 @@ class Rebuilt:
     variant: str
     known: frozenset[str]
     make: Make | None = None
+    executed: int | None = None
+    prefix: int = 0
 
 
 def read_shape_meta(settings: Settings, *types: str) -> tuple[int, Observed]:

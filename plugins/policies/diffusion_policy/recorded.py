@@ -1,6 +1,7 @@
 """Which arrays of a data set the observation was made of in training.
 
-Source: the data sets of real-stanford/diffusion_policy and YanjieZe/3D-Diffusion-Policy, by the names of their classes.
+Source: the data sets of real-stanford/diffusion_policy, and of 3D-Diffusion-Policy and Improved-3D-Diffusion-Policy of
+YanjieZe, by the names of their classes.
 """
 
 from collections.abc import Mapping
@@ -32,6 +33,8 @@ def _parts(data_set: str, config: Config) -> Mapping[str, list[Any]]:
         case "RobomimicReplayLowdimDataset":
             names = config.get("task.dataset.obs_keys", _ROBOMIMIC)
             return {"obs": names if isinstance(names, list) else []}
-        case "AdroitDataset" | "MetaworldDataset" | "RealDexDataset" | "DexArtDataset":
+        case "AdroitDataset" | "MetaworldDataset" | "RealDexDataset" | "DexArtDataset" | "GR1DexDataset3D":
             return {"agent_pos": ["state"]}
+        case "GR1DexDatasetImage":
+            return {"agent_pos": ["state"], "image": ["img"]}
     return {}

@@ -12,6 +12,7 @@ from torch import nn
 from ttscompile.core.spec import ObservationSpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
+from ttscompile.frontends.settings import Settings
 
 from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
 from . import parts
@@ -30,7 +31,7 @@ DEFAULTS: Mapping[str, Any] = {
     "n_groups": 8,
 }
 """Of the policies behind an encoder, which are not those of the network."""
-_MOST_STEPS = 4096
+MOST_STEPS = 4096
 """Of a chunk, which the weights do not limit; in use are 4 to 64."""
 
 Given = Literal["global condition", "local condition", "inpainting"]
@@ -146,13 +147,28 @@ def denoiser(
         weights: of the policy, without those of an encoder.
         steps: name of the setting that says how many steps its sample has.
     """
-    horizon, n_obs_steps = saved.settings.number(steps, most=_MOST_STEPS), saved.settings.number("n_obs_steps")
+    horizon, n_obs_steps = saved.settings.number(steps, most=MOST_STEPS), saved.settings.number("n_obs_steps")
+    network = network_of(saved.settings, weights, config, horizon, steps)
+    if start >= horizon or (given != "global condition" and n_obs_steps > horizon):
+        raise saved.settings.error(f"n_obs_steps = {n_obs_steps} leaves nothing of {steps} = {horizon}")
+    sample = (horizon, config.input_dim)
+    if given == "inpainting":
+        return parts.InpaintingDenoiser(network, sample, action_dim, n_obs_steps), sample
+    return (parts.GlobalDenoiser if given == "global condition" else parts.LocalDenoiser)(network), sample
+
+
+def network_of(settings: Settings, weights: Weights, config: UNetConfig, horizon: int, name: str) -> ConditionalUnet1D:
+    """The U-Net with its weights.
+
+    Args:
+        settings: of the policy.
+        horizon: steps of its sample, for which the weights set no limit.
+        name: of the setting that says so.
+    """
     if horizon % config.divisor:
         levels = len(config.down_dims)
         halves = f"a U-Net of {levels} levels halves the steps of its sample {levels - 1} times, and doubles them again"
-        raise saved.settings.error(f"{steps} is {horizon}; expected a multiple of {config.divisor}, because {halves}")
-    if start >= horizon or (given != "global condition" and n_obs_steps > horizon):
-        raise saved.settings.error(f"n_obs_steps = {n_obs_steps} leaves nothing of {steps} = {horizon}")
+        raise settings.error(f"{name} is {horizon}; expected a multiple of {config.divisor}, because {halves}")
     width, dims = config.diffusion_step_embed_dim, config.down_dims
     needed = {
         "input_dim": config.input_dim * dims[0],
@@ -164,7 +180,4 @@ def denoiser(
     parts.require_room(needed, weights)
     network = ConditionalUnet1D(config)
     parts.load_network(network, weights)
-    sample = (horizon, config.input_dim)
-    if given == "inpainting":
-        return parts.InpaintingDenoiser(network, sample, action_dim, n_obs_steps), sample
-    return (parts.GlobalDenoiser if given == "global condition" else parts.LocalDenoiser)(network), sample
+    return network

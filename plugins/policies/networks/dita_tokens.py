@@ -1,7 +1,7 @@
 """What Dita's Llama reads before the actions: the words of the instruction, and a few tokens of each picture.
 
 Parameters are called as in the original, ``scripts/vision_tokenizers/vit_tokenizer.py`` of RoboDita/Dita, but for those
-of the image encoder (``dinov2.own_names``).
+of the image encoder (``timm_vit.own_names``).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from .clip import ClipText
-from .dinov2 import DinoConfig, DinoV2
 from .qformer import QFormer, Resampler
+from .timm_vit import DinoConfig, TimmVit
 
 IMAGE, WRIST, WORDS = "image", "wrist_image", "natural_language_embedding"
 TOKENS, MASK = "language_instruction.input_ids", "language_instruction.attention_mask"
@@ -62,25 +62,25 @@ class Pictures(nn.Module):
 
     def __init__(self, config: PictureConfig) -> None:
         super().__init__()
-        self.tokenizer, width = DinoV2(config.vision), config.vision.hidden_size
+        self.tokenizer, width = TimmVit(config.vision), config.vision.hidden_size
         rows, columns = config.vision.grid
         if config.wrist:
             places = [row * columns + column for row in range(rows) for column in range(columns) if (row + column) % 2]
-            self.tokenizer.wrist_image_part = DinoV2(config.vision, places)
+            self.tokenizer.wrist_image_part = TimmVit(config.vision, places)
         if config.places is None:
             self.qformer: nn.Module = QFormer(width, config.depth, config.queries, config.frames)
         else:
             self.qformer = Resampler(width, config.depth, config.queries, config.places)
-        self.frames = config.frames
+        self.frames, self.before = config.frames, config.vision.before
         for name, values in (("mean", _MEAN), ("deviation", _DEVIATION)):
             self.register_buffer(name, torch.tensor(values, device="cpu")[:, None, None], persistent=False)
 
     def forward(self, image: Tensor, wrist: Tensor | None, words: Tensor) -> Tensor:
         """See the class."""
-        seen = self.tokenizer(self._normalised(image))
+        seen = self.tokenizer(self._normalised(image))[:, self.before :]
         if wrist is not None:
             own: nn.Module = self.tokenizer.wrist_image_part  # type: ignore[assignment]
-            seen = torch.cat([seen, own(self._normalised(wrist))], 1)
+            seen = torch.cat([seen, own(self._normalised(wrist))[:, self.before :]], 1)
         return self.qformer(seen, words).unflatten(0, (-1, self.frames)).flatten(1, 2)  # type: ignore[no-any-return]
 
     def _normalised(self, images: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import sys
 import typing
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from unittest.mock import MagicMock, patch
 
@@ -41,20 +42,28 @@ def main() -> None:
 
 def made(settings: dict[str, Any]) -> Any:
     """What ``hydra.utils.instantiate`` makes of an entry of the configuration."""
-    arguments = {
-        key: value if not isinstance(value, dict) else made(value) if "_target_" in value else OmegaConf.create(value)
-        for key, value in settings.items()
-    }
+    arguments = {key: _entry(value) for key, value in settings.items()}
     module, _, name = arguments.pop("_target_").rpartition(".")
     return getattr(schedulers if module == "diffusers.schedulers" else import_module(module), name)(**arguments)
 
 
+def _entry(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_entry(each) for each in value]
+    return value if not isinstance(value, dict) else made(value) if "_target_" in value else OmegaConf.create(value)
+
+
 @torch.no_grad()
-def run(variant: str) -> dict[str, Any]:
-    """The original's actions, and single evaluations of its network, with noise from outside."""
-    settings = unets.configuration(variant)["policy"]
+def run(variant: str, of: ModuleType = unets) -> dict[str, Any]:
+    """The original's actions, and single evaluations of its network, with noise from outside.
+
+    Args:
+        of: what makes configuration, weights, observations and noise of a variant; ``given`` is what the original
+            observes, where that is something else.
+    """
+    settings, given = of.configuration(variant)["policy"], getattr(of, "given", of.observation)
     policy = made(settings)
-    own, weights = policy.state_dict(), unets.state_dict(variant)
+    own, weights = policy.state_dict(), of.state_dict(variant)
     unknown = sorted(set(own) - set(weights))
     assert all(name.endswith(("_dummy_variable", "num_batches_tracked")) for name in unknown), unknown
     assert all(name.startswith("normalizer.") for name in set(weights) - set(own)), sorted(set(weights) - set(own))
@@ -64,9 +73,9 @@ def run(variant: str) -> dict[str, Any]:
     policy.model.register_forward_hook(
         lambda module, args, kwargs, out: evaluations.append((args, kwargs, out)), with_kwargs=True
     )
-    observation = {key: torch.from_numpy(value) for key, value in unets.observation(variant).items()}
+    observation = {key: torch.from_numpy(value) for key, value in given(variant).items()}
     steps = settings["n_action_steps"] if settings.get("pred_action_steps_only") else settings["horizon"]
-    initial, draws = unets.noise((steps, policy.model.final_conv[1].out_channels))
+    initial, draws = of.noise((steps, policy.model.final_conv[1].out_channels))
     order = iter(torch.from_numpy(draws))
     schedule = type(policy.noise_scheduler).__module__
     with (
