@@ -7,7 +7,7 @@ import pytest
 
 from ttscompile.core.sampler import SamplerTable
 from ttscompile.samplers.flow import flow_matching_table
-from ttscompile.verification.reuse import Unpaired
+from ttscompile.verification.reuse import NEGLIGIBLE, Unpaired, _promised, allowed
 
 
 @pytest.mark.parametrize(("moved", "least", "most"), [(0.0, 0.0, 0.25), (0.5, 0.2, 0.6), (3.0, 1.2, 3.0)])
@@ -54,3 +54,13 @@ def test_which_samplers_take_noise_alike() -> None:
     columns["noise_to_next"][0] = 1
     drawing = SamplerTable(euler.name, euler.timesteps, clip=None, **columns)
     assert not euler.takes_noise_as(drawing) and drawing.takes_noise_as(drawing)
+
+
+def test_an_estimate_that_lies_below_0_promises_no_more_than_its_interval() -> None:
+    """Of few calls an estimate may be negative; three times that is nothing that another one could keep to."""
+    record = {"plans": {"fast": {"distance": -0.144, "interval": [-0.26, 0.214]}, "old": {"distance": 0.1}}}
+    promised = _promised(record, "fast", "distance", "interval")
+    assert promised == 0.214
+    assert allowed(promised, NEGLIGIBLE, 28)[1] == pytest.approx(3 * 0.214)
+    assert _promised(record, "old", "distance", "interval") == 0.1, "of a plan without an interval"
+    assert _promised(record, "none", "distance", "interval") is None

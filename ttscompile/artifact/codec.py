@@ -324,7 +324,7 @@ def check_record(record: Value) -> None:
     if "budget" in members:
         _check_kinds(members["budget"].members(), dict.fromkeys(_BUDGET, float | None))
     for score in members["plans"].members().values() if "plans" in members else ():
-        _check_kinds(score.members(), dict.fromkeys(_SCORE, float | None))
+        _check_kinds(score.members(), {**dict.fromkeys(_SCORE, float | None), "interval": tuple[float, ...]})
     for tried in members["frontier"].items() if "frontier" in members else ():
         _check_kinds(tried.members(), _TRIED)
 

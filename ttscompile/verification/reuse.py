@@ -97,9 +97,8 @@ def check_episodes(
     error = float(np.mean(errors[name]))
     details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": other_noise}
     others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in errors.items() if n != name)
-    found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their"
-    found += f" units{f' ({others})' if others else ''}"
-    found += f"; two dense calls with different noise are {other_noise:.3g} apart"
+    found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their units"
+    found += f"{f' ({others})' if others else ''}; two dense calls with different noise are {other_noise:.3g} apart"
     if not episodes:
         found += f". No trajectories were given: these are {calls} calls on random observations, and not judged"
         remedy = "Give recorded episodes with --trajectories to have this judged."
@@ -108,7 +107,7 @@ def check_episodes(
     noise, unit, least = other_noise, UNIT, ROUNDING * other_noise
     if unpaired is not None:
         error, noise, unit, least = unpaired.distance, 1.0, OF_NOISE, NEGLIGIBLE
-        promised, promised_p90 = _promised(manifest.calibration, name, "distance"), None
+        promised, promised_p90 = _promised(manifest.calibration, name, "distance", "interval"), None  # may be below 0
         found += f". It is of another loop, in which the same noise means something else: by two draws {error:.3g} away"
     beyond = max(noise, promised_p90 or 0.0)
     factor, worse = allowed(promised, least, calls)
@@ -183,10 +182,11 @@ def allowed(promised: float | None, least: float, calls: int) -> tuple[float, fl
     return factor, float("inf") if promised is None else max(factor * promised, least)
 
 
-def _promised(calibration: Mapping[str, Any] | None, name: str, key: str) -> float | None:
-    """``error`` or ``error_p90`` that calibration measured for a plan on held-out calls; None if it did not."""
-    found = (calibration or {}).get("plans", {}).get(name, {}).get(key)
-    return None if found is None else float(found)
+def _promised(calibration: Mapping[str, Any] | None, name: str, *keys: str) -> float | None:
+    """The most that calibration measured for a plan on held-out calls, under these names; None if it did not."""
+    plan = (calibration or {}).get("plans", {}).get(name, {})
+    found = [plan[key] for key in keys if plan.get(key) is not None]
+    return float(np.hstack(found).max()) if found else None
 
 
 ENGAGED, NO_TIME = "engaged", "saves no time"
