@@ -97,8 +97,8 @@ def check_episodes(
     error = float(np.mean(errors[name]))
     details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": other_noise}
     others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in errors.items() if n != name)
-    found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their units"
-    found += f"{f' ({others})' if others else ''}; two dense calls with different noise are {other_noise:.3g} apart"
+    found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their"
+    found += f" units{f' ({others})' * bool(others)}; two dense calls with different noise are {other_noise:.3g} apart"
     if not episodes:
         found += f". No trajectories were given: these are {calls} calls on random observations, and not judged"
         remedy = "Give recorded episodes with --trajectories to have this judged."
