@@ -20,7 +20,7 @@ MARGIN = 5.0
 """Points of success, below which a plan is called equivalent (``examples/evaluation/equivalence.py``)."""
 FEW = 400
 """Episodes, below which a point is hollow: hardly any such plan can be called equivalent."""
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#8c564b")
 
 
 def plans() -> list[dict[str, Any]]:
