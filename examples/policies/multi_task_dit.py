@@ -1,7 +1,7 @@
 """Training LeRobot's ``multi_task_dit`` on the demonstrations of Push-T with lerobot's own code, on a CPU.
 
-What both recipes share: windows of demonstrations, tiny CLIP encoders from a configuration with random weights, the
-loop, and the averaged weights saved as lerobot saves a policy. lerobot has to be importable; none of its code is here.
+What both recipes share: tiny CLIP encoders from a configuration with random weights, the loop, and the averaged weights
+saved as lerobot saves a policy. lerobot has to be importable; none of its code is here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
 from lerobot.policies.multi_task_dit.modeling_multi_task_dit import MultiTaskDiTPolicy
 from lerobot.policies.multi_task_dit.processor_multi_task_dit import make_multi_task_dit_pre_post_processors
-from safetensors.torch import load_file, save_file
+from lerobot_training import average, saving, statistics
 from torch.optim.swa_utils import AveragedModel
 
 TASK = "push the T onto its place"
@@ -115,29 +115,6 @@ def make_encoder(folder: Path, vision: Mapping[str, int], seed: int) -> None:
     CLIPModel(CLIPConfig(text_config=text, vision_config=dict(vision), projection_dim=16)).save_pretrained(folder)
 
 
-def window_indices(episode_ends: np.ndarray, frames: int, horizon: int, executed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of every window: the observations up to now, and the actions from the first of them on.
-
-    The ends of an episode are repeated beyond it, as lerobot does. A window starts at every frame after which
-    ``executed`` actions are left, at most one of them repeated.
-
-    Returns:
-        int64 ``[N, frames]`` and ``[N, horizon]``.
-    """
-    observed, acted = [], []
-    for first, end in zip([0, *episode_ends[:-1]], episode_ends, strict=True):
-        now = np.arange(first, max(first + 1, end - executed + 1))[:, None]
-        observed.append(np.clip(now + np.arange(1 - frames, 1), first, end - 1))
-        acted.append(np.clip(now + np.arange(1 - frames, 1 - frames + horizon), first, end - 1))
-    return np.concatenate(observed), np.concatenate(acted)
-
-
-def statistics(values: np.ndarray) -> dict[str, torch.Tensor]:
-    """What lerobot's normalisers want to know of a feature, over ``[N, D]``."""
-    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-    return {name: torch.as_tensor(value, dtype=torch.float32) for name, value in found.items()}
-
-
 def picture_statistics(pictures: np.ndarray) -> dict[str, torch.Tensor]:
     """The same of pictures uint8 ``[N, H, W, 3]`` as 0..1, a number a channel: ``[3, 1, 1]`` each."""
     some = pictures[:: max(1, len(pictures) // 2000)].reshape(-1, 3) / 255
@@ -165,7 +142,7 @@ class Policy:
 
     def average_from_here(self) -> None:
         """Forget what was averaged."""
-        self.averaged = AveragedModel(self.network, avg_fn=_average)
+        self.averaged = AveragedModel(self.network, avg_fn=average)
 
     @torch.no_grad()
     def look(self, frames: torch.Tensor) -> torch.Tensor:
@@ -237,37 +214,14 @@ class Policy:
 
         The folder appears at once: there is never half a policy in it.
         """
-        beside = folder.with_name(f".{folder.name}.new")
-        shutil.rmtree(beside, ignore_errors=True)
         network: Any = self.averaged.module
-        network.save_pretrained(beside)
-        self.before.save_pretrained(beside)
-        self.after.save_pretrained(beside)
-        weights = load_file(beside / "model.safetensors")
-        save_file(
-            {name: value.half() for name, value in weights.items()}, beside / "model.safetensors", {"format": "pt"}
-        )
-        (beside / ENCODER).mkdir()
-        for file in ("config.json", "vocab.json", "merges.txt", "tokenizer_config.json"):
-            shutil.copy(encoder / file, beside / ENCODER)
-        shutil.rmtree(folder, ignore_errors=True)
-        beside.rename(folder)
-
-
-def draw(windows: dict[str, torch.Tensor], size: int, seed: int) -> Iterator[dict[str, torch.Tensor]]:
-    """Batches without end, every epoch in an order of its own."""
-    generator, count = np.random.default_rng(seed), len(windows["action"])
-    while True:
-        order = torch.from_numpy(generator.permutation(count))
-        for chosen in order.split(size)[: count // size]:
-            yield {name: every[chosen] for name, every in windows.items()}
+        with saving(folder) as beside:
+            for each in (network, self.before, self.after):
+                each.save_pretrained(beside)
+            (beside / ENCODER).mkdir()
+            for file in ("config.json", "vocab.json", "merges.txt", "tokenizer_config.json"):
+                shutil.copy(encoder / file, beside / ENCODER)
 
 
 def _identity(frames: torch.Tensor) -> torch.Tensor:
     return frames
-
-
-def _average(average: torch.Tensor, now: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
-    """Exponential average whose memory grows with the number of steps, up to 1000 of them."""
-    keep = min(0.999, 1 - (1 + float(count)) ** -0.75)
-    return average.lerp(now, 1 - keep)

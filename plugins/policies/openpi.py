@@ -30,7 +30,7 @@ from ttscompile.frontends.settings import MAX_BYTES, Settings, read_json
 
 from .lerobot import pi, vla
 from .lerobot.config import ACTION, CONFIG, MOST, MOST_STEPS, STATE, WEIGHTS, LeRobotConfig
-from .lerobot.policy import MASK, TOKENS, saved_weights
+from .lerobot.policy import MASK, TOKENS, weights_in
 from .lerobot.processors import Processors, Statistics
 from .lerobot.tokenizer import file_of_name
 from .openpi_params import read_params
@@ -144,7 +144,7 @@ def _weights(directory: Path, settings: Settings) -> tuple[dict[str, Tensor], bo
                 f"{key} is {settings.values[key]!r:.80}: openpi's converter leaves out what LoRA learned, so these are"
                 f" the weights of its base. Give the folder that it converted, which has {PARAMS}"
             )
-    return saved_weights(directory, *pi.UNREAD), False
+    return weights_in(directory, *pi.UNREAD), False
 
 
 def _variant(directory: Path, weights: Mapping[str, Tensor]) -> tuple[bool, int]:

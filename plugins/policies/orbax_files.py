@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from math import prod
@@ -21,6 +20,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
+from ttscompile.core.limits import limit
 from ttscompile.errors import CheckpointError
 
 MANIFEST = "manifest.ocdbt"
@@ -114,7 +114,8 @@ def send(folder: str) -> None:
     try:
         import tensorstore
 
-        _limit(_bytes_of(Path(folder)))
+        size = _bytes_of(Path(folder))
+        limit(_seconds(size), _MORE_BYTES + 4 * size)
         base = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
         keys = (key.decode() for key in tensorstore.KvStore.open(base).result().list().result())
         names = sorted(key.removesuffix("/.zarray") for key in keys if key.endswith("/.zarray"))
@@ -145,21 +146,3 @@ def _bytes_of(folder: Path) -> int:
 
 def _seconds(size: int) -> int:
     return _MORE_SECONDS + (size >> 20)
-
-
-def _limit(size: int) -> None:
-    """Limit this process, where its system can, to what files of so many bytes take."""
-    try:
-        import resource
-    except ModuleNotFoundError:  # Windows
-        return
-    limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
-    limits[resource.RLIMIT_CPU] = int(time.process_time()) + _seconds(size)
-    statm = Path("/proc/self/statm")
-    if statm.exists():
-        held = int(statm.read_text().split()[5]) * resource.getpagesize()
-        limits[resource.RLIMIT_DATA] = held + _MORE_BYTES + 4 * size
-    for which, value in limits.items():
-        hard = resource.getrlimit(which)[1]
-        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(which, (value, value))

@@ -76,8 +76,8 @@ def test_an_answer_that_is_cut_short_is_an_error(tmp_path: Path, monkeypatch: py
 def test_the_limits_of_the_process_hold(tmp_path: Path) -> None:
     code = f"""
 import resource
-from ttscompile.trajectories.sandbox import limit
-limit(3 << 20, 3 << 20)
+from ttscompile.core.limits import limit
+limit(10, 2**30)
 try:
     bytearray(3 << 29)
 except MemoryError:

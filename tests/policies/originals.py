@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
 import ttscompile
-from tests.rounding import PROMISED, bound
+from tests.rounding import PROMISED, Counted, assert_equal_but_for_rounding, bound
 from ttscompile import Noise, PolicySpec
 from ttscompile.artifact import load_artifact
+from ttscompile.frontends.eager import eager_policy, evaluation
 from ttscompile.runtimes import open_runtime
 
 from ..runtimes.agreement import call_terms, largest_difference
@@ -36,6 +38,25 @@ def assert_actions(spec: PolicySpec, sample: torch.Tensor, expected: Arrays) -> 
     executed = actions[:, spec.chunk.start : spec.chunk.stop]
     assert executed.shape == expected["action"].shape
     assert np.abs(executed - expected["action"]).max() < tolerance
+
+
+def assert_original(module: nn.Module, spec: PolicySpec, given: Arrays, noise: Noise, expected: Arrays) -> None:
+    """Single evaluations, timesteps, and the actions of a whole call are those that the original gave.
+
+    Args:
+        given: the observation as it is recorded.
+        noise: of the call; single evaluations are of the sample that it begins with.
+        expected: the golden file.
+    """
+    observation = as_seen(spec, given)
+    with torch.inference_mode():
+        evaluate, sample = evaluation(module, spec, observation), torch.from_numpy(noise.initial)
+        for timestep, prediction in zip(expected["probe_t"], expected["probe_out"], strict=True):
+            with Counted() as counted:
+                found = evaluate(sample, torch.full((len(sample),), int(timestep)))
+            assert_equal_but_for_rounding(found, prediction, counted.terms, counted.angle)
+    assert spec.sampler.timesteps.tolist() == expected["timesteps"].tolist()
+    assert_actions(spec, eager_policy(module, spec)(observation, noise), expected)
 
 
 def assert_compiled_acts(directory: Path, observation: Arrays, noise: Noise, expected: Arrays) -> None:

@@ -12,11 +12,10 @@ import pytest
 import torch
 
 import ttscompile
-from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends import load_checkpoint_policy
-from ttscompile.frontends.eager import eager_policy, evaluation
+from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.families import AS_SAVED
 from ttscompile.ir.program import Program
 from ttscompile.policies.diffusion_policy import family as diffusion_policy
@@ -24,7 +23,7 @@ from ttscompile.policies.diffusion_policy.dp3 import POINTS
 
 from ..families.support import record
 from . import unets
-from .originals import as_seen, assert_actions, assert_compiled_acts, golden
+from .originals import as_seen, assert_actions, assert_compiled_acts, assert_original, golden
 from .refused import Refusals, refusals
 
 GIVEN = {"local": "local condition", "inpainting": "inpainting", "hybrid_inpainting": "inpainting"}
@@ -48,16 +47,8 @@ def test_the_original_gave_the_same(variant: str, tmp_path: Path) -> None:
     with warned(variant):
         module, spec = load_checkpoint_policy(tmp_path / "policy.ckpt")
     assert (spec.source["variant"], spec.source["weights"]) == (GIVEN.get(variant, "global condition"), "ema_model")
-    numbers, observation = golden(f"unet_{variant}"), as_seen(spec, unets.observation(variant))
     noise = Noise(*unets.noise(spec.sample))
-    with torch.inference_mode():
-        evaluate = evaluation(module, spec, observation)
-        for timestep, expected in zip(numbers["probe_t"], numbers["probe_out"], strict=True):
-            with Counted() as counted:
-                found = evaluate(torch.from_numpy(noise.initial), torch.full((unets.STREAMS,), int(timestep)))
-            assert_equal_but_for_rounding(found, expected, counted.terms, counted.angle)
-    assert spec.sampler.timesteps.tolist() == numbers["timesteps"].tolist()
-    assert_actions(spec, eager_policy(module, spec)(observation, noise), numbers)
+    assert_original(module, spec, unets.observation(variant), noise, golden(f"unet_{variant}"))
 
 
 @pytest.mark.parametrize("name", SAVED_BY_THE_ORIGINAL)

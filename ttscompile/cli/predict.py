@@ -22,7 +22,7 @@ from ttscompile.plots.frontier import plot_chunk
 from ttscompile.runtimes.load import open_policy
 from ttscompile.trajectories.episodes import read_npz
 
-TASK = "--task TEXT"
+_TASK = "--task TEXT"
 
 
 def _pictures(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, Path]:
@@ -93,7 +93,7 @@ def predict(
         told = compiled if spec.instruction is None else "the artifact has no tokenizer; name one by --tokenizer PATH"
         raise ObservationError(f"{directory}: --task {task!r:.100}: {told}. Or give tokens in --observation FILE.npz.")
     options = {key: _option(key, spec) for key in spec.observations if key not in obs}
-    if told := ", ".join(f"{key} ({how})" for key, how in options.items() if task is None or how != TASK):
+    if told := ", ".join(f"{key} ({how})" for key, how in options.items() if task is None or how != _TASK):
         raise ObservationError(f"the observation lacks {told}. Give it so, or arrays by key: --observation FILE.npz.")
     with progress().status("loading"):
         policy = open_policy(artifact, seed=seed, plan=plan, tokenizer=tokenizer)
@@ -154,7 +154,7 @@ def observed(
 
 def _option(key: str, spec: PolicySpec) -> str:
     """The option that gives this observation."""
-    one, others = spec.observations[key], "--observation FILE.npz" if spec.instruction is None else TASK
+    one, others = spec.observations[key], "--observation FILE.npz" if spec.instruction is None else _TASK
     return f"--image {key}=FILE" if one.image else "--state NUMBER,.." if np.dtype(one.dtype).kind == "f" else others
 
 

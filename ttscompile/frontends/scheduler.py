@@ -96,7 +96,8 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
         told = f"{', '.join(unknown)}. Remove them from the configuration if they are not needed, and save it again"
         raise CheckpointError(f"{where} has settings that diffusers' {own} does not know: {told}.")
     if name != own_name:  # of diffusers, DDPM and DDIM have a bound where nothing is said, and nothing else has
-        given["clip_sample"] = own_name != DPM and given.get("clip_sample", own[:4] in ("DDPM", "DDIM", ""))
+        bounded = not own or own.startswith(("DDPM", "DDIM"))
+        given["clip_sample"] = own_name != DPM and given.get("clip_sample", bounded)
         given = _for_dpm_solver(given, where) if name == DPM else given
     if spacing is not None:
         given["timestep_spacing"] = spacing

@@ -11,7 +11,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -22,13 +21,14 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 
+from ..core.limits import limit
 from ..errors import TrajectoryError
 from .array_files import hdf5_recording, zarr_recording
 from .frames import AS_NPZ, BLOCK_BYTES, Array, Frames, Recording, bytes_of, one_error, require_proportion, worth_of
 from .lerobot_dataset import lerobot_recording
 
 MORE_BYTES, MORE_SECONDS = 2**30, 4
-"""Memory and processor time of a reader beyond what its imports take; more for large files, see ``limit``."""
+"""Memory and processor time of a reader beyond what its imports take; more for large files."""
 FORMATS = {"hdf5": hdf5_recording, "lerobot": lerobot_recording, "zarr": zarr_recording}
 _OPENED = [f"PIL.{name}ImagePlugin" for name in ("Bmp", "Gif", "Jpeg", "Ppm", "Png")]
 """What Pillow imports when an image is opened, whatever formats are allowed."""
@@ -134,7 +134,7 @@ def serve_alone(request: Mapping[str, Any]) -> None:
     for package in [*IMPORTS[request["kind"]], *(["av"] if (path / "videos").is_dir() else [])]:
         with suppress(ModuleNotFoundError):  # the reader says so
             importlib.import_module(package)
-    limit(bytes_of(path), worth_of(path))
+    limit(1 + _seconds(worth_of(path)), MORE_BYTES + 4 * bytes_of(path))  # as files are, not as they declare
     serve(request, out)
     out.flush()
     os._exit(0)  # threads of a library need not be waited for
@@ -189,29 +189,6 @@ def _send_array(path: Path, out: BinaryIO, head: Mapping[str, str], rows: int, b
 
 def _send(out: BinaryIO, **line: Any) -> None:
     out.write(json.dumps(line).encode() + b"\n")
-
-
-def limit(size: int, worth: int) -> None:
-    """Limit this process, where its system can.
-
-    Args:
-        size: bytes of the files that are read; memory grows with it, not with what they declare.
-        worth: the same for time, see ``worth_of``.
-    """
-    try:
-        import resource
-    except ModuleNotFoundError:  # Windows
-        return
-    limits = {resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: 0}
-    limits[resource.RLIMIT_CPU] = int(time.process_time()) + 1 + _seconds(worth)
-    statm = Path("/proc/self/statm")
-    if statm.exists():
-        held = int(statm.read_text().split()[5]) * resource.getpagesize()
-        limits[resource.RLIMIT_DATA] = held + MORE_BYTES + 4 * size  # not what allocators reserve and do not use
-    for which, value in limits.items():
-        hard = resource.getrlimit(which)[1]
-        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(which, (value, value))
 
 
 def _seconds(size: int) -> int:

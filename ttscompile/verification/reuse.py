@@ -107,7 +107,7 @@ def check_episodes(
     noise, unit, least = other_noise, UNIT, ROUNDING * other_noise
     if unpaired is not None:
         error, noise, unit, least = unpaired.distance, 1.0, OF_NOISE, NEGLIGIBLE
-        promised, promised_p90 = _promised(manifest.calibration, name, "distance", "interval"), None  # may be below 0
+        promised, promised_p90 = _promised(manifest.calibration, name, "distance", "interval"), None
         found += f". It is of another loop, in which the same noise means something else: by two draws {error:.3g} away"
     beyond = max(noise, promised_p90 or 0.0)
     factor, worse = allowed(promised, least, calls)
@@ -183,7 +183,7 @@ def allowed(promised: float | None, least: float, calls: int) -> tuple[float, fl
 
 
 def _promised(calibration: Mapping[str, Any] | None, name: str, *keys: str) -> float | None:
-    """The most that calibration measured for a plan on held-out calls, under these names; None if it did not."""
+    """The most that calibration measured of a plan; of an interval its upper end, as an estimate may lie below 0."""
     plan = (calibration or {}).get("plans", {}).get(name, {})
     found = [plan[key] for key in keys if plan.get(key) is not None]
     return float(np.hstack(found).max()) if found else None

@@ -21,19 +21,8 @@ from safetensors.torch import load_file
 sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "evaluation")]
 
 from environments.pusht import observation  # noqa: E402
-from multi_task_dit import (  # noqa: E402
-    ENCODER,
-    EXECUTED,
-    HORIZON,
-    STATE,
-    WINDOW,
-    Policy,
-    configuration,
-    draw,
-    make_encoder,
-    statistics,
-    window_indices,
-)
+from lerobot_training import draw, statistics, window_indices  # noqa: E402
+from multi_task_dit import ENCODER, EXECUTED, HORIZON, STATE, WINDOW, Policy, configuration, make_encoder  # noqa: E402
 
 
 @click.command()

@@ -26,19 +26,8 @@ from torch.nn import functional
 sys.path[1:1] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2] / "evaluation")]
 
 from environments.pusht import observation  # noqa: E402
-from multi_task_dit import (  # noqa: E402
-    ENCODER,
-    EXECUTED,
-    HORIZON,
-    STATE,
-    WINDOW,
-    Policy,
-    configuration,
-    draw,
-    picture_statistics,
-    statistics,
-    window_indices,
-)
+from lerobot_training import draw, statistics, window_indices  # noqa: E402
+from multi_task_dit import ENCODER, EXECUTED, HORIZON, STATE, WINDOW, Policy, configuration, picture_statistics  # noqa: E402
 
 IMAGE = "observation.image"
 

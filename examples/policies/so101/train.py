@@ -10,17 +10,21 @@ importable; none of its code is here.
 from __future__ import annotations
 
 import math
-import shutil
+import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch.optim.swa_utils import AveragedModel
+
+sys.path.insert(1, str(Path(__file__).parents[1]))
+
+from lerobot_training import average, draw, saving, statistics, window_indices
 
 STATE, PLACES, ACTION = "observation.state", "observation.environment_state", "action"
 WINDOW, HORIZON, EXECUTED = 2, 16, 8
@@ -59,47 +63,11 @@ def windows(data: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
 
     Windows in whose executed actions a push is felt are left out.
     """
-    observed, acted = [], []
-    ends = data["episode_ends"]
-    for first, end in zip([0, *ends[:-1]], ends, strict=True):
-        now = np.arange(first, end)[:, None]
-        observed.append(np.maximum(now + np.arange(1 - WINDOW, 1), first))
-        acted.append(np.clip(now + np.arange(1 - WINDOW, 1 - WINDOW + HORIZON), first, end - 1))
-    before, after = np.concatenate(observed), np.concatenate(acted)
+    before, after = window_indices(data["episode_ends"], WINDOW, HORIZON, 1)
     kept = ~data["pushed"].astype(bool)[after[:, WINDOW - 1 : WINDOW - 1 + EXECUTED]].any(1)
     named = ((STATE, "state", before), (PLACES, "places", before), (ACTION, "action", after))
     made = {key: torch.from_numpy(data[name][rows[kept]]) for key, name, rows in named}
     return made | {"action_is_pad": torch.zeros(int(kept.sum()), HORIZON, dtype=torch.bool)}
-
-
-def draw(count: int, size: int, seed: int) -> Iterator[torch.Tensor]:
-    """Rows of batches without end, every epoch in an order of its own."""
-    generator = torch.Generator().manual_seed(seed)
-    while True:
-        yield from torch.randperm(count, generator=generator).split(size)[: count // size]
-
-
-def statistics(values: np.ndarray) -> dict[str, torch.Tensor]:
-    """What lerobot's normalisers want to know of a feature, over ``[N, D]``."""
-    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-    return {name: torch.as_tensor(value, dtype=torch.float32) for name, value in found.items()}
-
-
-def average(average: torch.Tensor, now: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
-    """Exponential average whose memory grows with the number of steps, up to 1000 of them."""
-    return average.lerp(now, max(0.001, (1 + float(count)) ** -0.75))
-
-
-def save(network: Any, processors: tuple[Any, Any], folder: Path) -> None:
-    """The policy as lerobot saves one, its weights in half precision. The folder appears at once."""
-    beside = folder.with_name(f".{folder.name}.new")
-    shutil.rmtree(beside, ignore_errors=True)
-    for each in (network, *processors):
-        each.save_pretrained(beside)
-    weights = load_file(beside / "model.safetensors")
-    save_file({name: value.half() for name, value in weights.items()}, beside / "model.safetensors", {"format": "pt"})
-    shutil.rmtree(folder, ignore_errors=True)
-    beside.rename(folder)
 
 
 @click.command()
@@ -132,8 +100,8 @@ def main(demonstrations: Path, out: Path, steps: int, batch: int, rate: float, s
     policy.train()
     begun, recent = time.monotonic(), 0.0
     print(f"{len(ready[ACTION])} windows, {sum(p.numel() for p in policy.parameters()):,} weights", flush=True)
-    for step, rows in zip(range(1, steps + 1), draw(len(ready[ACTION]), batch, seed), strict=False):
-        loss, _ = policy.forward({key: value[rows] for key, value in ready.items()})
+    for step, drawn in zip(range(1, steps + 1), draw(ready, batch, seed), strict=False):
+        loss, _ = policy.forward(drawn)
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
@@ -145,7 +113,10 @@ def main(demonstrations: Path, out: Path, steps: int, batch: int, rate: float, s
             print(f"step {step} loss {recent / 100:.4f} minutes {(time.monotonic() - begun) / 60:.1f}", flush=True)
             recent = 0.0
         if step % 500 == 0 or step == steps:
-            save(averaged.module, processors, out / "policy")
+            network: Any = averaged.module
+            with saving(out / "policy") as beside:
+                for each in (network, *processors):
+                    each.save_pretrained(beside)
 
 
 if __name__ == "__main__":

@@ -15,11 +15,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from ttscompile.errors import CheckpointError
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
 
-from ..networks.internvl import DEVIATION, MEAN
 from ..networks.resnet import CHANNELS, Norm, group_norm, resnet
 from .dp3 import (
     MOST_POINTS,
@@ -35,8 +33,9 @@ from .dp3 import (
     require_shapes,
     tell_of_steps,
 )
+from .images import COLOURS, DEVIATION, MEAN, encoder_settings
 from .parts import Observed, Rebuilt, Saved, Weights, image_normalizer, read_shape_meta, require_room
-from .timm_pictures import COLOURS, Colours, Pictures
+from .timm_pictures import Colours, Pictures, tell_of_draws
 from .unet import DEFAULTS, behind_encoder
 
 _STAGES, _WIDTH = 4, 128
@@ -159,26 +158,14 @@ def images(saved: Saved) -> Rebuilt:
         if settings.flag(name, False):
             raise settings.error(f"{name} is true; expected false: R3M takes colours alone, so the original cannot run")
     action_dim, _ = read_shape_meta(settings, "low_dim", "rgb")
-    own = _encoder_settings(settings)
+    own = encoder_settings(settings, _ENCODER, _OF_ENCODER)
+    if own.values.get("model_name") != "r3m":
+        raise own.refusal("model_name", "r3m, the only one that the original has")
     observed = _observed(own, settings.number("n_obs_steps"))
     encoder = _r3m(own, observed, saved.weights)
     rebuilt = behind_encoder(saved, encoder, encoder.width, observed, action_dim, network, _ON_IMAGES)
     tell_of_steps(saved)
     return rebuilt
-
-
-def _encoder_settings(settings: Settings) -> Settings:
-    """``cfg.policy.obs_encoder``."""
-    values = settings.part("obs_encoder").values
-    found = (str(values.get("_target_")).rpartition(".")[2], values.get("model_name"))
-    if found != (_ENCODER, "r3m"):
-        raise settings.error(f"obs_encoder is {found[0]} of {found[1]!r:.80}; expected {_ENCODER} of r3m")
-    if unknown := sorted(set(values) - _OF_ENCODER):
-        raise CheckpointError(
-            f"cfg.policy.obs_encoder has settings that {_NAME} does not know: {', '.join(unknown)}. The encoder was"
-            " changed; use ttscompile.compile_denoiser(module, spec)."
-        )
-    return Settings(values, f"{settings.where}obs_encoder.", settings.remedy)
 
 
 def _observed(own: Settings, steps: int) -> Observed:
@@ -221,10 +208,5 @@ def _r3m(own: Settings, observed: Observed, weights: Weights) -> R3MEncoder:
     what = "the weights of the image encoder are not those of R3M's ResNet-18"
     require_weights({full: expected[name] for full, name in names.items()}, found, "cfg.policy.obs_encoder", what=what)
     encoder.load_state_dict({name: found[full] for full, name in names.items()}, strict=False)
-    if pictures.drawn:
-        warnings.warn(
-            f"{own.where}transforms: the original draws {', '.join(pictures.drawn)} anew at every call, on the robot,"
-            " too. The compiled policy takes the middle: the crop in the centre, nothing turned, no other colours.",
-            stacklevel=2,
-        )
+    tell_of_draws(own, pictures.drawn)
     return encoder

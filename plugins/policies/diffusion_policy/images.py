@@ -80,7 +80,8 @@ _ENCODER = "MultiImageObsEncoder"
 _KNOWN = {"_target_", "shape_meta", "rgb_model", "resize_shape", "crop_shape", "random_crop"}
 _KNOWN |= {"use_group_norm", "share_rgb_model", "imagenet_norm"}
 _PREFIX = "obs_encoder."
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the colours of ImageNet
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of the colours of ImageNet."""
 
 
 def encoder_settings(settings: Settings, encoder: str = _ENCODER, known: Collection[str] = _KNOWN) -> Settings:
@@ -173,7 +174,7 @@ def _camera(
         found = f"crop_shape is {list(crop)}, and the images of {key!r} are {whole[0]} x {whole[1]}"
         raise settings.error(f"{found}; expected a crop that is smaller; the original refuses this, too")
     scale, offset = normalizer
-    mean, deviation = (_MEAN, _DEVIATION) if imagenet else ((0.0,) * COLOURS, (1.0,) * COLOURS)
+    mean, deviation = (MEAN, DEVIATION) if imagenet else ((0.0,) * COLOURS, (1.0,) * COLOURS)
     scales = tuple(scale / each for each in deviation)
     offsets = tuple((offset - middle) / each for middle, each in zip(mean, deviation, strict=True))
     return Camera(height, width, resize, crop, scales, offsets)

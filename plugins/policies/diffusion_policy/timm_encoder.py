@@ -4,7 +4,6 @@ Source: ``TimmObsEncoder`` and ``TransformerObsEncoder`` of real-stanford/univer
 (Chi et al., arXiv 2402.10329), with the networks of timm 0.9.7, which it asks for.
 """
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -18,10 +17,10 @@ from ttscompile.frontends.settings import Settings
 
 from ..networks.clip import Attention
 from ..networks.timm_vit import own_names
-from .images import encoder_settings
+from .images import COLOURS, encoder_settings
 from .parts import Weights, affine, image_normalizer, read_shape_meta
 from .timm_networks import aggregation, is_vit, model_name, network_of
-from .timm_pictures import COLOURS, Pictures
+from .timm_pictures import Pictures, tell_of_draws
 
 _KNOWN = {"_target_", "shape_meta", "model_name", "pretrained", "frozen", "global_pool", "transforms"}
 _KNOWN |= {"use_group_norm", "share_rgb_model", "feature_aggregation", "downsample_ratio"}
@@ -175,13 +174,7 @@ def build(policy: Settings, name: str, weights: Weights) -> Encoder:
         raise settings.error(f"shape_meta.obs: expected cameras (type: rgb) of one size; found {sizes}")
     size = observed[cameras[0]][2:]
     pictures = [Pictures(settings, (size[0], size[1]), image_normalizer(weights, key)) for key in cameras]
-    if drawn := sorted({each for one in pictures for each in one.drawn}):
-        warnings.warn(
-            f"{settings.where}transforms: the original draws {', '.join(drawn)} anew at every call, on the robot, too."
-            " The compiled policy takes the middle of what is drawn: the crop in the middle, nothing turned, and no"
-            " other colours.",
-            stacklevel=2,
-        )
+    tell_of_draws(settings, [each for one in pictures for each in one.drawn])
     shared = settings.flag("share_rgb_model", False)
     found = _renamed(weights, keys, cameras[:1] if shared else cameras, shared)
     own = {key.removeprefix("networks.0."): each for key, each in found.items() if key.startswith("networks.0.")}

@@ -18,7 +18,7 @@ from ttscompile.frontends.settings import Settings
 from ..networks.convnext import convnext
 from ..networks.resnet import CHANNELS, DEEPER, WIDER, Norm, group_norm, resnet
 from ..networks.timm_vit import DinoConfig, TimmVit, VitConfig
-from .timm_pictures import COLOURS
+from .images import COLOURS
 
 _VIT = re.compile(
     r"vit_(tiny|small|base|large)_patch\d{1,2}_(clip_(quickgelu_)?\d{2,4}|(reg4_)?dinov2|\d{2,4})(\.\w+)?"

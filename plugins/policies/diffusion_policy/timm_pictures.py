@@ -1,4 +1,4 @@
-"""What UMI does to a picture before its network sees it, with the middle of all that it draws.
+"""What UMI and iDP3 do to a picture before their networks see it, with the middle of all that they draw.
 
 The original crops, turns and recolours its pictures at random in training, and at every call afterwards, too:
 torchvision's transforms do not know that a policy is evaluated. Here a crop is the one in the middle, no picture is
@@ -8,7 +8,8 @@ Source: ``transforms`` of ``TimmObsEncoder`` of real-stanford/universal_manipula
 torchvision 0.16, which it asks for.
 """
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch
@@ -17,10 +18,8 @@ from torch import nn
 from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.settings import Settings
 
+from .images import COLOURS
 from .parts import MOST_PIXELS
-
-COLOURS = 3
-"""Channels of a picture."""
 
 Size = tuple[int, int]
 
@@ -42,6 +41,22 @@ _OTHERS: Mapping[str, frozenset[str]] = {
     "Normalize": frozenset({"mean", "std"}),
 }
 """Their other settings, and those of the other transforms."""
+
+
+def tell_of_draws(settings: Settings, drawn: Collection[str]) -> None:
+    """Warn that the original draws what the compiled policy does not, if it does.
+
+    Args:
+        settings: of the encoder.
+        drawn: names of the transforms; see ``Pictures``.
+    """
+    if drawn:
+        warnings.warn(
+            f"{settings.where}transforms: the original draws {', '.join(sorted(set(drawn)))} anew at every call, on the"
+            " robot, too. The compiled policy takes the middle of what is drawn: the crop in the middle, nothing"
+            " turned, and no other colours.",
+            stacklevel=3,
+        )
 
 
 class Colours(nn.Module):

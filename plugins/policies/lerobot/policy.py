@@ -126,11 +126,11 @@ def read_weights(config: LeRobotConfig, options: LoadOptions, *without: str) -> 
     adapter, directory = read_adapter(config.directory, config.settings), config.directory
     if adapter is None and options.base is not None:
         raise CheckpointError(f"{directory}: the option base is for an adapter; found a whole policy. Leave it out.")
-    weights = saved_weights(directory if adapter is None else find_base(adapter, options.base), *without)
+    weights = weights_in(directory if adapter is None else find_base(adapter, options.base), *without)
     return weights if adapter is None else merged(directory, adapter, weights, without)
 
 
-def saved_weights(directory: Path, *without: str) -> dict[str, torch.Tensor]:
+def weights_in(directory: Path, *without: str) -> dict[str, torch.Tensor]:
     """The weights in a directory as float32, without those ``left_out``."""
     path = directory / WEIGHTS
     require_memory(path, without)

@@ -133,7 +133,7 @@ def _level(channels_in: int, channels: int, config: UNetConfig) -> list[nn.Modul
     return [ConditionedBlock(channels if i else channels_in, channels, config) for i in range(config.blocks)]
 
 
-class _Resize(nn.Module):
+class Resize(nn.Module):
     """A strided convolution, in a module of its own as the checkpoints name its weights."""
 
     def __init__(self, convolution: nn.Module) -> None:
@@ -141,6 +141,7 @@ class _Resize(nn.Module):
         self.conv = convolution
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[B, C, T]`` -> ``[B, C, T / 2]`` or ``[B, C, 2 T]``."""
         return self.conv(x)  # type: ignore[no-any-return]
 
 
@@ -161,12 +162,12 @@ class ConditionalUnet1D(nn.Module):
             self.local_cond_encoder = nn.ModuleList(each)
         self.down_modules = nn.ModuleList()
         for level, (before, after) in enumerate(pairwise((config.input_dim, *dims))):
-            halve = _Resize(nn.Conv1d(after, after, 3, 2, 1)) if level < len(dims) - 1 else nn.Identity()
+            halve = Resize(nn.Conv1d(after, after, 3, 2, 1)) if level < len(dims) - 1 else nn.Identity()
             self.down_modules.append(nn.ModuleList((*_level(before, after, config), halve)))
         self.mid_modules = nn.ModuleList(_level(dims[-1], dims[-1], config))
         self.up_modules = nn.ModuleList()
         for after, before in pairwise(reversed(dims)):
-            double = _Resize(nn.ConvTranspose1d(before, before, 4, 2, 1))
+            double = Resize(nn.ConvTranspose1d(before, before, 4, 2, 1))
             self.up_modules.append(nn.ModuleList((*_level(2 * after, before, config), double)))
         last = ConvolutionBlock(dims[0], dims[0], config.kernel_size, _GROUPS_AT_THE_END)
         self.final_conv = nn.Sequential(last, nn.Conv1d(dims[0], config.input_dim, 1))

@@ -4,7 +4,6 @@ Source: ``DiffusionMLP`` and ``Unet1D`` of irom-princeton/dppo at cc7234a (Ren e
 al., Diffusion Policy (arXiv 2303.04137).
 """
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,9 @@ from typing import Any
 
 import torch
 from torch import nn
+
+from .conditional_unet1d import Resize
+from .transformer_for_diffusion import SinusoidalEmbedding
 
 ACTIVATIONS: Mapping[str, Callable[[], nn.Module]] = {
     "Mish": nn.Mish,
@@ -25,20 +27,9 @@ ACTIVATIONS: Mapping[str, Callable[[], nn.Module]] = {
 }
 
 
-class _Waves(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.count = width // 2
-
-    def forward(self, timestep: torch.Tensor) -> torch.Tensor:
-        rates = torch.exp(torch.arange(self.count) * -(math.log(10000) / (self.count - 1)))
-        angles = timestep[:, None] * rates
-        return torch.cat((angles.sin(), angles.cos()), dim=-1)
-
-
 def _time(width: int, hidden: int) -> nn.Sequential:
     """Timesteps ``[B]`` -> ``[B, width]``."""
-    return nn.Sequential(_Waves(width), nn.Linear(width, hidden), nn.Mish(), nn.Linear(hidden, width))
+    return nn.Sequential(SinusoidalEmbedding(width), nn.Linear(width, hidden), nn.Mish(), nn.Linear(hidden, width))
 
 
 class MLP(nn.Module):
@@ -202,15 +193,6 @@ class _Conditioned(nn.Module):
         return self.blocks[1](inner + film) + self.residual_conv(x)  # type: ignore[no-any-return]
 
 
-class _Resize(nn.Module):
-    def __init__(self, conv: nn.Module) -> None:
-        super().__init__()
-        self.conv = conv
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.conv(x)  # type: ignore[no-any-return]
-
-
 class Unet1D(nn.Module):
     """Convolutions along the chunk's time, each pair of which reads timestep and observation."""
 
@@ -224,11 +206,11 @@ class Unet1D(nn.Module):
         self.mid_modules = nn.ModuleList(_Conditioned(levels[-1], levels[-1], config) for _ in range(2))
         self.down_modules, self.up_modules = nn.ModuleList(), nn.ModuleList()
         for number, (before, after) in enumerate(pairwise((config.actions, *levels)), start=1):
-            halve = _Resize(nn.Conv1d(after, after, 3, 2, 1)) if number < len(levels) else nn.Identity()
+            halve = Resize(nn.Conv1d(after, after, 3, 2, 1)) if number < len(levels) else nn.Identity()
             pair = _Conditioned(before, after, config), _Conditioned(after, after, config)
             self.down_modules.append(nn.ModuleList((*pair, halve)))
         for before, after in pairwise(reversed(levels)):
-            double = _Resize(nn.ConvTranspose1d(after, after, 4, 2, 1))
+            double = Resize(nn.ConvTranspose1d(after, after, 4, 2, 1))
             pair = _Conditioned(2 * before, after, config), _Conditioned(after, after, config)
             self.up_modules.append(nn.ModuleList((*pair, double)))
         last = _Convolution(levels[0], levels[0], config)

@@ -78,8 +78,9 @@ class SinusoidalEmbedding(nn.Module):
         super().__init__()
         half = width // 2
         step = math.log(10000) / (half - 1)
-        # Not persistent: checkpoints do not hold it.
-        self.register_buffer("frequencies", torch.exp(torch.arange(half) * -step), persistent=False)
+        # Not persistent: checkpoints do not hold it. Of numbers in a network on the meta device, too.
+        rates = torch.exp(torch.arange(half, device="cpu") * -step)
+        self.register_buffer("frequencies", rates, persistent=False)
 
     def forward(self, timestep: torch.Tensor) -> torch.Tensor:
         """``[B]`` -> ``[B, width]``."""
