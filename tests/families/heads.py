@@ -140,7 +140,7 @@ def dit_policy() -> Family:
 
 def scaledp() -> Family:
     return Family(
-        title="ScaleDP (DexVLA), read from its directory",
+        title="ScaleDP (DexVLA), its head without its Qwen2-VL, read from its directory",
         verified=f"DexVLA fc21a82 `model_forward`, `forward`, {UP_TO}",
         module=ScaleDPHead(ScaleDPConfig(24, heads=3, layers=2, horizon=6, actions=5, features=18, state=4, hidden=20)),
         conditions=("features", "state"),

@@ -11,7 +11,7 @@ from typing import Any
 
 from tests.ir.meta import assert_types_of
 from ttscompile.artifact.load import Artifact
-from ttscompile.ir.flops import frames_flops, graph_flops
+from ttscompile.ir.flops import graph_flops, once_flops
 from ttscompile.ir.graph import Graph
 from ttscompile.ir.program import Block, Program
 
@@ -62,7 +62,7 @@ def row(family: str, verified_against: str, sampler: str, program: Program) -> R
     steps = program.spec.sampler.steps
     loop = sum(graph_flops(piece.graph) for piece in pieces.loop.values()) * steps
     batched = 0 if pieces.step is None else graph_flops(pieces.step) * steps
-    evaluations = program.dense_flops - frames_flops(pieces) - graph_flops(pieces.condition)
+    evaluations = program.dense_flops - once_flops(pieces) or 1  # 0 where all of it runs once a call
     kinds = Counter(block.kind for block in program.blocks)
     return {
         "family": family,
