@@ -13,8 +13,10 @@ written, and no runtime knows of any.
   the width with itself for each token. The last column counts it.
 - ``gate``: FastCache's. A block is computed where its input has changed by more than a threshold since it last was,
   relative, by the Frobenius norm; the threshold is the lowest that keeps the cells. Else it is linear, or reused.
+- ``published``: the same gate with the threshold of its authors' code, and with that of its paper. How many cells they
+  compute, they decide.
 - ``tokens``: ToCa's, of each block those whose residual changed most, as if somebody knew before computing them. Their
-  number is rounded up.
+  number is rounded up. One more row has ToCa's own score.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
+from published import Gate, Keeps, authors_keep, below, paper_threshold, toca_score
 from three_parts import answered
 from torch import Tensor
 
@@ -54,7 +57,7 @@ from ttscompile.rivals.taylorseer import correction_for
 PROBES = 12
 """Of a threshold."""
 
-WAYS = ("forecast", "linear", "gate", "tokens")
+WAYS = ("forecast", "linear", "gate", "published", "tokens")
 
 Steps = tuple[int, ...]
 
@@ -188,49 +191,66 @@ class Study:
         matrix, shift = self.maps[b]
         return stream @ matrix + shift, 0.0
 
-    def gated(self, calls: Calls, threshold: float, otherwise: Fill) -> Filled:
-        """Calls in which a block is computed where its input has changed by more than a threshold since it last was."""
-        axis, before = self.runner.axes[0], dict[int, Tensor]()
-        latest = dict[int, Tensor]()
+    def gated(self, calls: Calls, keeps: Keeps, otherwise: Fill) -> Filled:
+        """Calls in which a block is computed where its input has changed too much since it last was."""
+        axis, gate, latest = self.runner.axes[0], Gate(keeps), dict[int, Tensor]()
 
         def fill(k: int, b: int, stream: Tensor, kept: Sequence[tuple[int, Tensor]]) -> tuple[Tensor, float]:
-            if b not in before:  # step 0 is whole, and its inputs are not seen here
-                before[b], latest[b] = torch.full_like(stream, float("inf")), kept[0][1]
-            change = (stream - before[b]).movedim(axis, 0).flatten(1).norm(dim=1)
-            size = before[b].movedim(axis, 0).flatten(1).norm(dim=1)
-            new = ~(change <= threshold * size) | before[b].movedim(axis, 0).flatten(1).isinf().any(1)
-            shape = [1, 1, 1]
+            latest.setdefault(b, kept[0][1])  # of step 0, which is whole, and whose inputs are not seen here
+            new, shape = gate(k, b, stream.movedim(axis, 0).flatten(1)), [1, 1, 1]
             shape[axis] = -1
             chosen = new.reshape(shape)
             computed = self.runner.model.block(b, k, stream, calls.contexts)
             other, _ = otherwise(k, b, stream, [(k, latest[b])])
-            before[b], latest[b] = torch.where(chosen, stream, before[b]), torch.where(chosen, computed, latest[b])
+            latest[b] = torch.where(chosen, computed, latest[b])
             return torch.where(chosen, computed, other), float(new.float().mean())
 
         return self.filled(calls, (0,), fill)
 
+    def published(self) -> list[tuple[str, Keeps]]:
+        """FastCache's own thresholds."""
+        size, timesteps = self.tokens * self.width, self.runner.view.manifest.spec.sampler.timesteps
+        return [
+            ("FastCache's own gate", lambda change, k: authors_keep(change, float(timesteps[k]), size)),
+            ("the gate of FastCache's paper", lambda change, k: change <= paper_threshold(size)),
+        ]
+
     def threshold(self, cells: float, otherwise: Fill) -> float:
         """The lowest, by bisection, with which calls that are learned from compute so many cells on average."""
+
+        def enough(found: float) -> bool:
+            return self.gated(self.learned, below(found), otherwise).cells <= cells
+
         low, high = 0.0, 1.0
-        while self.gated(self.learned, high, otherwise).cells > cells and high < 1e3:
+        while not enough(high) and high < 1e3:
             low, high = high, 2 * high
         for _ in range(PROBES):
             middle = (low + high) / 2
-            low, high = (low, middle) if self.gated(self.learned, middle, otherwise).cells <= cells else (middle, high)
+            low, high = (low, middle) if enough(middle) else (middle, high)
         return high
 
-    def some_tokens(self, whole: Steps, count: int) -> Filled:
-        """Calls in which the tokens of a block whose residual changed most are computed, so many, at other steps."""
+    def some_tokens(self, whole: Steps, count: int, toca: bool = False) -> Filled:
+        """Calls in which so many tokens of a block are computed at other steps.
+
+        Args:
+            whole: steps that are computed whole.
+            count: of tokens.
+            toca: those with ToCa's highest score, in place of those whose residual changed most.
+        """
         axis, calls, latest = self.runner.axes[0], self.judged, dict[int, Tensor]()
+        waited = dict[int, Tensor]()
 
         def fill(k: int, b: int, stream: Tensor, kept: Sequence[tuple[int, Tensor]]) -> tuple[Tensor, float]:
             if k - 1 in whole:
                 latest[b] = kept[0][1]
             computed = self.runner.model.block(b, k, stream, calls.contexts).movedim(axis, 0)
             old = latest[b].movedim(axis, 0)
-            chosen = (computed - old).norm(dim=-1).topk(count, 1).indices
-            mask = torch.zeros(old.shape[:2]).scatter(1, chosen, 1.0)[..., None] > 0
-            latest[b] = torch.where(mask, computed, old).movedim(0, axis)
+            if k - 1 in whole:
+                waited[b] = torch.zeros(old.shape[:2])
+            score = toca_score(stream.movedim(axis, 0), old, waited[b]) if toca else (computed - old).norm(dim=-1)
+            mask = torch.zeros(old.shape[:2]).scatter(1, score.topk(count, 1).indices, 1.0) > 0
+            waited[b] = torch.where(mask, 0.0, waited[b] + 1)
+            latest[b] = torch.where(mask[..., None], computed, old).movedim(0, axis)
             return latest[b], count / self.tokens
 
         return self.filled(calls, whole, fill)
@@ -255,16 +275,20 @@ def rows_of(study: Study, count: int, only: Sequence[str] = WAYS) -> list[Row]:
         found.append(study.row("forecast of the output, a correction", Filled(corrected.run(plan, judged), cells)))
     if "linear" in only:
         found.append(study.row("linear in the input", study.filled(judged, whole, study.linear), product))
-    if "gate" in only:
-        for name, otherwise, beside in (("reused", study.reused, 0.0), ("linear", study.linear, product)):
-            done = study.gated(judged, study.threshold(cells, otherwise), otherwise)
+    for name, otherwise, beside in (("reused", study.reused, 0.0), ("linear", study.linear, product)):
+        if "gate" in only:
+            done = study.gated(judged, below(study.threshold(cells, otherwise)), otherwise)
             found.append(study.row(f"FastCache's gate, else {name}", done, beside))
+        if "published" in only:
+            for gate, keeps in study.published():
+                found.append(study.row(f"{gate}, else {name}", study.gated(judged, keeps, otherwise), beside))
     if "tokens" in only:
         for fewer in range(count - 1, 0, -1):
             tokens = -(-(count - fewer) * study.tokens // (study.steps - fewer))  # rounded up
-            done = study.some_tokens(even(study.steps, fewer), tokens)
             whole_steps = f"{fewer} whole step{'s' * (fewer > 1)}"
-            found.append(study.row(f"{whole_steps}, and the best {tokens} of {study.tokens} tokens", done))
+            for which, toca in (("the best", False), ("ToCa's", True)):
+                done = study.some_tokens(even(study.steps, fewer), tokens, toca)
+                found.append(study.row(f"{whole_steps}, and {which} {tokens} of {study.tokens} tokens", done))
     return found
 
 

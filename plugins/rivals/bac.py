@@ -46,7 +46,7 @@ def bac(task: Task) -> Found:
     """The schedule of the scheduler and the union."""
     model = task.runner.model
     calls, run = some_calls(task, DENSE_CALLS), task.runner
-    found = [dense_statistics(run, run.select(calls, [i])) for i in task.clock.in_time(range(calls.count))]
+    found = [statistics(dense_residuals(run, run.select(calls, [i]))) for i in task.clock.in_time(range(calls.count))]
     similarity, change = (np.mean([one[part] for one in found], axis=0) for part in range(2))
     most = min(model.steps, task.budget // model.blocks + 1)
     schedules = [best_schedules(one, most) for one in similarity]
@@ -144,16 +144,18 @@ def spend(schedules: Sequence[Sequence[Schedule]], followed: Mapping[int, Sequen
     return counts
 
 
-def dense_statistics(runner: Runner, calls: Calls) -> tuple[Scores, Scores]:
+def statistics(residuals: Sequence[Tensor]) -> tuple[Scores, Scores]:
     """How each block's residual changes over the steps of dense calls.
+
+    Args:
+        residuals: ``[N, K, size]`` a block.
 
     Returns:
         Cosine similarities ``[blocks, K, K]``, and mean absolute differences over all pairs of steps ``[blocks]``; both
         averaged over the calls.
     """
-    residuals = dense_residuals(runner, calls)
     similarity, change = [], []
-    for rows in residuals:  # [N, K, size]
+    for rows in residuals:
         unit = torch.nn.functional.normalize(rows, dim=-1)
         similarity.append((unit @ unit.transpose(1, 2)).mean(0).cpu().double().numpy())
         change.append(float(torch.cdist(rows, rows, p=1).mean().cpu()) / rows.shape[-1])

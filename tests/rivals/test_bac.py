@@ -10,7 +10,7 @@ import pytest
 from tests.calibration.tasks import MakeTask, found_by
 from tests.rounding import Counted, assert_equal_but_for_rounding, bound
 from ttscompile.core.lattice import Source
-from ttscompile.rivals.bac import Schedule, best_schedules, bubbling, dense_residuals, dense_statistics, spend, union
+from ttscompile.rivals.bac import Schedule, best_schedules, bubbling, dense_residuals, spend, statistics, union
 
 
 def score(similarity: np.ndarray, steps: tuple[int, ...]) -> float:
@@ -75,7 +75,7 @@ def test_statistics_of_a_dense_call(make_task: MakeTask) -> None:
     task = make_task(20)
     calls = task.runner.select(task.calls, [0, 1])
     residuals = dense_residuals(task.runner, calls)
-    similarity, change = dense_statistics(task.runner, calls)
+    similarity, change = statistics(residuals)
     assert similarity.shape == (6, 10, 10)
     one, other = (residuals[4][0, k].double().numpy() for k in (2, 7))
     again = residuals[4][1].double().numpy()

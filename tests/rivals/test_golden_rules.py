@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from tests.calibration.tasks import MakeTask
 from tests.rounding import bound
 from ttscompile.core.lattice import Source
+from ttscompile.rivals.bac import best_schedules, bubbling, statistics, union
+from ttscompile.rivals.gates import Gates
 from ttscompile.rivals.online import Criterion, Decisions
+from ttscompile.rivals.static import edge_plan
 from ttscompile.rivals.taylorseer import forecast, schedules
 
 Arrays = Mapping[str, np.ndarray]
@@ -18,8 +23,11 @@ Arrays = Mapping[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def golden() -> Arrays:
-    with np.load(Path(__file__).with_name("golden") / "rules.npz") as arrays:
-        return dict(arrays)
+    found: dict[str, np.ndarray] = {}
+    for name in ("rules", "schedules"):
+        with np.load(Path(__file__).with_name("golden") / f"{name}.npz") as arrays:
+            found |= arrays
+    return found
 
 
 def decided(rule: Criterion, features: np.ndarray) -> np.ndarray:
@@ -52,3 +60,33 @@ def test_taylorseer_computes_the_same_steps_and_forecasts_the_same(golden: Array
         newest, older = forecast(k, before)
         mine = newest * features[before[-1]] + older * features[before[-2] if len(before) > 1 else 0]
         np.testing.assert_allclose(mine, given, atol=bound(8) * np.abs(features).max() * (newest - older), rtol=0)
+
+
+def test_bac_computes_the_cells_that_its_authors_code_does(golden: Arrays) -> None:
+    features, theirs = golden["bac.features"], golden["bac.computed"]
+    similarity, change = statistics([rows[None] for rows in torch.from_numpy(features)])
+    np.testing.assert_allclose(similarity, golden["bac.similarity"], atol=3 * bound(features.shape[2]), rtol=0)
+    schedules = [best_schedules(one, max(golden["bac.updates"])) for one in similarity]
+    followed = bubbling(change, ["self_attention", "feed_forward"] * (len(features) // 2))
+    assert sorted(followed) == np.flatnonzero(golden["bac.bubbling"]).tolist()
+    for count, scheduled, computed in zip(golden["bac.updates"], golden["bac.scheduled"], theirs, strict=True):
+        own = [one[count - 1].computed for one in schedules]
+        np.testing.assert_array_equal(own, scheduled)
+        assert computed.sum() > scheduled.sum() == count * len(features)
+        np.testing.assert_array_equal(union(own, followed).T, computed)
+
+
+def test_l2c_computes_the_cells_that_its_authors_code_does(golden: Arrays, make_task: MakeTask) -> None:
+    """Theirs has a threshold; with as many cells, ours are the same."""
+    theirs, search = golden["l2c.computed"], Gates(make_task(34), Source.TIMESTEP, whole=2)
+    search.restore({**search.state(), "scores": golden["l2c.scores"].astype(np.float64)})
+    assert 30 < theirs.sum() < 60
+    np.testing.assert_array_equal(search._cells(int(theirs.sum())) == Source.COMPUTE, theirs)
+
+
+def test_deepcache_computes_the_parts_that_its_authors_code_does(golden: Arrays) -> None:
+    """A branch of a U-Net is an edge of the chain that its parts are."""
+    for branch, theirs in enumerate(golden["deepcache.computed"]):
+        steps, parts = theirs.shape
+        plan = edge_plan(steps, parts, steps // int(golden["deepcache.interval"]), branch + 1)
+        np.testing.assert_array_equal(plan == Source.COMPUTE, theirs)
