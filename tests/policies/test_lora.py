@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -17,13 +18,12 @@ from ttscompile.artifact.load import load_artifact
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.hub import fetch_checkpoint
-from ttscompile.policies.lerobot.multi_task_dit import Network
-from ttscompile.policies.networks.clip import TextConfig
 
 from ..hub.conftest import hub as hub
 from ..hub.served import Hub
+from ..rounding import bound
 from . import lerobot_unets, vla_jepas
-from .lerobot_tiny import TEXT, change_json, dit_config, save_policy, write_json
+from .lerobot_tiny import change_json, save_policy, write_json
 from .refused import assert_not_read
 
 Tensors = dict[str, torch.Tensor]
@@ -338,35 +338,26 @@ def test_nothing_but_safetensors_is_read(base: Path) -> None:
     assert_not_read(adapter, r"adapter_model\.safetensors: no such file")
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of PEFT's own
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {},
-        {"use_rslora": True, "rank_pattern": {"qkv_proj": 2}, "alpha_pattern": {r"blocks\.0\.mlp\.0": 32, "mlp.0": 5}},
-        {"use_dora": True, "bias": "lora_only", "modules_to_save": ["output_proj"]},
-    ],
-)
-def test_peft_merges_the_same(base: Path, settings: dict[str, Any]) -> None:
-    """Its own adapter, saved by itself, against what its ``merge_and_unload`` makes of it, up to rounding."""
-    peft = pytest.importorskip("peft", reason="PEFT is not installed: run this where it is, before a release")
-    own: Any = Network(dit_config(base), None, TextConfig(**TEXT)).requires_grad_(False)
-    saved = load_file(base / "model.safetensors")
-    own.load_state_dict({name.replace(".text_model.", "."): value for name, value in saved.items()})
-    targets = {"target_modules": ["qkv_proj", "mlp.0"], "init_lora_weights": False}
-    model = peft.get_peft_model(own, peft.LoraConfig(r=4, lora_alpha=6, **targets, **settings))
-    with torch.no_grad():
-        for name, value in model.named_parameters():
-            if value.requires_grad:
-                value.add_(drawn(*value.shape, seed=len(name)).abs() * 0.1)
-    model.save_pretrained(base.parent / "saved")
-    adapter = save_adapter(base, {})
-    for name in ("adapter_config.json", "adapter_model.safetensors"):
-        shutil.copy(base.parent / "saved" / name, adapter / name)
-    expected = by_hand(base, lambda weights: None)
-    save_file(model.merge_and_unload().state_dict(), expected / "model.safetensors")
-    found, merged, before = network(adapter, base=base), network(expected), network(base)
-    assert sum(not torch.equal(found[name], before[name]) for name in found) >= 4
-    for name in found:
-        torch.testing.assert_close(found[name], merged[name], rtol=1e-6, atol=1e-6)
+@pytest.mark.parametrize("case", ["plain", "scaled", "lengths", "biases", "convolutions"])
+def test_peft_merges_the_same(tmp_path: Path, case: str) -> None:
+    """Adapters that PEFT saved, against what its ``merge_and_unload`` made of them (``golden/make_peft.py``)."""
+    with np.load(Path(__file__).with_name("golden") / "peft.npz") as arrays:
+        held = {name.removeprefix(f"{case}/"): arrays[name] for name in arrays if name.startswith(f"{case}/")}
+
+    def part(name: str) -> Tensors:
+        start = f"{name}/"
+        return {key.removeprefix(start): torch.from_numpy(held[key]) for key in held if key.startswith(start)}
+
+    base = lerobot_unets.save("states", tmp_path / "policy") if case == "convolutions" else save_policy(tmp_path)
+    weights = load_file(base / "model.safetensors")
+    save_file(weights | part("base"), base / "model.safetensors")
+    adapter = save_adapter(base, part("saved"))
+    (adapter / "adapter_config.json").write_text(str(held["config"]), encoding="utf-8")
+    merged = part("merged")
+    expected = network(by_hand(base, lambda own: own.update(merged)))
+    found, before = network(adapter, base=base), network(base)
+    assert len(merged) == {"lengths": 10, "biases": 30, "convolutions": 2}.get(case, 4)
+    assert found.keys() == expected.keys()
+    for name, value in found.items():
+        torch.testing.assert_close(value, expected[name], rtol=0, atol=bound(32) * float(value.abs().max()))
+    assert sum(not torch.equal(expected[name], before[name]) for name in found) == len(merged)
