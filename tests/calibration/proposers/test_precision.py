@@ -82,6 +82,24 @@ def test_what_is_learned_is_written_for_all_plans(tmp_path: Path) -> None:
     assert {name: dict(plan.precision) for name, plan in plans.items()} == {"dense": {}, "full": {"blocks": "int8"}}
 
 
+@pytest.mark.slow
+def test_four_bits_are_judged_as_eight_are(trials: Trials, tmp_path: Path) -> None:
+    """The same network in four bits is further off, stays where a margin allows it, and is what a plan then names."""
+    ttscompile.compile_denoiser(*seeing.policy(), tmp_path / "int4", precision="int4")
+    calls = recorded(tmp_path / "calls.npz")
+    four, both = trials_of(tmp_path / "int4", calls), ["condition", "blocks"]
+    eight_off = proposed(Precision(request()), trials, trials.base)[0].notes["alone"]
+    (found,) = proposed(proposer := Precision(request()), four, four.base)
+    assert dict(found.plan.precision) == dict.fromkeys(both, "int4") and proposer.told == "int4 in condition and blocks"
+    assert all(found.notes["alone"][part] > 2 * eight_off[part] for part in both)
+    assert 0.02 < further(judge(four, found.plan, LEARNED), judge(four, four.base.exact, LEARNED))[1] < Precision.margin
+    (found,) = proposed(proposer := Precision(request(margin=0.02)), four, four.base)
+    assert not found.plan.precision
+    assert proposer.told == "all parts stay fp32: int4 changes the actions more than 0.02 allows"
+    calibrate(tmp_path / "int4", calls, learn=("precision",), progress=False)
+    assert ttscompile.load(tmp_path / "int4").info.precision == "int4"
+
+
 def test_the_worst_part_is_left_out_first(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     both, far, near = ("condition", "blocks"), 3 * Precision.margin, 0.9 * Precision.margin
     limits = {(): 0.0, both: far, ("condition",): near, ("blocks",): 2 * near}
