@@ -31,7 +31,7 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
     if own is not None:
         return [*found, *own(path, spec, encoders)]
     affine = {key: one.normalizer for key, one in spec.observations.items()} | {ACTION: spec.chunk.normalizer}
-    both = np.array([[-1], [1]], np.float32)
+    both = np.array([[[-1]], [[1]]], np.float32)
     ends = {key: torch.from_numpy(one.unnormalize(both)) for key, one in affine.items() if one is not None}
     return found + [judged(key, low, high) for key, (low, high) in ends.items()]
 
@@ -39,13 +39,9 @@ def examine(path: Path, spec: PolicySpec, encoders: str | os.PathLike[str] | Non
 def judged(
     key: str, first: torch.Tensor, second: torch.Tensor, deviations: bool = False, unseen: bool = False
 ) -> Finding:
-    """Look at the normaliser of one feature.
+    """Look at the normaliser of one feature: the ends of its numbers' ranges, or their means and standard deviations.
 
-    Args:
-        first: the lower ends of its numbers' ranges, or their means.
-        second: the upper ends, or the standard deviations.
-        deviations: whether they are means and deviations.
-        unseen: whether a number without a range is not shown to the policy.
+    A number without a range may be ``unseen``: not shown to the policy.
     """
     # Of a chunk's steps the last, whose actions are the furthest from the state that they are relative to.
     first, second = (each[-1] if each.ndim == 2 else each.flatten() for each in (first, second))
