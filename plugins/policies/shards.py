@@ -8,7 +8,7 @@ import torch
 from safetensors import safe_open
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.saved_weights import names_of, require_memory_for, saved_size
+from ttscompile.frontends.saved_weights import left_out, names_of, require_memory_for, saved_size
 from ttscompile.frontends.settings import read_json
 
 WHOLE, INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -16,12 +16,12 @@ WHOLE, INDEX = "model.safetensors", "model.safetensors.index.json"
 Taken = TypeVar("Taken")
 
 
-def read_part(directory: Path, prefix: str) -> dict[str, torch.Tensor]:
-    """The tensors whose names begin so, without that beginning; the others are not read.
+def read_part(directory: Path, prefix: str, *without: str) -> dict[str, torch.Tensor]:
+    """The tensors whose names begin so, without that beginning; the others are not read, nor those ``left_out``.
 
     Where no name begins so, all of them: the part was saved alone.
     """
-    files = _files(directory)
+    files = {name: file for name, file in _files(directory).items() if not left_out(name, without)}
     part = {name: file for name, file in files.items() if name.startswith(prefix)} or files
     by_file = {file: [name for name, each in part.items() if each == file] for file in sorted(set(part.values()))}
     sizes = [_take(file, saved_size, by_file[file]) for file in by_file]

@@ -201,9 +201,9 @@ GROUPS: Refusals = {
         ({"state_key": "gripper"}, "actions 'reach' have 3 numbers, and the state 'gripper' 1"),
     ],
     "groot eef": [
-        ({"format": "XYZ_ROTVEC"}, r"'eef_9d' are relative, as EEF of the format XYZ_ROTVEC, which lerobot does not"),
+        ({"format": "XYZ_ROTVEC"}, r"'eef_9d' are relative, as EEF of the format XYZ_ROTVEC, which is not decoded"),
         ({"format": "DEFAULT"}, "expected NON_EEF, or EEF of the format XYZ_ROT6D"),
-        ({"type": "HAND"}, "as HAND of the format XYZ_ROT6D, which lerobot does not decode"),
+        ({"type": "HAND"}, "as HAND of the format XYZ_ROT6D, which is not decoded"),
         ({"state_key": "joint_position"}, "'eef_9d' have 9 numbers, and the state 'joint_position' 2; expected 9 each"),
     ],
 }

@@ -5,11 +5,11 @@ lerobot needs, too. Source: ``GrootPolicy.predict_action_chunk`` of huggingface/
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -38,7 +38,9 @@ _EMPTY = "Perform the task."
 _DEFAULTS = {"backbone_embedding_dim": 2048, "input_embedding_dim": 1536, "hidden_size": 1024}
 _DEFAULTS |= dict.fromkeys(("max_state_dim", "max_action_dim"), 132)
 """What lerobot takes for a width that a base model leaves out."""
-_INNER = "_groot_model.backbone.model."
+OWN, UNREAD = "_groot_model.", ".language_model.norm.weight"
+"""Begins the names of the weights; and the end of one that nothing reads."""
+_INNER = f"{OWN}backbone.model."
 _RENAMED = (
     (r"^_groot_model\.", ""),
     (r"\.layer([12])\.([Wb])$", r".fc\1.\2"),
@@ -49,6 +51,25 @@ _RENAMED = (
     (r"(\.vl_self_attention\.layers\.\d+)\.attn1\.", r"\1.self_attn."),
     (r"(\.vl_self_attention\.layers\.\d+)\.ff\.", r"\1.mlp."),
 )
+
+
+class Spoken(NamedTuple):
+    """What is said to the language model.
+
+    Attributes:
+        name: of the backbone.
+        images: that are given.
+        shown: places of images in the prompt.
+        plain: see ``Instruction``.
+        otherwise: likewise.
+    """
+
+    name: str
+    backbone: qwen.Backbone
+    images: int
+    shown: int
+    plain: bool
+    otherwise: str
 
 
 def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> tuple[nn.Module, PolicySpec]:
@@ -63,15 +84,12 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     name = base.text("model_name", _BACKBONE, MOST_LETTERS)
     backbone = qwen.find_backbone(name, folders)
     _require_whole(backbone, processors.geometry.target)
-    config = read_config(base, backbone.model, processors)
-    shared = _narrowed(shared, processors, config)
-    prompt, told = _prompt(processors, name, backbone, config.language.vocabulary)
-    sizes, task = {"actions": config.actions, "tokens": _LENGTH, "vocabulary": config.language.vocabulary}, None
-    if options.task is not None:
-        tokens = task_tokens(told.line(options.task), name, backbone.folder, None, sizes["vocabulary"], "")
-        task = torch.tensor([tokens[told.skipped :]])
-    weights = _weights(shared, options, config, processors.embodiment)
-    network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
+    seen = [(processors.geometry.target,) * 2] * len(processors.cameras)
+    config = read_config(base, backbone.model, seen, processors.padded)
+    shared, cameras = _narrowed(shared, processors, config), len(processors.cameras)
+    spoken = Spoken(name, backbone, cameras, cameras * processors.frames, processors.plain, _EMPTY)
+    saved = partial(read_weights, shared, options, UNREAD)
+    network, told, sizes, task = rebuilt(config, spoken, saved, processors.embodiment, options.task, directory)
     encoder = vla.Gathered(shared, processors, Prefix(network, Seen(processors.geometry)), config.state, task)
     edge, given = processors.geometry.edge, {name: each for name, each in entries.items() if each is not None}
     own = Settings({**base.values, **given}, settings.where)
@@ -120,14 +138,43 @@ def _require_whole(backbone: qwen.Backbone, side: int) -> None:
         )
 
 
-def read_config(base: Settings, model: Settings, processors: GrootProcessors) -> GrootConfig:
-    """Sizes and variant, of the entries of the base model and of its backbone."""
-    dit, side = vla.part_of(base, "diffusion_model_cfg"), processors.geometry.target
-    language = qwen.read_language(model, base.number("select_layer", 16), [(side, side)] * len(processors.cameras))
+def rebuilt(
+    config: GrootConfig,
+    spoken: Spoken,
+    saved: Callable[[], Mapping[str, Tensor]],
+    kind: int,
+    task: str | None,
+    directory: Path,
+) -> tuple[Groot, Instruction, dict[str, int], Tensor | None]:
+    """The network, how a task is told, the sizes that ``vla_spec`` takes, and the tokens of a task that is compiled in.
+
+    Args:
+        saved: gives the weights under lerobot's names.
+        kind: number of the embodiment.
+    """
+    prompt, told = _prompt(spoken, config.language.vocabulary)
+    sizes, tokens = {"actions": config.actions, "tokens": _LENGTH, "vocabulary": config.language.vocabulary}, None
+    if task is not None:
+        made = task_tokens(told.line(task), spoken.name, spoken.backbone.folder, None, sizes["vocabulary"], "")
+        tokens = torch.tensor([made[told.skipped :]])
+    weights = _weights(saved(), config, kind, directory)
+    network = filled(lambda: Groot(config, prompt), weights, "config.json, or the base model's,", directory)
+    return network, told, sizes, tokens
+
+
+def read_config(base: Settings, model: Settings, seen: list[tuple[int, int]], padded: tuple[int, int]) -> GrootConfig:
+    """Sizes and variant, of the entries of the base model and of its backbone.
+
+    Args:
+        seen: height and width of every image that the backbone sees.
+        padded: numbers of a state and of an action.
+    """
+    dit = vla.part_of(base, "diffusion_model_cfg")
+    language = qwen.read_language(model, base.number("select_layer", 16), seen)
     layers, width = _tower(dit), language.text.width
     mixing = vla.part_of(base, "vl_self_attention_cfg") if base.values.get("vl_self_attention_cfg") else None
     mixed = _tower(mixing) if mixing is not None and mixing.values.get("num_layers", 0) else None
-    (state, actions), out = processors.padded, dit.number("output_dim", 26, MOST)
+    (state, actions), out = padded, dit.number("output_dim", 26, MOST)
     base.require(backbone_embedding_dim=width, input_embedding_dim=layers.hidden_size, hidden_size=out)
     base.require(state_history_length=1, max_state_dim=state, max_action_dim=actions)
     if mixed is not None and mixed.hidden_size != width:
@@ -183,28 +230,25 @@ def _narrowed(shared: LeRobotConfig, processors: GrootProcessors, config: GrootC
     return replace(shared, features=features, horizon=config.horizon, n_action_steps=executed)
 
 
-def _prompt(
-    processors: GrootProcessors, name: str, backbone: qwen.Backbone, vocabulary: int
-) -> tuple[Prompt, Instruction]:
+def _prompt(spoken: Spoken, vocabulary: int) -> tuple[Prompt, Instruction]:
     """What is before each image, and how a task is told."""
-    shown = len(processors.cameras) * processors.frames
+    name, backbone, images, shown, plain, otherwise = spoken
     around = (qwen.IMAGE * shown, qwen.END)
-    told = Instruction(TOKENS, MASK, True, (qwen.TURN,), around=around, plain=processors.plain, otherwise=_EMPTY)
+    told = Instruction(TOKENS, MASK, True, (qwen.TURN,), around=around, plain=plain, otherwise=otherwise)
     between, told = told_after(told, name, backbone.folder, vocabulary, backbone.image, shown)
-    return Prompt(between, len(processors.cameras)), told
+    return Prompt(between, images), told
 
 
-def _weights(shared: LeRobotConfig, options: LoadOptions, config: GrootConfig, kind: int) -> Mapping[str, Tensor]:
+def _weights(saved: Mapping[str, Tensor], config: GrootConfig, kind: int, directory: Path) -> Mapping[str, Tensor]:
     """The weights under the names of ``Groot``; of those that each embodiment has, those of its own."""
     found = dict[str, Tensor]()
-    saved = read_weights(shared, options, ".language_model.norm.weight")
     others, backbone = qwen.of_backbone(saved, _INNER, partial(rebuilt_weights, config=config.language))
     for own, value in others.items():
         name = renamed(own, _RENAMED)
         if name.endswith((".W", ".b")):
             end, axes = (".weight", 3) if name.endswith(".W") else (".bias", 2)
             if value.ndim != axes or len(value) <= kind:
-                raise CheckpointError(f"{shared.directory}: weight {own} has no part {kind}, of the embodiment.")
+                raise CheckpointError(f"{directory}: weight {own} has no part {kind}, of the embodiment.")
             name, value = name[:-2] + end, value[kind].T.contiguous() if axes == 3 else value[kind].clone()
         found[name] = value
     return found | backbone

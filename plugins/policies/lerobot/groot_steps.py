@@ -25,7 +25,7 @@ from .config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 (_PACK, _UNPACK, _DECODE), _ENCODE = lerobot.GROOT, "groot_n1_7_vlm_encode_v1"
 _OLD = ("groot_pack_inputs_v3", "groot_eagle_encode_v3", "groot_eagle_collate_v3", "groot_action_unpack_unnormalize_v1")
 OLD = "of GR00T N1.5, which lerobot itself reads no longer than 0.5.1. Train a policy of GR00T N1.7"
-_MOST_FRAMES, _EPSILON = 64, 1e-8
+_MOST_FRAMES, _EPSILON, _MEAN = 64, 1e-8, "mean"
 _CAMERAS, _CAMERA, _CAMERA_ALONE = "observation.images", "observation.images.", "observation.image"
 _POSES = ("xyz_rot6d", "xyz+rot6d")
 """Both names of the one format of poses that lerobot decodes."""
@@ -180,7 +180,7 @@ def _geometry(encoding: Settings) -> Geometry:
     return Geometry(edge, max(1, round(edge * share)) if 0 < share < 1 else edge, target[0])
 
 
-class _Actions(NamedTuple):
+class Actions(NamedTuple):
     """How actions are unnormalised, and the rest as in ``GrootProcessors``."""
 
     statistics: lerobot.Statistics | None
@@ -191,7 +191,7 @@ class _Actions(NamedTuple):
     poses: tuple[Pose, ...] = ()
 
 
-def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Features) -> _Actions:
+def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Features) -> Actions:
     settings, count = _settings(directory, step), features[ACTION][1][0]
     if settings.values.get("env_action_dim", 0) not in (0, count):
         raise settings.refusal("env_action_dim", f"{count}, as many as an action has, or 0")
@@ -202,32 +202,49 @@ def _actions(directory: Path, step: Mapping[str, Any], features: lerobot.Feature
             raise settings.error(f"it has no {ACTION}.min and {ACTION}.max; found {list(tensors)[:6]}")
         gripper = count - 1 if count >= _LIBERO_NUMBERS else None
         bounded = settings.flag("clip_normalized_action", False)
-        return _Actions(statistics, statistics is not None and bounded, gripper)
+        return Actions(statistics, statistics is not None and bounded, gripper)
     ends = ("q01", "q99") if settings.flag("use_percentiles", False) else ("min", "max")
+    return grouped_actions(directory, settings, ends, count)
+
+
+def grouped_actions(directory: Path, settings: Settings, ends: tuple[str, str], count: int | None = None) -> Actions:
+    """How actions in groups are unnormalised.
+
+    Args:
+        ends: names of the two statistics of each group; ``mean`` and ``std``, or where its range ends.
+        count: numbers of an action; None for those of all groups.
+    """
     try:
         own = settings.values["modality_config"]["action"]
         names, steps = own["modality_keys"], len(own.get("delta_indices") or ()) or None
-        kinds = own["action_configs"] if settings.flag("use_relative_action", False) else [{}] * len(names)
+        kinds = (settings.flag("use_relative_action", False) and own["action_configs"]) or [{}] * len(names)
         found = zip(*(_group(settings, *each, ends) for each in zip(names, kinds, strict=True)), strict=True)
         *both, columns, of_poses = found
         rows = max((each.shape[:-1] for each in (*both[0], *both[1])), default=())
         tensors = {
             f"{ACTION}.{name}": torch.cat([each.expand(*rows, -1) for each in groups], -1)
-            for name, groups in zip(("min", "max"), both, strict=True)
+            for name, groups in zip(_ends(ends), both, strict=True)
         }
-    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        expected = f"groups of an action in modality_config, and numbers {' and '.join(ends)} of each in raw_stats"
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        both_ends = " and ".join(ends)
+        expected = f"groups of an action in modality_config, and numbers {both_ends} of each in the statistics"
         raise settings.error(f"{error!r:.80}; expected {expected}") from error
     steps = min(steps or rows[0], *rows) if rows else steps
     sizes = [len(each) for each in columns]
     single = "gripper" in names and sizes[at := names.index("gripper")] == 1
     gripper = sum(sizes[:at]) if single else None
-    shaped, entries, poses = {ACTION: ("ACTION", (*rows, count))}, list[int | None](), list[Pose]()
+    shaped = {ACTION: ("ACTION", (*rows, sum(sizes) if count is None else count))}
+    entries, poses = list[int | None](), list[Pose]()
     for own, pose in zip(columns, of_poses, strict=True):
         poses += [Pose(len(entries), own[0])] if pose else []
         entries += [None] * len(own) if pose else own
-    statistics = _statistics(directory, tensors, ACTION, shaped)
-    return _Actions(statistics, True, gripper, steps, tuple(entries), tuple(poses))
+    statistics = _statistics(directory, tensors, ACTION, shaped, ends=_ends(ends))
+    return Actions(statistics, ends[0] != _MEAN, gripper, steps, tuple(entries), tuple(poses))
+
+
+def _ends(ends: tuple[str, str]) -> tuple[str, str]:
+    """The same, of ranges that are not those of percentiles."""
+    return ends if ends[0] == _MEAN else ("min", "max")
 
 
 def _group(
@@ -240,10 +257,10 @@ def _group(
         pose = str(kind.get("type")).lower() == "eef"
         if str(kind.get("type")).lower() != "non_eef" and not (pose and str(kind.get("format")).lower() in _POSES):
             raise settings.error(
-                f"actions {name!r} are relative, as {told}, which lerobot does not decode; expected NON_EEF, or EEF of"
-                " the format XYZ_ROT6D"
+                f"actions {name!r} are relative, as {told}, which is not decoded; expected NON_EEF, or EEF of the"
+                " format XYZ_ROT6D"
             )
-        part, ends = "relative_action", ("min", "max")
+        part, ends = "relative_action", _ends(ends)
     low, high = (torch.tensor(raw[part][name][end], dtype=torch.float32) for end in ends)
     if not relative:
         return low, high, (None,) * low.shape[-1], False
@@ -257,12 +274,20 @@ def _group(
 
 
 def _statistics(
-    directory: Path, tensors: Mapping[str, Tensor], key: str, features: lerobot.Features, clipped: bool = False
+    directory: Path,
+    tensors: Mapping[str, Tensor],
+    key: str,
+    features: lerobot.Features,
+    clipped: bool = False,
+    ends: tuple[str, str] = ("min", "max"),
 ) -> lerobot.Statistics | None:
-    """The range of a feature; None where nothing is known of it."""
-    names = [f"{key}.{name}" for name in ("min", "max")]
+    """The range of a feature, or its mean and deviation; None where nothing is known of it."""
+    names = [f"{key}.{name}" for name in ends]
     if not all(name in tensors for name in names):
         return None
     kind, shape = features[key]
     low, high = (lerobot.as_statistic(directory, name, tensors[name], kind, shape) for name in names)
-    return lerobot.Statistics("MIN_MAX", low, high, _EPSILON, still=True, clipped=clipped)
+    if ends[0] != _MEAN:
+        return lerobot.Statistics("MIN_MAX", low, high, _EPSILON, still=True, clipped=clipped)
+    still = high == 0  # what never moved stays as it is
+    return lerobot.Statistics("MEAN_STD", low.masked_fill(still, 0), high.masked_fill(still, 1), 0.0)

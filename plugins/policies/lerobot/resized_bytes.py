@@ -1,4 +1,4 @@
-"""Resizing images of bytes with a cubic filter as Pillow and torchvision do, bit for bit, as matrix products.
+"""Resizing images of bytes with a cubic or linear filter as Pillow and torchvision do, bit for bit, as matrix products.
 
 Both multiply by whole numbers, and round after the rows and again after the columns. Sources: ``Resample.c`` of Pillow,
 and ``UpSampleKernelAVXAntialias.h`` of PyTorch, which torchvision calls for images of bytes on a processor.
@@ -30,14 +30,15 @@ _NEARLY = 1e-6
 """What is so little below a half is one: no order of the sums in float64 makes as much of a difference."""
 
 
-def resized(before: tuple[int, int], after: tuple[int, int], own: Filter) -> nn.Module:
+def resized(before: tuple[int, int], after: tuple[int, int], own: Filter, mode: str = "bicubic") -> nn.Module:
     """What makes of images ``[..., H, W]`` of whole numbers in 0..255, as float32, others of another height and width.
 
     Args:
         before: height and width.
         after: likewise.
+        mode: ``bicubic``, or ``bilinear`` but on a graphics card.
     """
-    return _OnceRounded(before, after) if own == "card" else _TwiceRounded(before, after, own)
+    return _OnceRounded(before, after) if own == "card" else _TwiceRounded(before, after, own, mode)
 
 
 class _OnceRounded(nn.Module):
@@ -54,9 +55,9 @@ class _TwiceRounded(nn.Module):
     rows: Tensor
     columns: Tensor
 
-    def __init__(self, before: tuple[int, int], after: tuple[int, int], own: Filter) -> None:
+    def __init__(self, before: tuple[int, int], after: tuple[int, int], own: Filter, mode: str) -> None:
         super().__init__()
-        rows, columns = (_weights(old, new, own) for old, new in zip(before, after, strict=True))
+        rows, columns = (_weights(old, new, own, mode) for old, new in zip(before, after, strict=True))
         for name, value in (("rows", rows), ("columns", columns.T)):
             made = torch.tensor(np.ascontiguousarray(value), dtype=torch.float32, device="cpu")
             self.register_buffer(name, made, persistent=False)
@@ -104,9 +105,9 @@ def _rounded(sums: Tensor) -> Tensor:
     return (sums + 0.5).floor().clamp(0, 255)
 
 
-def _weights(before: int, after: int, own: Filter) -> npt.NDArray[np.float64]:
+def _weights(before: int, after: int, own: Filter, mode: str) -> npt.NDArray[np.float64]:
     """``[after, before]``: the share that each old entry has in each new one, in steps of a power of two."""
-    found = resize_matrix(before, after, True, "bicubic", torch.float64).numpy()
+    found = resize_matrix(before, after, True, mode, torch.float64).numpy()
     bits = _MOST_BITS
     if own == "torchvision":
         bits = next(

@@ -202,6 +202,8 @@ class Gathered(nn.Module):
         state: numbers of the state, padded or cut; None where the instruction holds it, or nothing reads it.
         task: tokens int64 ``[1, L]`` of the one instruction that is compiled in; None where it is an input.
         committed: whether the network also reads how many actions are committed, and that first.
+        normalizer: of the state, which pads it, too; None for the statistics that the processors have.
+        frames: of each camera that are images, the oldest of all cameras first.
     """
 
     task: Tensor | None
@@ -214,18 +216,22 @@ class Gathered(nn.Module):
         state: int | None,
         task: Tensor | None,
         committed: bool = False,
+        normalizer: nn.Module | None = None,
+        frames: int = 1,
     ) -> None:
         super().__init__()
         names = {key: processors.renamed.get(key, key).replace(".", "_") for key in config.features}
         self.images, self.state = [names[key] for key in config.cameras], names.get(STATE, "")
-        self.normalizer = Normalizer(processors.normalizers.get(STATE))
-        self.prefix, self.missing = prefix, None if state is None else state - config.state_dim
-        self.committed = committed
+        self.normalizer = normalizer or Normalizer(processors.normalizers.get(STATE))
+        known = state if state is None or normalizer is not None else config.state_dim
+        self.prefix, self.missing = prefix, None if state is None or known is None else state - known
+        self.committed, self.frames = committed, frames
         self.register_buffer("task", task, persistent=False)
 
     def forward(self, observations: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
         """Observations ``[B, 1, ...]`` by argument, the instruction without a frame."""
-        images = [observations[name][:, -1] * 2 - 1 for name in self.images]
+        newest = range(-self.frames, 0)
+        images = [observations[name][:, frame] * 2 - 1 for frame in newest for name in self.images]
         state = None
         if self.missing is not None:
             state = self.normalizer(observations[self.state])[:, -1].to(images[0].dtype)  # statistics may be float64
