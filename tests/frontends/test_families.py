@@ -41,7 +41,7 @@ def test_options_are_the_arguments_of_convert_and_of_the_command_line() -> None:
 
 @pytest.mark.parametrize("option", sorted(OPTIONS))
 def test_an_option_of_other_families_is_refused_before_anything_is_loaded(option: str, tmp_path: Path) -> None:
-    own = Family("own", "our own", "a file", lambda path: True, "file", "there_is_no_such_module", frozenset())
+    own = Family("own", "our own", "a file", lambda path: True, "there_is_no_such_module", frozenset())
     given: dict[str, Any] = {option: 7 if option in ("steps", "prediction_horizon") else "x"}
     with pytest.raises(CheckpointError, match=rf"the option {option} is for policies of .*; this is one of our own"):
         own.load(tmp_path / "policy", LoadOptions(**given))
@@ -59,7 +59,9 @@ def test_the_narrower_family_is_asked_first(tmp_path: Path) -> None:
     assert find_family(tmp_path, "auto").name == find_family(tmp_path, "lerobot").name == "lerobot"
     with pytest.raises(CheckpointError, match="is a directory without a policy that is read"):
         find_family(tmp_path, "diffusion_policy")
-    with pytest.raises(CheckpointError, match="no such directory; expected a directory that lerobot's save_pretrained"):
+    with pytest.raises(
+        CheckpointError, match="no such file or directory; expected a directory that lerobot's save_pretrained"
+    ):
         find_family(tmp_path / "nowhere", "lerobot")
     with pytest.raises(CheckpointError, match=r"config\.json: not of the format lerobot; expected a directory that"):
         find_family(tmp_path / "config.json", "lerobot")

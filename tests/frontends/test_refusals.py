@@ -49,7 +49,11 @@ PAYLOADS: list[tuple[dict[str, Any], str, str]] = [
         "a VLA-JEPA or another of starVLA",
         rf"No tool makes LeRobot's vla_jepa of it: .*{OWN_MODULE}",
     ),
-    ({"gating_network._layers.0.weight": W, "joint_cmps._gpt.a": W}, "a policy of VDD", "There is no denoising loop"),
+    (
+        {"backbone.tok_emb.weight": W, "gmm_mean_net.layers.0.weight": W, "gating_network.network.layers.0.weight": W},
+        "a policy of VDD",
+        "a DirectDenoiser of the mean of the expert with the highest gate",
+    ),
     (
         {"itr": 9, "model": {"actor_ft.mlp_mean.layers.0.l1.weight": W, "actor.a": W}},
         "a policy of DPPO",
@@ -105,6 +109,8 @@ def test_torch_files(tmp_path: Path, payload: dict[str, Any], what: str, remedy:
 
 NAMES = [
     ("DiffusionUnetVideoPolicy", "a diffusion policy with another observation encoder.*inside the module"),
+    ("OneDPUnetLowdimPolicy", f"a policy of OneDP, distilled to one evaluation.*{OWN_MODULE}.*no torch on the robot"),
+    ("MyOneDPImagePolicy", "a policy of OneDP"),
     ("BETLowdimPolicy", "a policy without diffusion.*no denoising loop"),
     ("RobomimicImagePolicy", "a policy without diffusion"),
     ("MyDiffusionUnetImagePolicy", r".*one of these renamed\. .* the name of that class at the end of cfg\.policy\._t"),
@@ -137,7 +143,6 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["checkpoints/latest.ckpt", ".hydra/config.yaml"], "a directory of checkpoints.*latest.ckpt"),
     (["config.json", "model.safetensors"], r"a directory of weights .told by model\.safetensors"),
     (["config.json", "checkpoints/step-1.pt"], r"a directory of checkpoints .told by checkpoints/step-1\.pt"),
-    (["config.json=model_type=Gr00tN1d7", "model-00001.safetensors"], r"N1\.7 as NVIDIA saves it.*save_pretrained"),
     (["config.json=model_type=gr00t_n1_5", "model.safetensors"], r"a GR00T model .told by config\.json: model_type"),
     (["config.json=act_adaptor=mlp3x_silu", "pytorch_model.bin"], rf"an RDT2 or H-RDT .*{OWN_MODULE}"),
     (["config.json=policy_head_type=unet_diffusion_policy", "model.safetensors"], "DexVLA.*whose head is a U-Net"),

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from ..core.coercion import integer
 from ..core.spec import WITHOUT, PolicySpec
@@ -86,7 +86,6 @@ class Family:
     title: str
     reads: str
     detect: Callable[[Path], bool]
-    kind: Literal["file", "directory"] = "file"
     module: str = ""
     options: frozenset[str] = DIFFUSION_OPTIONS
 
@@ -129,16 +128,21 @@ FAMILIES = (
         name="lerobot",
         title="LeRobot",
         reads="a directory that lerobot's save_pretrained wrote, with config.json and model.safetensors",
-        kind="directory",
         detect=lambda path: "type" in _config(path),
         module="lerobot.family",
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras", "base"},
     ),
     Family(
+        name="groot",
+        title="GR00T",
+        reads="a directory of GR00T N1.7 as NVIDIA's code saves it, with config.json and processor_config.json",
+        detect=lambda path: _config(path).get("model_type") == "Gr00tN1d7",
+        options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
+    ),
+    Family(
         name="scaledp",
         title="DexVLA",
         reads="a directory that DexVLA's training saved, with config.json and safetensors",
-        kind="directory",
         detect=lambda path: "scale_dp_policy" in map(_config(path).get, ("policy_head_type", "model_type")),
     ),
     Family(
@@ -164,7 +168,6 @@ FAMILIES = (
         name="rdt",
         title="RDT",
         reads="a directory that RDT's save_pretrained wrote, with config.json and its weights",
-        kind="directory",
         detect=lambda path: "lang_adaptor" in _config(path),
         options=DIFFUSION_OPTIONS | {"encoders", "without_cameras"},
     ),
@@ -172,7 +175,6 @@ FAMILIES = (
         name="openpi",
         title="openpi",
         reads="a folder that openpi's training or its converter to PyTorch saved, with model.safetensors and assets",
-        kind="directory",
         detect=lambda path: "paligemma_variant" in _config(path) or any(any(path.glob(sign)) for sign in _OPENPI),
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
@@ -180,7 +182,6 @@ FAMILIES = (
         name="octo",
         title="Octo",
         reads="a folder that Octo's save_pretrained wrote, with config.json and example_batch.msgpack",
-        kind="directory",
         detect=lambda path: (path / "example_batch.msgpack").is_file(),
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
@@ -219,11 +220,7 @@ FORMATS = ("auto", *(each.name for each in FAMILIES))
 
 
 def find_family(path: Path, format: str) -> Family:
-    """The family that reads a checkpoint.
-
-    Raises:
-        CheckpointError: the format is not known, or no family reads what is there; says what it is, if that is known.
-    """
+    """The family that reads a checkpoint. What no family reads is refused by what it is, if that is known."""
     if format not in FORMATS:
         raise CheckpointError(f"format {format!r} is not known; expected one of {', '.join(FORMATS)}.")
     rows = [each for each in FAMILIES if format in ("auto", each.name)]
@@ -232,5 +229,5 @@ def find_family(path: Path, format: str) -> Family:
         return found
     if path.is_dir():
         refuse_directory(path)
-    wrong = f"not of the format {format}" if path.exists() else f"no such {rows[0].kind}"
+    wrong = f"not of the format {format}" if path.exists() else "no such file or directory"
     raise CheckpointError(f"{path}: {wrong}; expected {rows[0].reads}.")

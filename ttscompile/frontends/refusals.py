@@ -23,7 +23,6 @@ _RENAMED = (
     " end of cfg.policy._target_. Otherwise:"
 )
 _HYDRA = "Give the file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
-_GROOT = "Open it in LeRobot, as base_model_path of a policy groot, and convert what its save_pretrained writes."
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
 _EXPERTS = f"{_BUILD}. The module has to compute all experts and weigh them, in place of choosing rows of the data."
 _INNER_MODEL = f"{_BUILD}. The module is an EDMDenoiser of its inner_model."
@@ -36,6 +35,8 @@ _HYBRID_VLA = "Give the .pt file of its folder checkpoints, as its training save
 _MOST_FILES = 10_000  # looked at in a directory; somebody may give the root of a disk
 _ARTIFACT, _LOAD = "an artifact that is compiled already", "Load it with ttscompile.load, or calibrate it."
 _NO_LOOP = "There is no denoising loop to compile. Use torch.compile, or torch.onnx.export and then onnxruntime."
+_ONCE = f"{_BUILD}. One evaluation has nothing to reuse; it gains eight bits, known frames, and no torch on the robot."
+_EXPERT = f"{_ONCE} The module is a DirectDenoiser of the mean of the expert with the highest gate."
 _GGUF = "llama.cpp and vla.cpp run such files. Convert the checkpoint that it was made from, if that denoises actions."
 MERGE = "Merge it into its base model (PeftModel.merge_and_unload), save that policy, and convert the result."
 _BY_NAME = (
@@ -64,6 +65,7 @@ class Refusal:
 
 POLICIES = (
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
+    Refusal(r"onedp", "a policy of OneDP, distilled to one evaluation", _ONCE),
     Refusal(
         r"transformer|unet",
         "a diffusion policy with another observation encoder than those that are read, or one of these renamed",
@@ -80,7 +82,6 @@ DIRECTORIES = (
     Refusal(r"^[^/]+/(metadata\.pt|params/_METADATA)$", "a directory around checkpoints of openpi", _ONE),
     Refusal(r"(^|/)(_(CHECKPOINT_)?METADATA|manifest\.ocdbt)$|\.msgpack$", "a JAX checkpoint (Orbax or msgpack)", _JAX),
     Refusal(r"(^|/)pretrained_model(/config\.json)?$", "a directory around what lerobot saved", _INNER),
-    Refusal(r"^config\.json: model_type=Gr00tN1d7", "a GR00T N1.7 as NVIDIA saves it", _GROOT),
     Refusal(r"^config\.json: model_type=(?i:gr00t)", "a GR00T model", _HEAD),
     Refusal(r"^config\.json: model_type=xvla", "an X-VLA as its authors save it", _PUT),
     Refusal(r"^config\.json: model_type=eo1$", "an EO-1 as its authors save it", _TRAIN.format("eo1")),
@@ -122,7 +123,7 @@ STATES = (
     Refusal(r"^action_model\b", "a checkpoint of CogACT", "Give it a name that ends with .pt, as its training does."),
     Refusal(r"(^|\.)act(ion)?_adaptor\.", "an RDT2 or H-RDT", _HEAD),
     Refusal(r"(^|\.)(state|lang|img)_adaptor\.", "weights of RDT", _RDT),
-    Refusal(r"^(joint_cmps|gating_network)\.", "a policy of VDD, experts of one evaluation each", _NO_LOOP),
+    Refusal(r"^(joint_cmps|gating_network|gmm_mean_net)\.", "a policy of VDD, experts of one evaluation each", _EXPERT),
     Refusal(r"^(actor_ft|network)\.(time_embedding|time_mlp|mlp_mean)\.", "a policy of DPPO", _HYDRA),
     Refusal(r"^nn_model\.", "a network of Diffusion BC without its schedule, or another one", _DIFFUSION_BC),
     Refusal(r"noise_pred_net\.blocks\.", "a first stage of DexVLA's ScaleDP", "Give what its second or third saved."),
