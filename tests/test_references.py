@@ -49,8 +49,20 @@ def test_every_family_that_is_read_has_a_row() -> None:
     assert [kind for kind in TYPES if not any(f"`{kind}`" in work for work in works)] == []
 
 
+def test_the_works_that_the_paper_is_known_to_cite_are_counted() -> None:
+    """Each has one row, which has a test or says why nothing is built; the page says how many there are."""
+    summary, told = ([row[0] for row in ROWS if row[0].endswith(mark)] for mark in "¹²")
+    assert (len(set(summary)), len(set(told))) == (len(summary), len(told)) == (18, 16)
+    assert not any(mark in " ".join(row[1:]) for row in ROWS for mark in "¹²")
+    prose = " ".join(line for line in LINES if not line.startswith("|"))
+    assert "cites 32 works" in prose
+    assert f"the {len(summary)} works that a published summary" in prose
+    assert f"marks {len(told)} more" in prose
+    assert f"That is {len(summary) + len(told)}, so at least two" in prose
+
+
 def test_what_is_missing_is_found() -> None:
-    assert len(ROWS) > 40
+    assert len(ROWS) > 65
     assert named("`--strategy bac`, `examples/a/b.py`", r"--strategy ([\w-]+)") == {"bac"}
     assert not there("tests/test_references.py::test_of_nothing")
     with pytest.raises(AssertionError):

@@ -80,7 +80,7 @@ def verdict(
         found = paired_difference_of_shares(values, baseline, level)
     else:
         found = paired_difference(values, baseline, seed, level)
-    word = EQUIVALENT if found.low > -margin else WORSE if found.high < 0 else TOO_FEW
+    word = word_of(found.low, found.high, margin)
     made = Verdict(word, found, margin, len(values), comparisons, None)
     if word == EQUIVALENT and not shares and len(values) < FEWEST:
         return replace(made, word=TOO_FEW, enough=FEWEST)
@@ -88,6 +88,11 @@ def verdict(
         return made
     enough = _enough(found, margin, len(values), level)
     return replace(made, enough=enough if shares else max(enough, FEWEST))
+
+
+def word_of(low: float, high: float, margin: float) -> str:
+    """What an interval of a difference says, where it is wide enough for so many episodes."""
+    return EQUIVALENT if low > -margin else WORSE if high < 0 else TOO_FEW
 
 
 def _enough(found: Estimate, margin: float, episodes: int, level: float) -> int:

@@ -4,13 +4,16 @@
 
 What the score of an episode is, 0 to 1, its environment says. Differences are taken episode by episode, against the
 first variant. A second table says of each other variant whether it is as good as the first: equivalent within the
-margins, worse, or not told by so few episodes, and how many would do in four of five cases.
+margins, worse, or not told by so few episodes, and how many would do in four of five cases. Whoever looks at 100
+episodes, and then at 400, has looked twice: ``--looks 2`` has both share the error.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -43,6 +46,7 @@ from variants import (
     threads_option,
 )
 
+from ttscompile.artifact.load import read_manifest
 from ttscompile.artifact.manifest import abbreviated
 from ttscompile.cli.options import ray_option
 from ttscompile.measure.machine import fingerprint, one_line
@@ -258,6 +262,22 @@ def print_tables(
         console.print(verdict_table(evaluations, verdicts))
 
 
+def distance_of(text: str) -> float | None:
+    """How far a variant's plan is from the original, as its calibration judged it; None where none did."""
+    directory, plan, *_ = *text.split(":"), ""
+    manifest = read_manifest(Path(directory))
+    judged = (manifest.calibration or {}).get("plans", {}).get(plan or manifest.default_plan, {})
+    distance: float | None = judged.get("distance")
+    return distance
+
+
+looks_option = click.option(
+    "--looks",
+    default=1,
+    show_default=True,
+    type=click.IntRange(1),
+    help="How often it is looked at in more and more episodes, this time included. The looks share the error.",
+)
 margins_option = click.option(
     "--margins",
     nargs=2,
@@ -281,6 +301,7 @@ margins_option = click.option(
 @click.option("--no-cache", is_flag=True, help="Run all episodes, and keep none.")
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1), help="Processes that run episodes.")
 @ray_option
+@looks_option
 @margins_option
 @click.option(
     "--plot",
@@ -289,7 +310,7 @@ margins_option = click.option(
     help="Draw score against the latency of a call, which is measured after the episodes.",
 )
 @json_option
-def main(  # noqa: C901  # checks each option in turn
+def main(  # noqa: C901, PLR0912  # checks each option in turn
     variants: tuple[str, ...],
     environment: str,
     episodes: int,
@@ -301,6 +322,7 @@ def main(  # noqa: C901  # checks each option in turn
     no_cache: bool,
     jobs: int,
     ray: str | None,
+    looks: int,
     margins: tuple[float, float],
     picture: Path | None,
     as_json: bool,
@@ -331,7 +353,7 @@ def main(  # noqa: C901  # checks each option in turn
             with RayPool(ray) as pool:
                 fill_cache(environment, variants, seeds, batch, runtime, cache, pool, finished)
         evaluations = evaluate(make, opened, seeds, batch, finished, caches)
-    verdicts = verdicts_of(evaluations, margins)
+    verdicts = verdicts_of(evaluations, margins, looks)
     timed = [] if picture is None else time_calls(opened, evaluations[0].rollout.episodes[0].windows, TIMED_CALLS)
     machine = fingerprint()
     identities = [one.policy.info.identity for one in opened]
@@ -346,7 +368,11 @@ def main(  # noqa: C901  # checks each option in turn
         for each, (score, success) in zip(figures[1:], verdicts, strict=True):
             by = {"score": dataclasses.asdict(score), "success": dataclasses.asdict(success)}
             each["verdict"] = {"word": joined((score, success)), **by}
-        document = {"environment": environment, "machine": machine, "threads": threads, "variants": figures}
+        for each, text in zip(figures, variants, strict=True):
+            each["distance"] = distance_of(text)
+        command = shlex.join(["python", "examples/evaluation/evaluate.py", *sys.argv[1:]])
+        document = {"command": command, "environment": environment, "machine": machine, "threads": threads}
+        document["variants"] = figures
         click.echo(json.dumps(document, indent=2))
     else:
         print_tables(make.title, evaluations, seeds, timed, verdicts)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import click
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from bootstrap import estimate, paired_difference
 from click.testing import CliRunner
+from driven import rows_of
 from evaluate import evaluation_table, summarise, task_table
 from rollout import Episode, Rollout
 
@@ -184,3 +186,27 @@ def test_a_cluster_and_what_it_cannot_have_beside_it_are_refused(tiny_artifact: 
     result = CliRunner().invoke(evaluate.main, [str(tiny_artifact), "--ray", "local", *other])
     assert result.exit_code == 2
     assert "--ray" in result.output.splitlines()[-1]
+
+
+def test_looks_share_the_error_and_the_document_makes_rows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tiny_artifact: Path
+) -> None:
+    dense, sparse = rollout([0.97, 0.76] * 50), rollout([0.97, 0.75] * 50)
+
+    def evaluated(*_: Any) -> Any:
+        return [summarise("dense", dense, dense), summarise("sparse", sparse, dense)]
+
+    judged = SimpleNamespace(default_plan="schedule", calibration={"plans": {"schedule": {"distance": 0.05}}})
+    monkeypatch.setattr(evaluate, "evaluate", evaluated)
+    monkeypatch.setattr(evaluate, "read_manifest", lambda _: judged)
+    words = [f"{tiny_artifact}:dense", str(tiny_artifact), "--looks", "2", "--json", "--cache", str(tmp_path)]
+    document = json.loads(CliRunner().invoke(evaluate.main, words).stdout)
+    assert [one["distance"] for one in document["variants"]] == [None, 0.05]
+    assert document["command"].startswith("python examples/evaluation/evaluate.py")
+    (row,) = rows_of(document, "Push-T", ["2 of 4 steps"], "a.md#b", [])
+    assert (row.distance, row.episodes, row.comparisons, row.counted) == (0.05, 100, 2, 2)
+    assert row.score is not None and row.score[0] == pytest.approx(-0.01 / 0.95 / 2, abs=1e-4)
+    assert row.verdict == {measure: row.word(measure) for measure in ("success", "score")}
+    once = json.loads(CliRunner().invoke(evaluate.main, [*words[:2], "--json", "--cache", str(tmp_path)]).stdout)
+    low, wider = (one["variants"][1]["verdict"]["success"]["difference"]["low"] for one in (once, document))
+    assert wider < low < 0

@@ -130,8 +130,15 @@ def test_the_robot_is_driven_until_a_plan_is_equivalent(
     last, said = settle(["schedule", SAFE], 400, driven)
     assert asked == looked
     assert joined(said[-1]) == EQUIVALENT
-    assert {each.comparisons for pair in said for each in pair} == {LOOKS * len(said)}  # they share the error
-    assert "in 2 looks together" in str(verdict_table(last, said).caption)
+    # They share the error, and so does the look at ``safe`` that there may be.
+    assert {each.comparisons for pair in said for each in pair} == {(LOOKS + 1) * len(said)}
+    assert "in 3 looks together" in str(verdict_table(last, said).caption)
+
+
+def test_a_single_plan_is_looked_at_twice_at_most() -> None:
+    coming = iter([(200, 100), (200, 100)])
+    _, said = settle(["schedule"], 400, lambda plans, count: evaluations(*next(coming)))
+    assert [each.comparisons for pair in said for each in pair] == [LOOKS, LOOKS] and joined(said[0]) == WORSE
 
 
 def test_the_steps_to_a_plan_are_named_by_what_it_says() -> None:
