@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Container, Iterator
+import re
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,6 +57,25 @@ def imports(name: str, path: Path) -> list[Import]:
     ]
 
 
+def imports_by_name(name: str, path: Path) -> list[str]:
+    """What a module loads by a text, or has in a table as ``room.module:Name``, resolved.
+
+    Of a text that is put together, what comes before its first part that only a run can tell; nothing where that is the
+    whole package.
+    """
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    own, found = {"__package__": package, "__name__": name}, []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and node.args and ast.unparse(node.func).rpartition(".")[2] in _LOADERS:
+            text = _known_text(node.args[0], own).partition(":")[0]
+            dots = len(text) - len(text.lstrip("."))
+            anchor = package.split(".")[: len(package.split(".")) + 1 - dots] if dots else []
+            found.append(".".join([*anchor, *filter(None, text.split("."))]))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and _ROW.fullmatch(node.value):
+            found.append(f"ttscompile.{node.value.partition(':')[0]}")
+    return [target for target in found if target != "ttscompile"]
+
+
 def home(target: str, known: Container[str]) -> str | None:
     """The module of the package that ``target`` is, or is a name in; None for somebody else's."""
     while target:
@@ -83,6 +103,20 @@ def eager_closure(start: str, graph: dict[str, list[Import]]) -> dict[str, list[
         if parent in graph:
             pending.append((parent, [*chain, parent]))
     return chains
+
+
+_LOADERS = ("import_module", "resolve_name")
+_ROW = re.compile(r"(?!ttscompile)[a-z]\w*(\.\w+)*:[A-Z]\w*")
+
+
+def _known_text(node: ast.expr, own: Mapping[str, str]) -> str:
+    text = ""
+    for part in node.values if isinstance(node, ast.JoinedStr) else [node]:
+        told = part.value if isinstance(part, ast.Constant) else own.get(ast.unparse(part).strip("{f'\"}"))
+        if not isinstance(told, str):
+            break
+        text += told
+    return text
 
 
 def _import_nodes(tree: ast.AST, eager: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:

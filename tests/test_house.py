@@ -14,8 +14,8 @@ import pytest
 
 import ttscompile
 
-from .imports import PACKAGES, Import, eager_closure, home, imports, modules
-from .structure import FLOORS, arrows_up, circles, doors_of, drawing
+from .imports import PACKAGES, Import, eager_closure, home, imports, imports_by_name, modules
+from .structure import FLOORS, arrows_up, by_name_of, circles, doors_of, drawing
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = modules(ROOT)
@@ -184,7 +184,51 @@ def test_circles_and_arrows_up_are_found_and_drawn() -> None:
 def test_the_drawing_can_be_had_as_a_command() -> None:
     result = subprocess.run([sys.executable, ROOT / "tests" / "structure.py"], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.endswith("circles: none\narrows up: none\n")
+    named = "calibration -> rivals (1); cli -> serving (1); frontends -> policies (1)"
+    assert result.stdout.endswith(f"by name: {named}\ncircles: none\narrows up: none\n")
+
+
+def test_what_is_attached_is_loaded_by_name_from_one_place_each_and_is_a_floor_up() -> None:
+    found = [(room, target, places) for room, targets in by_name_of().items() for target, places in targets.items()]
+    assert sorted(found) == [("calibration", "rivals", 1), ("cli", "serving", 1), ("frontends", "policies", 1)]
+    floor = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+    assert all(floor[target] > floor[room] for room, target, _ in found)
+    assert {f"plugins/{target}" for _, target, _ in found} < set(PACKAGES)
+
+
+def test_names_that_are_loaded_are_resolved_as_far_as_the_text_tells(tmp_path: Path) -> None:
+    path = tmp_path / "one.py"
+    path.write_text(
+        "import_module('ttscompile.serving.command').serve\n"
+        "importlib.import_module(f'..policies.{name}', __package__)\n"
+        "pkgutil.resolve_name('ttscompile.rivals:RIVALS'); pkgutil.resolve_name(f'ttscompile.{maker}')\n"
+        "import_module(f'{__package__}.fused'); import_module('numpy'); import_module(name)\n"
+        "ROW = Row('calibration.tts:Tts', 'of a task: Text')\n"
+    )
+    assert sorted(filter(None, imports_by_name("ttscompile.frontends.one", path))) == [
+        "numpy",
+        "ttscompile.calibration.tts",
+        "ttscompile.frontends.fused",
+        "ttscompile.policies",
+        "ttscompile.rivals",
+        "ttscompile.serving.command",
+    ]
+
+
+def test_the_residual_stream_is_never_the_stream_and_the_glossary_has_each_word_once() -> None:
+    """A batch has streams, too: each is called by its own word (design, section 1)."""
+    texts = [*MODULES.values(), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    found = {path: re.findall(r".*\bthe stream\b.*", path.read_text(), re.IGNORECASE) for path in texts}
+    assert {str(path): lines for path, lines in found.items() if lines and path.name != "design.md"} == {}
+    words = (ROOT / "docs" / "design.md").read_text().partition("\n## 2. ")[0]
+    rows = re.findall(r"^\| ([a-z][^|]*?) \|", words, re.MULTILINE)
+    assert sorted(set(rows) - {"word"}) == sorted(row for row in rows if row != "word")
+
+
+def test_the_core_has_at_most_42000_lines() -> None:
+    """``find ttscompile passes runtimes -name "*.py" | xargs cat | wc -l``: who adds to it takes away elsewhere."""
+    files = [path for folder in ("ttscompile", "passes", "runtimes") for path in (ROOT / folder).rglob("*.py")]
+    assert sum(path.read_bytes().count(b"\n") for path in files) <= 42_000
 
 
 def leaving(module: str, source: str) -> list[int]:
