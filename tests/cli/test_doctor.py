@@ -3,9 +3,11 @@
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,9 @@ import pytest
 
 from tests.artifact.folders import flip
 from tests.commands import done, refused, run
+from tests.pages import ROOT
 from tests.plans import store_schedules
+from ttscompile.cli import main
 from ttscompile.core.finding import Finding, Level
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.doctor import diagnosis as doctor, machine as doctor_machine
@@ -130,6 +134,16 @@ def test_requirements_are_read_with_their_extras() -> None:
     assert all(each.least for each in wanted)
     assert found("extra 'videos'", doctor_machine.package_findings()).level in (Level.OK, Level.NOTE)
     assert release("2.13.0+cpu") == (2, 13)
+
+
+def test_every_extra_of_users_is_told_with_commands_and_options_that_there_are() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(doctor_machine.ENABLES) == set(extras) - {"dev", "docs", "release"}
+    told = re.findall(r"(\w+) (--?[a-z-]+)\b", ", ".join(doctor_machine.ENABLES.values()))
+    assert ("calibrate", "--ray") in told
+    assert ("serve", "--copies") in told
+    for command, option in told:
+        assert option in {name for each in main.commands[command].params for name in each.opts}, command
 
 
 @pytest.mark.parametrize(

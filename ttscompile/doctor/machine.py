@@ -32,8 +32,10 @@ ENABLES = {
     "serve": "serve",
     "hub": "hf:// names, push",
     "pusht": "examples/pusht",
-    "examples": "Meta-World and Fetch in examples/evaluation",
-    "ray": "--ray of calibrate and compare, fleet",
+    "octo": "checkpoints of Octo",
+    "openpi": "JAX checkpoints of openpi",
+    "examples": "Meta-World, Fetch and SO-101 in examples/evaluation",
+    "ray": "calibrate --ray, serve --copies",
 }
 """What each extra of ttscompile is for. Those for its own development are not looked at."""
 
