@@ -38,7 +38,8 @@ class Known:
     Attributes:
         positions: of the T time steps.
         channels: of the D dimensions.
-        values: float32 ``[K + 1, B, N, channels]``, there, before each step and after the last.
+        values: float32 ``[K + 1, B, N, channels]``, there, before each step and after the last. In calibration NaN
+            where a call has fewer than N.
     """
 
     positions: slice
@@ -86,7 +87,7 @@ def noise_levels(sampler: SamplerTable) -> Levels | None:
         None if they do not follow.
     """
     levels = _levels(sampler)
-    return levels if levels is not None else _levels(sampler.without_skip())
+    return levels if levels is not None else _levels(sampler.with_skip(-1))
 
 
 def _levels(sampler: SamplerTable) -> Levels | None:
@@ -125,11 +126,7 @@ def check_prefix(
 ) -> FloatArray:
     """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, normalised: a copy of the caller's.
 
-    Args:
-        reference: what the actions of the call are relative to, ``ChunkSpec.reference``.
-
-    Raises:
-        ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
+    ``reference`` is what the actions of the call are relative to, ``ChunkSpec.reference``.
     """
     array = plain(prefix, "prefix", ObservationError)
     room = spec.sample[0] - spec.chunk.start
@@ -156,12 +153,7 @@ def check_prefix(
 
 
 def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> Known | None:
-    """What a prefix makes known of the samples of a call; None if it is empty.
-
-    Args:
-        prefix: from ``check_prefix``.
-        initial: the noise that the call starts from, ``[B, T, D]``.
-    """
+    """What a prefix from ``check_prefix`` tells of samples that begin as ``initial [B, T, D]``; None if empty."""
     if not prefix.size:
         return None
     channels = slice(spec.chunk.action_dim)

@@ -22,7 +22,7 @@ class Timings:
         wait_pruner: how long the denoising loop stood still for the pruner's plan; 0 if the plan was given.
         decode: the denoising loop, without that wait.
         total: from the normalised observation to the denoised sample.
-        frames: of the prologue, what depends on single frames alone and was not known.
+        frames: of the prologue, what depends on frames and instruction alone and was not known.
     """
 
     prologue: float
@@ -45,11 +45,12 @@ class CallReport:
         legalised: cells of each stream that were replaced because their residual was never computed.
         flops: FLOPs of each stream, multiply and add counted as two, prologue and pruner included.
         timings: wall time in milliseconds.
-        frames: how many frames were computed and how many were known, and what that took and saved.
+        frames: how many frames and scenes were computed and how many were known, and what that took and saved.
         loop: name of the loop that was executed.
         outside: of each stream of a plan with a correction, how far the observation is from what was recorded: 1 for
-            the furthest recorded one. Above ``FAR`` the stream had as many steps, evenly spaced, and no correction.
+            the furthest recorded one. Above ``FAR`` a stream had as many steps, evenly spaced, and no correction.
             Empty where nothing is said of that: ``core.envelope``.
+        unfitted: whether the prefix was longer than those that the plan's correction was fitted with.
     """
 
     plan: PlanArray
@@ -61,6 +62,7 @@ class CallReport:
     frames: FrameWork = field(default_factory=FrameWork)
     loop: str = ORIGINAL
     outside: tuple[float, ...] = ()
+    unfitted: bool = False
 
     @property
     def far(self) -> bool:

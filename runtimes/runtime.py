@@ -175,12 +175,6 @@ class Runtime:
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.
-
-        Raises:
-            IllegalPlanError: the plan names what the artifact lacks, its cells have the wrong shape, or are illegal and
-                not to be repaired.
-            ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
-            RuntimeUnavailableError: this runtime cannot do what the plan asks for.
         """
         streams = len(next(iter(obs.values())))
         self.require_streams(streams)
@@ -197,7 +191,9 @@ class Runtime:
             change = None if reference is None or self._reference is None else (self._reference, reference)
             noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed, change)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
-        obs = {**obs, **spec.committed(streams, 0 if known is None else known.values.shape[2])}
+        committed = 0 if known is None else known.values.shape[2]
+        correction = plan.correction and plan.correction.of(committed)
+        obs = {**obs, **spec.committed(streams, committed)}
         cells = (streams, manifest.steps, len(manifest.groups))
         same = opened is self._used  # else what earlier calls kept is of another variant
         written = self._written if same and self._written is not None else np.zeros(cells, dtype=np.bool_)
@@ -215,7 +211,7 @@ class Runtime:
         backend.prepare(streams, None if settled is None else settled.lowered)
 
         start = time.perf_counter()
-        made = self._denoised(opened, plan, Call(obs, noise, plan.correction, known, keep, written), settled)
+        made = self._denoised(opened, plan, Call(obs, noise, correction, known, keep, written), settled)
         stop, settled = time.perf_counter(), made.settled
         computed = settled.plans == Source.COMPUTE.value
         self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
@@ -230,9 +226,10 @@ class Runtime:
             loop=plan.loop,
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
             legalised=settled.legalised,
-            flops=tuple(manifest.flops.call(one, plan.pruned, plan.correction) for one in settled.plans),
+            flops=tuple(manifest.flops.call(one, plan.pruned, correction) for one in settled.plans),
             frames=made.frames,
             outside=tuple(made.outside.tolist()),
+            unfitted=correction is not None and committed > correction.prefixes,
             timings=Timings(
                 prologue=_milliseconds(start, made.prologue),
                 pruner=settled.pruner,

@@ -40,7 +40,8 @@ Wish = tuple[str, int]
 How = tuple[int | None, float, bool]
 """Intervals at most, seconds of a search, and whether its plan takes part with a correction too."""
 
-_FIELDS = tuple(field.name for field in fields(Correction))
+_FIELDS = tuple(field.name for field in fields(Correction) if not field.kw_only)
+"""Those of calls without a prefix, which plans are compared on."""
 
 
 class ComparisonState(StateFile):

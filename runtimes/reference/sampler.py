@@ -134,9 +134,10 @@ def correct(
 
 
 def hold(carried: Carried, known: Known | None, k: int) -> Carried:
-    """What is carried to step k, or from the last, with what is known of the sample in its place."""
+    """What is carried to step k, or from the last, with what is known of the sample in its place; NaN is not known."""
     if known is None:
         return carried
-    sample = carried.sample.clone()
-    sample[:, known.positions, known.channels] = torch.from_numpy(known.values[k])
+    sample, values = carried.sample.clone(), torch.from_numpy(known.values[k])
+    place = (slice(None), known.positions, known.channels)
+    sample[place] = torch.where(values.isnan(), sample[place], values)
     return carried._replace(sample=sample)

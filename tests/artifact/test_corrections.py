@@ -49,6 +49,22 @@ def test_one_without_jumps_has_no_arrays_for_them() -> None:
     assert named == {"anchors", "weights", "bias", "reading", "observed"}
 
 
+def test_that_of_calls_with_a_prefix_stands_beside_that_of_others() -> None:
+    """Where there is none, an artifact is what it was before there were any."""
+    late = replace(WITH, prefixes=3)
+    stored = correction_arrays("fast", replace(WITHOUT, late=late)) | correction_arrays("slow", WITH)
+    found = read_corrections(stored, of_plans("fast", "slow"), "here")
+    assert found["slow"].late is None and found["slow"].prefixes == found["fast"].prefixes == 0
+    assert found["fast"].late is not None and found["fast"].late.prefixes == 3
+    np.testing.assert_array_equal(found["fast"].late.outer, late.outer)
+    assert not found["fast"].jumps
+    alone = {name: array for name, array in stored.items() if name.startswith("correction/fast/late/")}
+    twice = {name.replace("/late/", "/late/late/"): array for name, array in alone.items()}
+    for wrong in (alone, stored | twice):
+        with pytest.raises(ArtifactError, match="^here: expected corrections of plans among"):
+            read_corrections(wrong, of_plans("fast", "slow"), "here")
+
+
 @pytest.mark.parametrize("change", ["no plan", "less", "less of the jumps", "more"])
 def test_others_are_refused(change: str) -> None:
     stored, plans = correction_arrays("fast", WITH), of_plans("fast")

@@ -1,6 +1,7 @@
 """The record of a correction: what it must look like, what it costs, and when action dimensions share it."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,7 +120,7 @@ def test_jumps_that_fit_nothing_are_refused(change: str) -> None:
         with pytest.raises(IllegalPlanError, match="none of a chunk of more than 1024 numbers"):
             jumping([True, False, True], horizon=513)
         return
-    changed = {
+    changed: dict[str, Any] = {
         "anchors": {"anchors": np.array([True, False, True, False, True])},
         "inner": {"inner": good.inner[:, 1:]},
         "middle": {"middle": good.middle[:, :, :-1]},
@@ -159,3 +160,18 @@ def test_a_single_file_has_an_input_for_each_of_its_arrays() -> None:
     inputs = jumping([True, False, True, False, False]).inputs()
     assert inputs["correction_jumps"].tolist() == [-1, 0, -1, -1, -1]
     assert inputs["correction_inner"].shape == (1, 7 + 33, HIDDEN)
+
+
+def test_a_call_with_a_prefix_has_the_one_that_was_fitted_on_such_calls() -> None:
+    own, late = no_correction(5, (4, 2)), replace(no_correction(5, (4, 2)), prefixes=3)
+    both = replace(own, late=late)
+    assert both.of(0) is both and both.of(1) is late and both.of(4) is late
+    assert own.of(2) is own and (own.prefixes, both.of(2).prefixes) == (0, 3)
+    with pytest.raises(IllegalPlanError, match="this policy needs"):
+        replace(own, late=no_correction(6, (4, 2))).require_fit(5, (4, 2), 7)
+
+
+@pytest.mark.parametrize("prefixes", [-1, 5, 1.5, True])
+def test_prefixes_are_a_number_of_actions_of_the_chunk(prefixes: Any) -> None:
+    with pytest.raises(IllegalPlanError, match=r"prefixes of a correction must be an integer .* at most 4; found"):
+        replace(no_correction(5, (4, 2)), prefixes=prefixes)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -63,13 +64,12 @@ def jumping(anchors: list[bool], read: int = 3, horizon: int = 4) -> Correction:
     rng = np.random.default_rng(2)
     like = no_correction(len(anchors), (horizon, 2))
     flags = np.array(anchors)
-    return replace(
-        like,
-        anchors=flags,
-        reading=rng.standard_normal((7, read)).astype(np.float32),
-        observed=np.zeros((read, *like.observed.shape[1:]), np.float32),
-        **dict(zip(("inner", "middle", "outer"), random_jumps(rng, flags, (horizon, 2), read), strict=True)),
+    reading = rng.standard_normal((7, read)).astype(np.float32)
+    layers: dict[str, Any] = dict(
+        zip(("inner", "middle", "outer"), random_jumps(rng, flags, (horizon, 2), read), strict=True)
     )
+    observed = np.zeros((read, *like.observed.shape[1:]), np.float32)
+    return replace(like, anchors=flags, reading=reading, observed=observed, **layers)
 
 
 def random_reading(

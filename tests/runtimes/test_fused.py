@@ -10,6 +10,7 @@ import importlib.util
 import os
 from dataclasses import replace
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,7 +78,7 @@ def test_it_agrees_with_the_reference(
             correction = replace(correction, weights=correction.weights[:, :1])
         anchors = (plan == Source.COMPUTE).all(axis=1)  # and no idle step, as in what calibration makes
         jumps = random_jumps(rng, anchors, artifact.manifest.spec.sample, correction.reads)
-        named = dict(zip(("inner", "middle", "outer"), jumps, strict=True))
+        named: dict[str, Any] = dict(zip(("inner", "middle", "outer"), jumps, strict=True))
         obs, noise = random_inputs(artifact, rng, streams)
         for own in (None, replace(correction, anchors=anchors, **named)):
             one = Plan(cells=plan, correction=own)

@@ -1,6 +1,7 @@
 """Steps without a computed block, in numpy, against the reference: every sampler, any plan, any number of streams."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_runs_of_idle_steps_go_through_numpy_and_prepare_once(
     monkeypatch.setattr(IdleSteps, "prepare", lambda self: prepared.append(1) or prepare(self))  # type: ignore[func-returns-value]
     obs, noise = random_inputs(artifact, np.random.default_rng(0), 1)
     correction = random_correction(artifact, np.random.default_rng(1))
-    without = dict.fromkeys(("inner", "middle", "outer"), np.zeros((0, 0, 0), np.float32))
+    without: dict[str, Any] = dict.fromkeys(("inner", "middle", "outer"), np.zeros((0, 0, 0), np.float32))
     runtime.predict(
         obs, noise, Plan(cells=plan, correction=replace(correction, anchors=np.ones(STEPS, np.bool_), **without))
     )

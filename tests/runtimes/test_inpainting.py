@@ -241,6 +241,24 @@ def test_no_action_committed_is_no_prefix_and_a_prefix_leaves_nothing_behind(art
     np.testing.assert_array_equal(runtime.predict(obs, noise, Plan(cells=plan, correction=correction))[0], before)
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "torch", "reference"])
+def test_a_call_with_a_prefix_has_the_correction_of_such_calls_and_says_where_that_is_none(
+    artifact: Artifact, runtime: str
+) -> None:
+    rng = np.random.default_rng(3)
+    own, late = (random_correction(artifact, rng) for _ in range(2))
+    late, cells = replace(late, prefixes=2), uniform_plan(STEPS, BLOCKS, 3)
+    both, alone, other = (Plan(cells=cells, correction=one) for one in (replace(own, late=late), own, late))
+    (obs, noise), opened = random_inputs(artifact, rng, 1), open_runtime(artifact, runtime)
+    prefix = rng.standard_normal((1, 3, 2)).astype(np.float32)
+    for count, like, unfitted in ((0, alone, False), (2, other, False), (3, other, True), (0, alone, False)):
+        made, report = opened.predict(obs, noise, both, prefix[:, :count])
+        np.testing.assert_array_equal(made, opened.predict(obs, noise, like, prefix[:, :count])[0])
+        assert report.unfitted is unfitted
+    assert opened.predict(obs, noise, alone, prefix)[1].unfitted
+    assert not opened.predict(obs, noise, replace(alone, correction=None), prefix)[1].unfitted
+
+
 def test_a_prefix_that_does_not_fit_is_refused_and_nothing_is_executed(artifact: Artifact) -> None:
     policy = ttscompile.load(artifact.path, seed=0)
     obs = {"obs": np.zeros((2, 2), np.float32)}

@@ -4,7 +4,8 @@ Beside them stands what was recorded to fit them: ``envelope/FIELD``.
 """
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,18 @@ from .strict_json import REMEDY
 
 PREFIX, ENVELOPE = "correction/", "envelope/"
 
-_OF_ALL = tuple(field.name for field in fields(Correction) if field.default_factory is MISSING)
-_OF_JUMPS = tuple(field.name for field in fields(Correction) if field.name not in _OF_ALL)
+LATE = "/late"
+"""After the name of a plan: of its calls with a prefix."""
+
+_OF_JUMPS, _OF_PREFIXES = ("inner", "middle", "outer"), ("prefixes",)
+_OF_ALL = tuple(one.name for one in fields(Correction) if one.default is one.default_factory is MISSING)
 
 
 def correction_arrays(plan: str, correction: Correction) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a plan's correction, by name."""
-    names = (*_OF_ALL, *(_OF_JUMPS if correction.jumps else ()))
-    return {f"{PREFIX}{plan}/{name}": np.asarray(getattr(correction, name)) for name in names}
+    names = (*_OF_ALL, *_OF_JUMPS * bool(correction.jumps), *_OF_PREFIXES * bool(correction.prefixes))
+    own = {f"{PREFIX}{plan}/{name}": np.asarray(getattr(correction, name)) for name in names}
+    return own if correction.late is None else own | correction_arrays(plan + LATE, correction.late)
 
 
 def envelope_arrays(envelope: Envelope | None) -> dict[str, npt.NDArray[Any]]:
@@ -53,29 +58,29 @@ def read_envelope(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, wh
 
 
 def read_corrections(stored: Mapping[str, npt.NDArray[Any]], manifest: Manifest, where: str) -> dict[str, Correction]:
-    """The corrections among some arrays, by the name of the plan.
-
-    Args:
-        stored: arrays; those of other names are left alone.
-    """
+    """The corrections among some arrays, by the name of the plan; arrays of other names are left alone."""
     parts = {name.removeprefix(PREFIX): array for name, array in stored.items() if name.startswith(PREFIX)}
     wanted = dict[str, tuple[str, ...]]()
     for name in sorted({name.rpartition("/")[0] for name in parts}):
-        wanted[name] = (*_OF_ALL, *_OF_JUMPS) if f"{name}/{_OF_JUMPS[0]}" in parts else _OF_ALL
-    plans = set(manifest.plans)
+        also = (of for of in (_OF_JUMPS, _OF_PREFIXES) if f"{name}/{of[0]}" in parts)
+        wanted[name] = (*_OF_ALL, *chain.from_iterable(also))
+    plans = {*manifest.plans, *(name + LATE for name in manifest.plans if name in wanted)}
     if not wanted.keys() <= plans or {f"{name}/{one}" for name, of in wanted.items() for one in of} != set(parts):
         raise ArtifactError(
-            f"{where}: expected corrections of plans among {sorted(plans)}, each with {', '.join(_OF_ALL)}, and"
-            f" {', '.join(_OF_JUMPS)} if it has jumps; found {sorted(parts)}. {REMEDY}"
+            f"{where}: expected corrections of plans among {sorted(manifest.plans)}, each with {', '.join(_OF_ALL)},"
+            f" {', '.join(_OF_JUMPS)} if it has jumps, and {_OF_PREFIXES[0]} if it was fitted with any; found"
+            f" {sorted(parts)}. {REMEDY}"
         )
     found = dict[str, Correction]()
     for name, of in wanted.items():
+        own: dict[str, Any] = {one: parts[f"{name}/{one}"] for one in of}
         try:
-            found[name] = Correction(**{one: parts[f"{name}/{one}"] for one in of})
-            require_fit(found[name], manifest, manifest.plans[name].loop)
+            found[name] = Correction(**own)
+            require_fit(found[name], manifest, manifest.plans[name.removesuffix(LATE)].loop)
         except IllegalPlanError as error:
             raise ArtifactError(f"{where}: {name}: {error} {REMEDY}") from error
-    return found
+    late = {name.removesuffix(LATE): found.pop(name) for name in wanted if name.endswith(LATE)}
+    return {name: replace(one, late=late.get(name)) for name, one in found.items()}
 
 
 def require_fit(correction: Correction, manifest: Manifest, loop: str) -> None:

@@ -1,5 +1,7 @@
 """The calls that calibration works on: observation, noise, and what the dense policy answers."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +15,7 @@ from torch import Tensor
 from ..core.spec import PolicySpec
 from ..core.tokenizer import ReadTokenizer
 from ..errors import CalibrationError
+from ..runtimes.inpainting import Known
 from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
 from ..trajectories.episodes import Episode, episodes_of
@@ -32,12 +35,7 @@ calibration judges on episodes that it saw nothing of."""
 
 @dataclass(frozen=True)
 class Split:
-    """Calls by episode: what plans are learned from, and what they are judged on.
-
-    Attributes:
-        calibration: numbers of the episodes to learn from.
-        validation: numbers of the episodes to judge on; none of them is in ``calibration``.
-    """
+    """Numbers of the episodes that plans are learned from, and of others that they are judged on."""
 
     calibration: tuple[int, ...]
     validation: tuple[int, ...]
@@ -57,11 +55,7 @@ def load_episodes(
     observation: Mapping[str, Sequence[str]] | None,
     tokenizer: ReadTokenizer | None = None,
 ) -> list[Episode]:
-    """The recorded episodes, as the policy observes them; see ``load_trajectories``.
-
-    Raises:
-        TrajectoryError: the recordings do not fit the policy.
-    """
+    """The recorded episodes, as the policy observes them; see ``load_trajectories``."""
     episodes = episodes_of(spec, trajectories, observation, tokenizer)
     if len(episodes) < 2:
         raise CalibrationError(
@@ -83,13 +77,16 @@ class Calls:
     The first call of a window is treated as the first of its episode: nothing of an earlier one is in the caches.
 
     Attributes:
-        contexts: what the loop reads beside the stream.
+        contexts: what the loop reads beside the residual stream.
         initial: the sample at step 0, ``[N, T, D]``.
         noise: the draw used at each step, ``[K, N, T, D]``; None if the sampler is deterministic.
         episodes: the number of the episode that each call is from, ``[N]``.
         path: the sample of the dense policy after each step with the same noise, ``[N, K, T, D]``; None before it is
-            known.
+            known. Where a prefix takes its place it is what the step makes, before that.
         window: how many calls, one after the other, are a window; 1 for calls that are independent of each other.
+        known: what prefixes make known of the samples; NaN where that of a call is shorter. None without prefixes.
+        late: the first of these calls once more, each with a prefix and other noise, which corrections of such calls
+            are fitted on; None for none.
     """
 
     contexts: Contexts
@@ -98,6 +95,8 @@ class Calls:
     episodes: IntArray
     path: Tensor | None = None
     window: int = 1
+    known: Known | None = None
+    late: Calls | None = None
 
     @property
     def count(self) -> int:
@@ -156,12 +155,7 @@ def prepare_calls(
     seed: tuple[int, ...],
     window: int = 1,
 ) -> Calls:
-    """Calls without targets: draw their noise and run the prologue.
-
-    Args:
-        spec: of the policy, with the loop of the model.
-        chosen: the number of the episode, and the row in it, of each call; those of a window one after the other.
-    """
+    """Calls without targets: draw their noise and run the prologue. See ``calls_at``."""
     return calls_at(model, spec, episodes, chosen, draw_noise(spec, len(chosen), seed), window)
 
 

@@ -85,13 +85,7 @@ def envelope_of(condition: Tensor, episodes: IntArray, most: int) -> Envelope | 
 
 
 class Solved(NamedTuple):
-    """The correction of one step.
-
-    Attributes:
-        weight: ``[G, 6 T, T]``.
-        bias: ``[D, 1, T]``.
-        observed: of components, ``[F, D, T]``.
-    """
+    """The correction of one step: weight ``[G, 6 T, T]``, bias ``[D, 1, T]``, and of components ``[F, D, T]``."""
 
     weight: Tensor
     bias: Tensor
@@ -140,11 +134,7 @@ Layers = tuple[Tensor, Tensor, Tensor]
 
 
 def fit_jump(known: Tensor, missing: Tensor, episodes: IntArray, seed: int) -> tuple[Layers, Tensor] | None:
-    """A network, trained on all calls, and what it would have added to each; see ``on_other_episodes``.
-
-    Args:
-        seed: of the weights that training begins with, and of the order of the calls.
-    """
+    """A network, trained on all calls, and what it would have added to each; see ``on_other_episodes``."""
     return on_other_episodes(partial(_trained, seed=seed), known, missing, episodes)
 
 
@@ -157,10 +147,7 @@ def on_other_episodes(
     corrections that are fitted after it would take it for that good.
 
     Args:
-        fit: makes layers of what some calls read and what they miss.
-        known: what it reads, ``[n, I]``.
-        missing: what should be added, ``[n, D T]``.
-        episodes: of each call, ``[n]``.
+        fit: makes layers of what some calls read, ``[n, I]``, and of what they miss, ``[n, D T]``.
 
     Returns:
         Its layers, each with the row that is added last, and ``[n, D T]``. None where that leaves over more than is

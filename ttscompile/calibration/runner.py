@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ class Runner:
         blocks, pieces = view.manifest.blocks, view.pieces
         self.view = view
         self.model = ReferenceModel.from_view(view, device)
-        types = {name: pieces.condition.types()[name] for name in pieces.condition.outputs}
+        types = pieces.conditions
         self._context_axes = {name: one.batch_axis for name, one in types.items() if one.batch_axis is not None}
         self.types = [block.type for block in blocks]
         self.axes = [block.type.batch_axis or 0 for block in blocks]
@@ -85,17 +86,14 @@ class Runner:
             episodes=calls.episodes[index.numpy()],
             path=None if calls.path is None else calls.path[index],
             window=calls.window if whole_windows(chosen_calls, calls.window) else 1,
+            known=calls.known and replace(calls.known, values=calls.known.values[:, chosen_calls]),
         )
 
     def run(self, plan: PlanArray, calls: Calls) -> Tensor:
-        """The denoised sample of every call, ``[N, T, D]``.
+        """The denoised sample of every call, ``[N, T, D]``, with one plan, or with its own of ``[N, K, blocks]``.
 
-        Args:
-            plan: ``[K, blocks]``, or ``[N, K, blocks]`` for each call one of its own. A cell that reads of an earlier
-                call what no earlier one of its window computed reads TIMESTEP, as legalised plans do.
-
-        Raises:
-            IllegalPlanError: a plan reads the rollout cache and calls are independent, or step 0 is not dense.
+        A cell that reads of an earlier call what no earlier one of its window computed reads TIMESTEP. Raises
+        IllegalPlanError: a plan reads the rollout cache and calls are independent, or step 0 is not dense.
         """
         if (plan[..., 0, :] != Source.COMPUTE).any():
             raise IllegalPlanError("expected plans with a dense step 0.")
@@ -120,7 +118,7 @@ class Runner:
 
     def samples(self, calls: Calls, blocks: Blocks) -> Iterator[Tensor]:
         """The sample ``[N, T, D]`` after each step; ``blocks`` says what the blocks make of the stem's stream."""
-        loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction)
+        loop = self.model.steps_of(calls.contexts, calls.initial, calls.noise, blocks, self.correction, calls.known)
         return (carried.sample for carried in loop)
 
     def _following(self, plans: PlanArray, calls: Calls) -> Iterator[Tensor]:
@@ -145,7 +143,7 @@ class Runner:
     def step(
         self, row: PlanArray, k: int, stream: Tensor, calls: Calls, caches: StreamCaches, blocks: range | None = None
     ) -> Tensor:
-        """The stream after the blocks of step k, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do.
+        """The residual stream after the blocks of step k, where ``row [1, blocks]`` or ``[N, blocks]`` says what to do.
 
         ``stream`` is that before the blocks, all of them or those that are given; ``caches`` are changed.
         """

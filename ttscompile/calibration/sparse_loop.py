@@ -19,7 +19,7 @@ from torch import Tensor
 from ..core.correction import Correction, components_of, groups_of, jumps_of, may_jump, numbers_of
 from ..core.lattice import BoolArray, PlanArray, Source
 from ..pool import workers
-from ..runtimes.reference.sampler import correct, features, through
+from ..runtimes.reference.sampler import correct, features, hold, through
 from .calls import Calls
 from .regression import Components, Layers, Solved, fit_jump, solve
 from .runner import Runner, StreamCaches
@@ -48,13 +48,7 @@ def is_whole(plan: PlanArray) -> bool:
 
 @dataclass(frozen=True)
 class Place:
-    """Before a step of a sparse loop.
-
-    Attributes:
-        fitted: calls that corrections are fitted on, at this place.
-        judged: others, that only go along.
-        jumps: those that hold, by the step after which they were added.
-    """
+    """Before a step of a sparse loop: calls to fit corrections on, others that go along, and jumps that hold."""
 
     step: int
     fitted: tuple[_Batch, ...]
@@ -100,7 +94,7 @@ class SparseLoop:
 
     def __init__(self, runner: Runner, fitted: Calls | None, judged: Calls | None, *, reads: bool, whole: bool) -> None:
         self._components: Components | None = None
-        self._groups, self._numbers, self._known = 0, 0, torch.empty(0, 0)
+        self._groups, self._numbers, self._known, self._prefixes = 0, 0, torch.empty(0, 0), 0
         if fitted is not None:
             steps, sample = runner.model.steps, (fitted.initial.shape[1], fitted.initial.shape[2])
             condition = runner.model.condition(fitted.contexts)
@@ -110,6 +104,7 @@ class SparseLoop:
             others = [] if judged is None else [self._components.of_others(runner.model.condition(judged.contexts))]
             self._known = torch.cat([self._components.values, *others]).float()
             self._episodes = fitted.episodes
+            self._prefixes = 0 if fitted.known is None else fitted.known.values.shape[2]
 
         def batches(calls: Calls | None) -> tuple[_Batch, ...]:
             if calls is None:
@@ -183,7 +178,7 @@ class SparseLoop:
         # Fitted to components of mean 0; a call reads them with their center, so that is taken out of what is added.
         biases = biases - np.einsum("f,fkdt->kdt", self._components.center, observed)[:, :, None]
         anchors, reading = np.array(place.anchors), self._components.reading
-        without = Correction(anchors, weights, biases.astype(np.float32), reading, observed)
+        without = Correction(anchors, weights, biases.astype(np.float32), reading, observed, prefixes=self._prefixes)
         if not place.jumps:
             return without
         absent = tuple(torch.zeros_like(layer) for layer in next(iter(place.jumps.values())))
@@ -225,7 +220,7 @@ class _Batch:
 
     def predict(self, rows: PlanArray, k: int) -> None:
         """Go through step k, without a correction; ``rows`` of plans, ``[1 or n, blocks]``."""
-        model, calls, self._before = self._runner.model, self._calls, self._carried
+        model, calls = self._runner.model, self._calls
 
         def blocks(k: int, stem: Tensor) -> Tensor:
             if self._sums and rows[0, 0] != Source.COMPUTE:
@@ -235,6 +230,7 @@ class _Batch:
                 self._total, self._caches = stream - stem, StreamCaches()
             return stream
 
+        self._before = hold(self._carried, calls.known, k)
         self._k, self._prediction = k, model.predict(self._before.sample, k, calls.contexts, blocks)
         noise = None if calls.noise is None else calls.noise[k]
         self._carried = model.sampler.advance(self._before, self._prediction, noise, k)
@@ -269,6 +265,15 @@ class _Batch:
 
 
 def fit_correction(runner: Runner, plan: PlanArray, calls: Calls, reads: bool) -> Correction | None:
+    """``fitted_alone``, and beside it that of calls with a prefix: one for both is further away than two are."""
+    own = fitted_alone(runner, plan, calls, reads)
+    if own is None or calls.late is None:
+        return own
+    some = plan if plan.ndim == 2 else plan[: calls.late.count]
+    return replace(own, late=fitted_alone(runner, some, calls.late, reads))
+
+
+def fitted_alone(runner: Runner, plan: PlanArray, calls: Calls, reads: bool) -> Correction | None:
     """The correction of a schedule, or one for all plans of a pruner; None where the sparse loop ends in no numbers.
 
     At step k the sparse loop, corrected so far, has features; the correction of the step is the ridge regression, on

@@ -8,9 +8,11 @@ import torch
 
 from ..artifact.view import view_of
 from ..core.plan import Plan
+from ..core.spec import PolicySpec
 from ..pool import Here, Pool, Work, artifact_arguments, artifact_elsewhere, workers
+from ..runtimes.inpainting import known_samples, prefix_refusal
 from ..trajectories.episodes import Episode
-from .calls import Calls, Split, prepare_calls, sample_calls
+from .calls import Calls, Split, draw_noise, prepare_calls, sample_calls
 from .clock import Clock
 from .progress import Bar
 from .runner import Runner
@@ -18,6 +20,9 @@ from .state import StateFile
 
 REPEATS = 8
 """How often an observation may be learned from, each time with another noise."""
+
+LATE = 3
+"""One call in so many is learned from once more, with a prefix."""
 
 TARGETS_AT_ONCE = 16
 """Dense calls that go through the loop together, on one core; after a round of these the state is saved."""
@@ -67,6 +72,24 @@ def dense_rounds(runner: Runner, calls: Calls, begin: int = 0, pool: Pool | None
         found = list(pool.map(work, [runner.select(calls, part) for part in parts]))
         begin = end
         yield torch.cat(found)
+
+
+def inpaints_prefixes(spec: PolicySpec) -> bool:
+    """Whether a policy takes prefixes and was not trained to go on from them, which its prologue would be told of."""
+    return not spec.trained_prefix and prefix_refusal(spec) is None
+
+
+def late_calls(runner: Runner, calls: Calls, seed: int) -> Calls:
+    """The first of some answered calls once more, with other noise and as a prefix some of the actions executed."""
+    spec, count = runner.view.manifest.spec, calls.count // LATE
+    initial, noise = draw_noise(spec, count, (seed, 2, 1))
+    answers = calls.targets[:count, spec.chunk.start : spec.chunk.stop, : spec.chunk.action_dim].numpy()
+    known = known_samples(spec, answers, initial.numpy())
+    lengths = np.random.default_rng((seed, 2, 2)).integers(1, answers.shape[1] + 1, (count, 1))
+    assert known is not None
+    known.values[:, np.arange(answers.shape[1]) >= lengths] = np.nan
+    same = runner.select(calls, np.arange(count), consecutive=True)
+    return replace(same, initial=initial, noise=noise, path=None, known=known)
 
 
 def runner_arguments(runner: Runner) -> tuple[str, str, str]:

@@ -113,16 +113,12 @@ class Task:
 
 
 def _of_correction(correction: Correction | None) -> dict[str, int]:
-    reads, jumps = (0, 0) if correction is None else (correction.reads, len(correction.jumps))
-    return {"numbers_read_of_the_observation": reads, "jumps": jumps}
+    own = (0, 0, 0) if correction is None else (correction.reads, len(correction.jumps), correction.of(1).prefixes)
+    return dict(zip(("numbers_read_of_the_observation", "jumps", "prefixes"), own, strict=True))
 
 
 class Search(Protocol):
-    """A strategy at work, in intervals. Between two of them it can stop, and go on later from its ``state``.
-
-    Attributes:
-        intervals: how many there are at most.
-    """
+    """A strategy at work, in at most ``intervals``. Between two it can stop, and go on later from its ``state``."""
 
     intervals: int
 

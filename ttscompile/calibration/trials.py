@@ -33,7 +33,7 @@ from .progress import Bar
 from .regression import envelope_of
 from .runner import Runner
 from .state import StateFile
-from .targets import dense_rounds, draw_calls, with_targets
+from .targets import LATE, dense_rounds, draw_calls, inpaints_prefixes, late_calls, with_targets
 
 ANSWERED_BY = 0.5
 """Share of the time limit after which no more calls to learn from are answered than there have to be."""
@@ -198,8 +198,15 @@ class Trials:
             fewest, loop = self.limits.fewest, self.base.loop
             name = ("calibration" if window == 1 else "windows") + f" of {loop}" * (loop != ORIGINAL)
             most, until = self._affordable(name), self.clock.until(self.until_share)
+            inpaints = window == 1 and inpaints_prefixes(self.runner.view.manifest.spec)
             calls = draw_calls(self.runner, self.episodes, self.split, most, self.seed, window)
-            self._calls[window] = with_targets(self.runner, name, calls, fewest, self.state, until, self.bar, self.pool)
+            first = until.until(0.8 if inpaints else 1.0)
+            calls = with_targets(self.runner, name, calls, fewest, self.state, first, self.bar, self.pool)
+            if inpaints and calls.count >= LATE * fewest:  # fewer do harm
+                late, also = late_calls(self.runner, calls, self.seed), f"{name}, with a prefix"
+                late = with_targets(self.runner, also, late, 0, self.state, until, self.bar, self.pool)
+                calls = replace(calls, late=late if late.count >= fewest else None)
+            self._calls[window] = calls
             if self.clock.left() < 0:
                 self.bar.warn(
                     f"{self.clock.limit / 60:g} minutes were over when the calls to learn from had been answered:"

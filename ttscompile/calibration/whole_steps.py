@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -65,7 +65,8 @@ class WholeSteps:
         self._known: dict[tuple[int, ...], Errors] = {}
         self._runs: dict[bool | None, ScheduleRuns] = {}
         self._pool = pool or Here()
-        self._work = Work(self.measured, _measured_elsewhere, (*runner_arguments(runner), calls, seed, small))
+        alone = replace(calls, late=None)
+        self._work = Work(self.measured, _measured_elsewhere, (*runner_arguments(runner), alone, seed, small))
         self._seed, self._small = seed, small
         self._fitted, self._compared = self._divided(0, SMALL_SHARE if small else FITTED_SHARE)
 
@@ -173,7 +174,8 @@ class WholeSteps:
     def told_of_episodes(self, steps: Sequence[int]) -> str:
         """Whether more recorded episodes may pay for a schedule: a clause; empty where too few say nothing.
 
-        By how much nearer its correction brings it, on other episodes, with as many calls of all as of half of them.
+        By how much nearer its correction brings it, on other episodes, with as many calls of all as of half of them:
+        twice as many bring the same share again where errors fall as a power of their number.
         """
         episodes, of = np.unique(self._fitted.episodes), self._calls.episodes
         if len(episodes) < TELLING or self._calls.window > 1:
@@ -185,7 +187,9 @@ class WholeSteps:
         before, now = (self._errors_of(one.end(self.plan(steps)).samples, self._compared).normalised for one in loops)
         gain = max(before - now, 0.0) / max(before, 1e-30)  # 0 where nothing is left
         told = f"learned from {len(episodes)} it is {gain:.0%} nearer than learned from half of them"
-        return f"more episodes {'may' if gain >= WORTH else 'would hardly'} pay: {told}"
+        if gain < WORTH:
+            return f"more episodes would hardly pay: {told}"
+        return f"more episodes may pay: {told}, and {len(episodes)} more to learn from may bring as much again"
 
     def comparing(self, full_steps: int) -> float:
         """Seconds that ``errors`` of a schedule takes, by those so far; 0 before any."""
@@ -193,7 +197,8 @@ class WholeSteps:
 
     def correcting(self, full_steps: int) -> float:
         """Seconds that ``correction_of`` a schedule takes, by the comparisons so far; 0 before any."""
-        share = self._calls.count / (self._fitted.count + 2 * self._compared.count)
+        late = 0 if self._calls.late is None else self._calls.late.count
+        share = (self._calls.count + late) / (self._fitted.count + 2 * self._compared.count)
         return (1 + 2 * share) * self.comparing(full_steps)  # without jumps, and with them
 
     def _errors_of(self, samples: Tensor, of: Calls) -> Errors:

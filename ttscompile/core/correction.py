@@ -31,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import IllegalPlanError
+from .coercion import integer
 from .spec import FloatArray
 
 FEATURES = 6
@@ -78,6 +79,8 @@ class Correction:
         inner: float32 ``[J, F + 4 T D + 1, H]``; J is the number of jumps, or 0 where there are none.
         middle: float32 ``[J, H + 1, H]``.
         outer: float32 ``[J, H + 1, T D]``.
+        prefixes: actions of the longest prefix among the calls that it was fitted on; 0 where none had one.
+        late: what a call with a prefix has in place of this, fitted on such calls; None for this.
 
     Raises:
         IllegalPlanError: shapes or dtypes that do not fit each other, or numbers that are not finite.
@@ -91,6 +94,8 @@ class Correction:
     inner: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
     middle: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
     outer: npt.NDArray[np.float32] = field(default_factory=_no_jumps)
+    prefixes: int = field(default=0, kw_only=True)
+    late: "Correction | None" = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         steps, groups, _, horizon = self.weights.shape if self.weights.ndim == 4 else (0, 0, 0, 0)
@@ -123,6 +128,12 @@ class Correction:
             )
         if not all(np.isfinite(array).all() for array in (*arrays[1:], *networks)):
             raise IllegalPlanError("a correction holds numbers that are not finite. Calibrate the artifact again.")
+        longest = integer(self.prefixes, "prefixes of a correction", IllegalPlanError, most=horizon)
+        object.__setattr__(self, "prefixes", longest)
+
+    def of(self, committed: int) -> "Correction":
+        """That of a call with a prefix of so many actions."""
+        return self if not committed or self.late is None else self.late
 
     @cached_property
     def jumps(self) -> dict[int, tuple[int, int]]:
@@ -146,6 +157,8 @@ class Correction:
 
     def require_fit(self, steps: int, sample: tuple[int, int], numbers: int, groups: int | None = None) -> None:
         """Raise IllegalPlanError unless it is for K steps, samples ``(T, D)`` and conditions of N numbers."""
+        if self.late is not None:
+            self.late.require_fit(steps, sample, numbers, groups)
         expected = (steps, groups or groups_of(steps, sample), FEATURES * sample[0], sample[0])
         if self.weights.shape != expected:
             raise IllegalPlanError(
