@@ -3,6 +3,7 @@
 import inspect
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
@@ -46,13 +47,19 @@ class MonotonicClock:
 
 
 def require_plans(policy: Policy, settings: Resolved) -> None:
-    """Raise ExecutorError unless every plan that calls may run goes with the seam and the horizon."""
+    """Raise ExecutorError unless every plan that calls may run goes with the seam and the horizon; warn of losses."""
     info, plans = policy.info, getattr(policy, "plans", None)
     executed = info.action.stop - info.action.start
     for name in settings.plans:
         if settings.seam == "prefix":
             _require_prefix(policy, settings, name)
         own = plans.get(name.partition("@")[0]) if isinstance(plans, Mapping) else None
+        correction = getattr(own, "correction", None) if settings.seam == "prefix" else None
+        if correction is not None and (most := correction.of(1).prefixes) < settings.horizon:
+            told = f"plan {name!r} has a correction that was fitted to calls with at most {most} committed actions"
+            remedy = "Calibrate the artifact again, take a plan without a correction, or seam='replace'"
+            more = f"of this executor have up to {settings.horizon}, and may be further from the original's"
+            warnings.warn(f"{told}; those {more}. {remedy}.", stacklevel=3)
         follows = own is None and name == info.default_plan and getattr(info, "follows", False)
         if settings.horizon > executed and (follows or getattr(own, "otherwise", None) is not None):
             told = f"begins with the chunk of the call before, but not after more than the policy's {executed} actions"

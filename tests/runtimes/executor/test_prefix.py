@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,11 @@ from tests.rounding import allowed, assert_equal_but_for_rounding
 from tests.runtimes import committed
 from tests.runtimes.toys import toy_program, written_artifact
 from ttscompile import AsyncExecutor, ExecutorSettings
+from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.write import update_plans
+from ttscompile.core.correction import no_correction
+from ttscompile.core.plan import Plan
 from ttscompile.core.spec import Relative
 from ttscompile.errors import ExecutorError
 from ttscompile.runtimes.executor.settings import resolve
@@ -124,3 +128,20 @@ def test_latencies_are_measured_with_a_prefix(inpainting: Path) -> None:
     settings = ExecutorSettings(seam="prefix", warm_up=1, measured_calls=2, n_obs_steps=1)
     with AsyncExecutor(policy, HZ, settings):
         assert [prefix.shape for prefix, _ in policy.calls] == [(1, 2)] * 3
+
+
+@pytest.mark.parametrize(("fitted", "told"), [(0, "at most 0 committed"), (2, "at most 2 committed"), (3, None)])
+def test_a_correction_that_was_fitted_with_shorter_prefixes_is_told_of(
+    inpainting: Path, tmp_path: Path, fitted: int, told: str | None
+) -> None:
+    artifact = load_artifact(shutil.copytree(inpainting, tmp_path / "artifact"))
+    cells, like = artifact.plans["dense"].cells, no_correction(5, artifact.manifest.spec.sample)
+    late = replace(like, prefixes=fitted) if fitted else None
+    update_plans(artifact.path, {"fast": Plan(cells=cells, correction=replace(like, late=late))}, "fast")
+    policy, settings = ttscompile.load(artifact.path, seed=0), ExecutorSettings(seam="prefix", horizon=3)
+    expected = nullcontext() if told is None else pytest.warns(UserWarning, match=f"plan 'fast' .* {told} .* up to 3,")
+    with expected, AsyncExecutor(policy, HZ, settings, latencies={"fast": LATENCY}):
+        pass
+    other = replace(settings, seam="replace"), replace(settings, tiers=("dense",))
+    for one in other:
+        AsyncExecutor(policy, HZ, one, latencies={"fast": LATENCY, "dense": LATENCY}).close()
