@@ -87,6 +87,9 @@ WAYS = {
 """The paper's, and what LeRobot 0.6.1 computes by default: it evaluates the network before it asks for gradients, so
 that none go through it."""
 
+SEAMS = ("replace", "prefix", *WAYS)
+"""How a chunk may begin."""
+
 
 class GuidedPolicy:
     """A flow-matching policy in PyTorch whose chunks are guided to what is left of the chunk before.
@@ -213,6 +216,7 @@ def roughness(rollout: Sequence[Driven]) -> list[float]:
     "--checkpoint", required=True, type=click.Path(exists=True, path_type=Path), help="What DIR was made from."
 )
 @click.option("--sparse", metavar="DIR[:PLAN]", help="Another plan of the policy, played with the seam prefix.")
+@click.option("--seams", default=",".join(SEAMS), show_default=True, callback=several(str), help="Played with DIR.")
 @click.option("--ticks", default="2,5", show_default=True, callback=several(float), help="That a call takes.")
 @click.option("--horizon", default=8, show_default=True, help="Actions from one call to the next.")
 @click.option("--episodes", default=100, show_default=True, type=click.IntRange(2))
@@ -223,6 +227,7 @@ def main(
     variant: str,
     checkpoint: Path,
     sparse: str | None,
+    seams: list[str],
     ticks: list[float],
     horizon: int,
     episodes: int,
@@ -232,8 +237,10 @@ def main(
 ) -> None:
     """Play the policy of DIR with calls that take time, and say what each way to begin a chunk costs."""
     seeds = range(first_seed, first_seed + episodes)
-    seams = [(variant, seam) for seam in ("replace", "prefix", *WAYS)] + ([(sparse, "prefix")] if sparse else [])
-    ways = [Way(text, seam, each, horizon) for each in ticks for text, seam in seams]
+    if "prefix" not in seams or not set(seams) <= set(SEAMS):
+        raise click.BadParameter(f"expected prefix, which all are compared with, and others of {SEAMS}; found {seams}.")
+    played_with = [(variant, seam) for seam in seams] + ([(sparse, "prefix")] if sparse else [])
+    ways = [Way(text, seam, each, horizon) for each in ticks for text, seam in played_with]
     found: dict[tuple[Way, int], Driven] = {}
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("episodes", total=len(ways) * episodes)
@@ -247,7 +254,7 @@ def main(
     baseline = summarise("the world waits", waiting, waiting)
     played = {way: [found[way, seed] for seed in seeds] for way in ways}
     rows = {way: figures(way.setup(), each, prefixed(played, way, variant)) for way, each in played.items()}
-    times = milliseconds([opened(text, seam, checkpoint) for text, seam in seams])
+    times = milliseconds([opened(text, seam, checkpoint) for text, seam in played_with])
     if as_json:
         told = [
             {**vars(way), **one.to_json(), "roughness": roughness(played[way]), "ms": times[i % len(times)]}
