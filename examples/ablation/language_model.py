@@ -203,7 +203,8 @@ def similarities(module: nn.Module, observations: dict[str, Tensor]) -> list[flo
         valid = encoder(observations)[0]
     for hook in hooks:
         hook.remove()
-    return [float(each[valid].mean()) for each in found]
+    early, late = found[: len(hooks)], found[len(hooks) :]  # pictures and words, and then the state's token
+    return [float(torch.cat(pair, 1)[valid].mean()) for pair in zip(early, late, strict=True)]
 
 
 def most_similar(similar: Sequence[float], count: int) -> tuple[int, ...]:

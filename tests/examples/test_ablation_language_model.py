@@ -46,7 +46,7 @@ def answer(policy: Any, encoded: Any = None) -> Any:
 def test_with_all_layers_and_tokens_it_is_the_original(policy: Any) -> None:
     for kept in (None, 32):
         valid, _, *found = ablation.shorter(policy, (), kept).encoder(GIVEN)
-        assert all(torch.equal(*pair) for pair in zip((valid, *found), policy.encoder(GIVEN), strict=True))
+        torch.testing.assert_close((valid, *found), policy.encoder(GIVEN))  # whose state goes through layers alone
     torch.testing.assert_close(answer(ablation.shorter(policy)), answer(policy))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import repeat, zip_longest
 from typing import NamedTuple
 
 import torch
@@ -123,7 +123,7 @@ class Layer(nn.Module):
     def forward(
         self, x: Tensor, turns: Rotation, mask: Tensor, before: Seen | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``.
+        """The residual stream after the layer; keys, rotated, and values ``[B, groups, T, channels]``.
 
         Args:
             before: those of tokens before these, which these see, too.
@@ -165,18 +165,21 @@ def laid(seen: Iterable[Tensor], words: Iterable[Tensor | None], last: Tensor) -
     return torch.cat(parts, 1)
 
 
-def read_prefix(layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor) -> list[Tensor]:
+def read_prefix(
+    layers: Iterable[nn.Module], x: Tensor, turns: Rotation, mask: Tensor, before: Iterable[Seen | None] = repeat(None)
+) -> list[Tensor]:
     """Keys and values of every layer, in turn, ``[B, groups, T, channels]``; what nobody reads is not part of a graph.
 
     Args:
         layers: of the language model.
         x: the tokens, embedded, ``[B, T, width]``.
         turns: of their positions.
-        mask: added to the scores, ``[B, 1, T, T]``.
+        mask: added to the scores, ``[B, 1, T, T]``, or ``[B, 1, T, before + T]``.
+        before: of each layer, keys and values of tokens before these, which these see, too.
     """
     found = []
-    for layer in layers:
-        x, keys, values = layer(x, turns, mask)
+    for layer, earlier in zip(layers, before, strict=False):
+        x, keys, values = layer(x, turns, mask, earlier)
         found += [keys, values]
     return found
 

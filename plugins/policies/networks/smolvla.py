@@ -158,11 +158,17 @@ class Prefix(nn.Module):
             before, after = (self.text_model.embed_tokens(each).expand(*seen.shape[:2], -1, -1) for each in both)
             seen, rest = torch.cat([before, seen, after], 2), [before[:, 0], after[:, 0]] * self.config.absent
         words = self.text_model.embed_tokens(tokens) * scale
-        x = torch.cat([seen.flatten(1, 2), *rest, words, self.state_proj(state)[:, None]], 1)
-        valid = functional.pad(mask, (x.shape[1] - words.shape[1] - 1, 1), value=True)
+        x = torch.cat([seen.flatten(1, 2), *rest, words], 1)
+        valid = functional.pad(mask, (x.shape[1] - words.shape[1], 0), value=True)
         turns = layers.rotation(torch.cumsum(valid, 1) - 1, self.channels)
-        # Images and words do not see the state.
-        return valid, *layers.read_prefix(self.text_model.layers, x, turns, layers.prefix_mask(valid, late=1))
+        early = layers.read_prefix(self.text_model.layers, x, turns, layers.prefix_mask(valid))
+        # Images and words do not see the state, whose token follows by itself: what was made of them may be kept.
+        turns = layers.rotation(valid.sum(1, keepdim=True), self.channels)
+        valid = functional.pad(valid, (0, 1), value=True)
+        before = [layers.Seen(*early[i : i + 2]) for i in range(0, len(early), 2)]
+        mask, own = layers.added(valid[:, None, None, :]), self.state_proj(state)[:, None]
+        late = layers.read_prefix(self.text_model.layers, own, turns, mask, before)
+        return valid, *(torch.cat(pair, 2) for pair in zip(early, late, strict=True))
 
 
 class Expert(nn.Module):
