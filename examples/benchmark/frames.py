@@ -8,7 +8,8 @@ SmolVLA sees one frame, computes 2 of 10 steps, and is in int8. Calls take turns
 - ``all``: every frame and the instruction are computed in the call, as if none had been seen;
 - ``newest``: the frame before was prepared when it came, where the window has one, and the instruction is known;
 - ``one still``: the same, and one of the cameras shows what it showed before;
-- ``still``: nothing moves.
+- ``still``: cameras show what they showed before, and so frames are known, but no call has seen them together;
+- ``state alone``: the call before saw the same pictures and words, too.
 
 Seconds are the processor's, since the machine may be busy; ratios are those of the medians. Then an executor runs in
 real time, in turn with and without preparing and remembering frames, and the calls that it makes are timed. It controls
@@ -148,12 +149,14 @@ def window(spec: PolicySpec, before: Obs, newest: Obs) -> Obs:
 
 def calls(policy: CompiledPolicy, spec: PolicySpec, rounds: int) -> None:
     """Time the calls, and print a table."""
-    still = next(key for key, one in spec.observations.items() if one.image)
+    cameras = [key for key, one in spec.observations.items() if one.image]
+    still = cameras[0]
     ways: dict[str, Callable[[Obs, Obs], Obs]] = {
         "all": lambda before, newest: newest,
         "newest": lambda before, newest: newest,
         "one still": lambda before, newest: newest | {still: before[still]},
         "still": lambda before, newest: before,
+        "state alone": lambda before, newest: newest | {key: before[key] for key in cameras},
     }
     times: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
     stream = frames(spec, 0)
@@ -163,6 +166,8 @@ def calls(policy: CompiledPolicy, spec: PolicySpec, rounds: int) -> None:
             before, newest = next(stream), next(stream)
             policy.forget_frames() if way == "all" else policy.prepare_frame({k: v[None] for k, v in before.items()})
             obs = window(spec, before, move(before, newest))
+            if way == "state alone":
+                policy.predict_action(window(spec, before, before))
             start = time.process_time()
             policy.predict_action(obs)
             took = time.process_time() - start
@@ -240,6 +245,8 @@ def measure(name: str, folder: Path, rounds: int, seconds: float) -> None:
     print(f"\n## {name}\n")
     calls(policy, spec, rounds)
     alone = [key for key, one in spec.observations.items() if one.image and one.frames == 1]
+    if not seconds:
+        return
     print(f"\n{alone[0]} shows what it did before." if alone else "")
     drive(policy, spec, hz, seconds, lambda: frames(spec, 1, alone[:1]))
     if alone:
@@ -254,7 +261,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--policies", default="resnet,clip")
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each policy in the executor")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each policy in the executor; 0 for none")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifacts in; a temporary one otherwise")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
