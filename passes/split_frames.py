@@ -1,4 +1,4 @@
-"""Work that depends on one frame alone: one image of one camera, or the instruction."""
+"""Work that depends on one frame alone, one image of one camera or the instruction; and on all of these together."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -11,7 +11,7 @@ import torch
 from ttscompile.core.spec import COMMITTED, ObservationSpec
 from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.evaluate import evaluator
-from ttscompile.ir.flops import node_flops
+from ttscompile.ir.flops import graph_flops, node_flops, once_flops
 from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType, backward_slice
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Program
@@ -22,6 +22,8 @@ LEAST_FLOPS = 5_000_000
 """Of a tower, for one row. With less it costs about as much to see whether a row is new as to compute it."""
 MOST_BEFORE = 0.25
 """What is computed before the rows are there is computed at every call: this share of the tower's FLOPs at most."""
+LEAST_SHARE = 0.1
+"""Of the scene, of all that is computed before the loop, but for step values."""
 _CLOSE = 1e-3
 """Share of a tower's largest number by which batches of one and of two rows may differ: rounding is below it."""
 
@@ -45,8 +47,14 @@ class SplitFrames(Pass[Program, Program]):
     never of B, holds for any number of rows and keeps these apart: it cannot know which of them are of one stream.
     Towers of one form with the same weights, as where one encoder looks at several cameras in turn, are one.
 
+    What no number of the robot's reaches, all cameras and the instruction together, is the *scene*: most of what a
+    vision-language model does, where its state is read by the action expert alone::
+
+        scene     : %keys = language_model(%features.frame, %tokens)
+        condition : %state.token = linear(%state)
+
     Args:
-        least_flops: of a tower, for one row; what costs less stays where it is.
+        least_flops: of a tower, for one row, or of the scene, for one stream; what costs less stays where it is.
     """
 
     def __init__(self, least_flops: int = LEAST_FLOPS) -> None:
@@ -54,7 +62,7 @@ class SplitFrames(Pass[Program, Program]):
 
     def call(self, program: Program) -> PassResult[Program]:
         graph, found = program.pieces.condition, list[_Tower]()
-        if program.pieces.towers:
+        if program.pieces.towers or program.pieces.scene:
             return PassResult(program)
         observations, declined = program.spec.observations, dict[str, str]()
         lengths = {key: spec.frames or 1 for key, spec in observations.items()}
@@ -66,8 +74,13 @@ class SplitFrames(Pass[Program, Program]):
                 found.append(tower)
             else:
                 declined[tower.entries[0]] = f"%{tower.entries[0]} is left: its rows are made of several frames"
-        if not found:
-            return PassResult(program, tuple(declined.values()))
+        program, told = self._with_towers(program, found) if found else (program, ())
+        program, scene = self._with_scene(program)
+        return PassResult(program, (*told, *declined.values(), *scene))
+
+    def _with_towers(self, program: Program, found: "list[_Tower]") -> tuple[Program, tuple[str, ...]]:
+        """The program with towers of their own, and notes."""
+        graph = program.pieces.condition
         order = {node.name: i for i, node in enumerate(graph.nodes)}
         alike: dict[tuple[int, str], list[_Tower]] = {}  # what does the same with the same weights, together
         for tower in sorted(found, key=lambda one: order[one.entries[0]]):
@@ -81,7 +94,22 @@ class SplitFrames(Pass[Program, Program]):
         called = (dict(zip(group[0].entries, _together(group), strict=True)) for group in groups)
         towers = tuple(group[0].graph.renamed(names) for group, names in zip(groups, called, strict=True))
         pieces = replace(program.pieces, frames=frames, condition=condition, towers=towers)
-        return PassResult(replace(program, pieces=pieces), (*map(_note, groups), *declined.values()))
+        return replace(program, pieces=pieces), tuple(map(_note, groups))
+
+    def _with_scene(self, program: Program) -> tuple[Program, tuple[str, ...]]:
+        """The program with a scene, where it is worth while, and notes."""
+        pieces, whole = program.pieces, once_flops(program.pieces)
+        late = {key for key, spec in program.spec.observations.items() if spec.numbers}
+        changing = [key for key in pieces.condition.inputs if key == COMMITTED or key in late]
+        scene, rest = _parted(pieces.condition, changing)
+        flops, left, least = graph_flops(scene), graph_flops(rest), max(self._least, LEAST_SHARE * whole)
+        told = f"{left / 1e6:.1f} MFLOP in every call, since they read {' and '.join(f'%{key}' for key in changing)}"
+        if flops < least:
+            return program, (told,) * (left >= least and len(late) < len(program.spec.observations))
+        if pieces.frames is not None and (apart := _beside(pieces.frames, program.weights)):
+            return program, (f"the scene is left: rows %{apart[0]} are not one stream after the other",)
+        told = f"{flops / whole:.0%} of what is known before the loop, {flops / 1e6:.1f} MFLOP, once a scene"
+        return replace(program, pieces=replace(pieces, scene=scene, condition=rest)), (told,)
 
     def ensures(self, program: Program) -> None:
         """A tower reads rows and nothing else, and gives a value a row."""
@@ -99,8 +127,7 @@ class _Tower:
     Attributes:
         entries: the values whose rows it works on: one, or those of the instruction.
         rows: m, how many rows a stream has.
-        inside: names of its nodes.
-        before: names of the nodes that make the rows.
+        taken: names of its nodes, and of those that make the rows.
         exits: values that others read.
         graph: of any number of rows.
         flops: for the m rows of a stream.
@@ -108,8 +135,7 @@ class _Tower:
 
     entries: tuple[str, ...]
     rows: int
-    inside: frozenset[str]
-    before: frozenset[str]
+    taken: frozenset[str]
     exits: tuple[str, ...]
     graph: Graph
     flops: int
@@ -121,11 +147,22 @@ def _is_frame(spec: ObservationSpec) -> bool:
     return (spec.frames or 1) == 1 and (axes >= 3 or not spec.dtype.startswith("float"))
 
 
+def _parted(graph: Graph, changing: Collection[str]) -> tuple[Graph, Graph]:
+    """What none of these inputs reaches, giving values with one axis of streams; and the rest, which reads them."""
+    still, types = tuple(name for name in graph.inputs if name not in changing), graph.types()
+    exits = _following(graph, still, 1, reachable_from(graph, graph.inputs), changing)
+    scene = backward_slice(graph, exits, {})
+    outputs = tuple(name for name in graph.outputs if name not in exits)
+    rest = backward_slice(graph, outputs, {name: types[name] for name in exits})
+    left = {name: graph.inputs[name] for name in changing} or graph.inputs  # a piece has an input
+    return scene, replace(rest, inputs={**left, **rest.inputs})
+
+
 def _largest(
     graph: Graph, found: Collection[_Tower], frames: Collection[str], declined: Collection[str]
 ) -> _Tower | None:
     """The tower with the most FLOPs among what is in no other."""
-    taken = {name for tower in found for name in (*tower.inside, *tower.before)}
+    taken = {name for tower in found for name in tower.taken}
     observed, starts = reachable_from(graph, graph.inputs), list[tuple[str, ...]]()
     types = graph.types()
     alone = {key: types[key] for key in graph.inputs if key in frames}
@@ -165,8 +202,23 @@ def _begins(node: Node, types: Mapping[str, TensorType], alone: Mapping[str, Ten
 
 def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], taken: Collection[str]) -> _Tower | None:
     """All that follows from these rows alone; None if that is nothing."""
-    types, users, banned = graph.types(), graph.users(), set(taken)
+    types = graph.types()
     rows = _rows(types, entries[0])
+    exits = _following(graph, entries, rows, observed, taken)
+    own = backward_slice(graph, exits, {name: types[name] for name in entries})
+    before = backward_slice(graph, entries, {})
+    flops, spent = (sum(node_flops(node, types) for node in part.nodes) for part in (own, before))
+    if not exits or set(own.inputs) != set(entries) or spent > MOST_BEFORE * flops:
+        return None
+    names = frozenset(node.name for node in (*own.nodes, *before.nodes) if node.name in observed)
+    return _Tower(entries, rows, names, exits, _of_rows(own, rows, exits), flops)
+
+
+def _following(
+    graph: Graph, entries: tuple[str, ...], rows: int, observed: Collection[str], taken: Collection[str]
+) -> tuple[str, ...]:
+    """Of all that follows from some values alone, those that others read, which have a row for each of theirs."""
+    users, banned = graph.users(), set(taken)
     while True:
         inside, free = set(entries), set(graph.constants)
         for node in graph.nodes:
@@ -179,19 +231,11 @@ def _grow(graph: Graph, entries: tuple[str, ...], observed: Collection[str], tak
         inside.difference_update(entries)
         read_outside = {name for name in inside if any(user.name not in inside for user in users[name])}
         leaving = inside & {*read_outside, *graph.outputs}
-        exits = [node.name for node in graph.nodes if node.name in leaving]
+        exits = tuple(node.name for node in graph.nodes if node.name in leaving)
         bad = [name for name in exits if not _is_exit(graph, name, rows)]
         if not bad:
-            break
+            return exits
         banned.update(bad)
-    own = backward_slice(graph, tuple(exits), {name: types[name] for name in entries})
-    before = backward_slice(graph, entries, {})
-    flops, spent = (sum(node_flops(node, types) for node in part.nodes) for part in (own, before))
-    if not exits or set(own.inputs) != set(entries) or spent > MOST_BEFORE * flops:
-        return None
-    names = frozenset(node.name for node in own.nodes if node.name in observed)
-    earlier = frozenset(node.name for node in before.nodes)
-    return _Tower(entries, rows, names, earlier, tuple(exits), _of_rows(own, rows, exits), flops)
 
 
 def _is_exit(graph: Graph, name: str, rows: int) -> bool:
@@ -224,16 +268,22 @@ def _together(group: list[_Tower]) -> tuple[str, ...]:
 
 
 def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
-    """Observations to the rows of each tower, those of towers that are alike one after the other."""
+    """Observations to the rows of each tower: stream by stream, those of towers that are alike one after the other."""
     entries = tuple(entry for group in groups for tower in group for entry in tower.entries)
     own, types = backward_slice(graph, entries, {}), graph.types()
     nodes = list(own.nodes)
     for group in groups:
         for place, (entry, name) in enumerate(zip(group[0].entries, _together(group), strict=True)):
             if name != entry:
-                parts, (_, *row) = tuple(Ref(tower.entries[place]) for tower in group), types[entry].shape
-                type_ = replace(types[entry], shape=(Batch(len(group) * group[0].rows), *row))
-                nodes.append(Node(name, "aten.cat.default", (parts, 0), (), (type_,)))
+                (_, *row), m, parts = types[entry].shape, group[0].rows, list[Ref]()
+                for one in (tower.entries[place] for tower in group):
+                    kind, part = replace(types[entry], shape=(Batch(), m, *row)), f"{one}.of_stream"
+                    nodes.append(Node(part, "aten.reshape.default", (Ref(one), kind.shape), (), (kind,)))
+                    parts.append(Ref(part))
+                kind, whole = replace(kind, shape=(Batch(), len(group) * m, *row)), f"{name}.of_stream"
+                nodes.append(Node(whole, "aten.cat.default", (tuple(parts), 1), (), (kind,)))
+                kind = replace(kind, shape=(Batch(len(group) * m), *row))
+                nodes.append(Node(name, "aten.reshape.default", (Ref(whole), kind.shape), (), (kind,)))
     observed = {name: kind for name, kind in graph.inputs.items() if name != COMMITTED}
     return Graph(observed, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
 
@@ -248,11 +298,13 @@ def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:
             if count == 1:
                 nodes.append(Node(name, "aten.clone.default", (Ref(crossing),), (), (kind,)))
                 continue
-            apart = replace(kind, shape=(count, *kind.shape))
+            apart = replace(kind, shape=(Batch(), count, first.rows, *kind.shape[1:]))
             nodes.append(Node(f"{crossing}.apart", "aten.reshape.default", (Ref(crossing), apart.shape), (), (apart,)))
-            for i, tower in enumerate(group):
-                args = (Ref(f"{crossing}.apart"), 0, i)
-                nodes.append(Node(tower.exits[place], "aten.select.int", args, (), (kind,)))
+            own = replace(kind, shape=(Batch(), first.rows, *kind.shape[1:]))
+            for i, name in enumerate(tower.exits[place] for tower in group):
+                which, part = (Ref(f"{crossing}.apart"), 1, i), f"{name}.of_stream"
+                nodes.append(Node(part, "aten.select.int", which, (), (own,)))
+                nodes.append(Node(name, "aten.reshape.default", (Ref(part), kind.shape), (), (kind,)))
     made = {node.name for node in nodes}
     whole = replace(graph, inputs=inputs, nodes=(*nodes, *(n for n in graph.nodes if n.name not in made)))
     return replace(backward_slice(whole, graph.outputs, {}), inputs=inputs)
@@ -286,15 +338,22 @@ def _drawn(type_: TensorType, rows: int, rng: np.random.Generator) -> torch.Tens
 
 def _require_apart(each: SplitFrames, tower: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> None:
     """Raise unless a row gives the same beside another and alone."""
-    run = evaluator(tower, weights)
-    rng = np.random.default_rng(0)
-    rows = {name: _drawn(type_, 2, rng) for name, type_ in tower.inputs.items()}
+    for output in _beside(tower, weights):
+        raise each.fail(f"%{output} of a row depends on the other rows.")
+
+
+def _beside(graph: Graph, weights: Mapping[str, npt.NDArray[np.generic]]) -> list[str]:
+    """The outputs whose second half, for two rows or streams, is not what the second one gives alone."""
+    run, rng = evaluator(graph, weights), np.random.default_rng(0)
+    rows = {name: _drawn(type_, 2, rng) for name, type_ in graph.inputs.items()}
     with torch.no_grad():
-        both, alone = run(rows), run({name: value[1:] for name, value in rows.items()})
-    for output, one, other in zip(tower.outputs, both, alone, strict=True):
-        here, there = one[1:].double(), other.double()
+        both, alone = run(rows), run({name: value[len(value) // 2 :] for name, value in rows.items()})
+    wrong = list[str]()
+    for output, one, other in zip(graph.outputs, both, alone, strict=True):
+        here, there = one[len(other) :].double(), other.double()
         if not torch.allclose(here, there, rtol=0, atol=_CLOSE * float(there.abs().max()), equal_nan=True):
-            raise each.fail(f"%{output} of a row depends on the other rows.")
+            wrong.append(output)
+    return wrong
 
 
 def _note(group: list[_Tower]) -> str:

@@ -30,8 +30,8 @@ def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> di
 
     Raises:
         ArtifactError: the artifact is missing, damaged or of another version.
-        IllegalPlanError: there is no plan of this name; or it has weights of its own or begins with the chunk of the
-            call before, which a file cannot; or it is in another loop or precision than the file.
+        IllegalPlanError: there is no plan of this name; or it has weights of its own, reuses tokens or begins with the
+            chunk of the call before, which a file cannot; or it is in another loop or precision than the file.
     """
     artifact = load_artifact(path)
     name = artifact.manifest.default_plan if plan is None else plan
@@ -46,9 +46,9 @@ def inputs_of(path: str | Path, plan: str | None = None, streams: int = 1) -> di
         raise IllegalPlanError(f"{problem}. Give a plan of that loop, or use ttscompile.load.")
     record = artifact.manifest.precision
     bits, computed = (FP32, FP32) if record is None else (record.name, record.told)
-    # The file computes in the precision of ``convert``, whatever a plan says.
-    if own.precision != ({} if record is None else dict.fromkeys(record.kept, bits)):
-        problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact computes {computed}"
+    # The file computes in the precision of ``convert``, and all tokens, whatever a plan says.
+    if own.tokens is not None or own.precision != ({} if record is None else dict.fromkeys(record.kept, bits)):
+        problem = f"plan {name!r} is {own.in_words()}, and a single file of this artifact has all tokens, {computed}"
         remedy = f"Give {name.partition('@')[0] + '@' + bits!r}, or use ttscompile.load."
         raise IllegalPlanError(f"{problem}. {remedy}")
     view = view_of(artifact, own)

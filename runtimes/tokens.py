@@ -5,8 +5,8 @@ held against these pixels, not against the frame before, so that slow changes ad
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,8 +23,15 @@ Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
 Renew: TypeAlias = Callable[[str, Mapping[str, Array], Mapping[str, Array]], tuple[Array, ...]]
 """A piece for some tokens, by its name, on inputs and on what is kept, by theirs; its other outputs in order. What is
 kept gets its new rows where it is."""
-Lane: TypeAlias = bytes
-"""One camera of one stream."""
+
+
+class Lane(NamedTuple):
+    """One camera of one stream: its key, and the observations that show it; empty where they cannot be told apart."""
+
+    key: bytes
+    camera: str = ""
+    stream: int = 0
+
 
 EIGHTHS = (1, 2, 3, 4, 6)
 """A frame is computed for so many eighths of its tokens, or for all: few shapes, so that one was met before."""
@@ -33,6 +40,36 @@ EIGHTHS = (1, 2, 3, 4, 6)
 def sizes_of(tokens: int) -> tuple[int, ...]:
     """For how many of a tower's tokens a frame may be computed, ascending."""
     return (*(-(-tokens * count // 8) for count in EIGHTHS), tokens)
+
+
+@dataclass(frozen=True)
+class TokenWork:
+    """How many tokens were computed for a new frame, and why.
+
+    Attributes:
+        of: how many it has.
+        first: since it is the first of its lane.
+        refresh: since so many frames of the lane before it were not computed whole.
+        changed: since their patches changed.
+        filled: with these: those without a patch, and the next most changed, so that there are few shapes.
+        forward: that took the rows of a computed one (FORWARD). The others kept their own (ROLLOUT).
+        camera: the observations that show it.
+        stream: of the batch.
+    """
+
+    of: int
+    first: int = 0
+    refresh: int = 0
+    changed: int = 0
+    filled: int = 0
+    forward: int = 0
+    camera: str = ""
+    stream: int = 0
+
+    @property
+    def computed(self) -> int:
+        """All that were computed."""
+        return self.first + self.refresh + self.changed + self.filled
 
 
 @dataclass(frozen=True)
@@ -81,11 +118,8 @@ class TokenTower:
 
     Args:
         names: of the piece that makes of a row what patches are cut from, and of the piece for some tokens.
-        record: of the tokens.
-        reuse: when a token is computed.
         forward: whether the piece writes rows of computed tokens to others, too. One of an older artifact does not.
-        run: the first of these.
-        renew: the second.
+        run, renew: the first and the second of these.
     """
 
     def __init__(
@@ -112,21 +146,16 @@ class TokenTower:
             computed, forward = np.isin(numbers, kept.index), np.isin(numbers, kept.forward)
             yield Seen(kept.pixels.copy(), computed, forward, self._record.patch, kept.number)
 
-    def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int, int]:
-        """What the tower gives for a new frame, and how many tokens were computed and took a computed one's rows.
+    def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], TokenWork]:
+        """What the tower gives for a new frame, a row ``[1, ...]`` by the input of the frame piece, and what was done.
 
-        Args:
-            lane: of the frame. What is kept of it is gone if this fails.
-            row: ``[1, ...]``, by the input of the frame piece.
-
-        Raises:
-            ArtifactError: the manifest cuts the picture into other patches than there are tokens.
+        What is kept of the lane is gone if this fails.
         """
         kept = self._lanes.pop(lane, None)
         (pixels,) = self._run(self._pixels, row)
         if kept is None:
             self._require_patches(pixels[0])
-        index, off = self._changed(kept, pixels[0])
+        index, off, work = self._changed(kept, pixels[0])
         if kept is None:
             nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
             kept = _Kept(pixels[0], nothing, (), index, index[:0])
@@ -145,23 +174,25 @@ class TokenTower:
             y, x = np.divmod(index[self._record.fixed :] - self._record.fixed, ours.shape[2])
             theirs[:, y, x] = ours[:, y, x]
         kept.index, self._lanes[lane] = index, kept
-        return kept.values, len(index), len(kept.forward)
+        return kept.values, replace(work, forward=len(kept.forward), camera=lane.camera, stream=lane.stream)
 
-    def _changed(self, kept: _Kept | None, pixels: Array) -> tuple[Array, Array]:
-        """Numbers of the tokens to compute, int64; none where no patch changed. And by how much each patch differs.
+    def _changed(self, kept: _Kept | None, pixels: Array) -> tuple[Array, Array, TokenWork]:
+        """Numbers of the tokens to compute, int64, none where no patch changed; how much each patch differs; and why.
 
         Of a frame that is computed whole anyway nobody asks how much differs, and nothing is said.
         """
         fixed, tokens = self._record.fixed, self.tokens
         if kept is None or kept.age + 1 >= self._reuse.refresh:
-            return np.arange(tokens), np.zeros(0, np.float32)
+            why = TokenWork(tokens, first=tokens) if kept is None else TokenWork(tokens, refresh=tokens)
+            return np.arange(tokens), np.zeros(0, np.float32), why
         off = self._differences(pixels, kept.pixels)
-        changed = np.count_nonzero(off > self._reuse.threshold)
+        changed = int(np.count_nonzero(off > self._reuse.threshold))
         if not changed:
-            return np.arange(0), off
+            return np.arange(0), off, TokenWork(tokens)
         size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
         most = np.argpartition(-off, size - fixed - 1)[: size - fixed] if size < tokens else np.arange(tokens - fixed)
-        return np.concatenate([np.arange(fixed), fixed + np.sort(most)]), off
+        index = np.concatenate([np.arange(fixed), fixed + np.sort(most)])
+        return index, off, TokenWork(tokens, changed=changed, filled=size - changed)
 
     def _similar(self, old: Array, new: Array, index: Array, off: Array) -> tuple[Array, Array]:
         """Tokens that take the rows of a computed one, and which one each takes, as a place in ``index``.

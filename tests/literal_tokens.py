@@ -1,20 +1,90 @@
 """What reusing tokens means, literally: every value of the tower is computed whole, and then most of it is thrown away.
 
 In a value that has a row for each token, the rows of tokens that are not computed are those that it had when they were,
-or those that a computed token has now.
+or those that a computed token has now. Which tokens these are is said patch by patch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from ttscompile.core.plan import TokenReuse
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import GETITEM, Graph, Ref
 from ttscompile.ir.tokens import find_tokens
+
+Array = npt.NDArray[np.float32]
+EIGHTHS = (1, 2, 3, 4, 6, 8)
+NEAR = 1e-6
+"""Differences of pixels that are nearer than this may be ordered either way: they are rounded."""
+
+
+class LiteralChoice:
+    """Which tokens of a lane's frames are computed, and which have rows of a computed one.
+
+    Args:
+        reuse: of the plan.
+        fixed: how many tokens have no patch; they come first.
+        patch: height and width of one.
+    """
+
+    def __init__(self, reuse: TokenReuse, fixed: int, patch: tuple[int, int]) -> None:
+        self.reuse, self.fixed, self.patch = reuse, fixed, patch
+        self.shown = dict[int, Array]()  # by token, the patch that it was last computed for
+        self.age = 0
+
+    def require(self, pixels: Array, computed: Collection[int], similar: Mapping[int, int]) -> dict[str, int]:
+        """Raise AssertionError unless just these may be computed for a frame ``[C, H, W]``; how many of them why."""
+        (high, wide), (_, height, width) = self.patch, pixels.shape
+        cut = [pixels[:, y : y + high, x : x + wide] for y in range(0, height, high) for x in range(0, width, wide)]
+        new, whole = dict(enumerate(cut, self.fixed)), self.fixed + len(cut)
+        why = "" if self.shown else "first"
+        if self.shown and self.age + 1 == self.reuse.refresh:
+            why = "refresh"
+        if why:
+            assert sorted(computed) == list(range(whole)) and not similar
+            self.shown, self.age = new, 0
+            return {why: whole}
+        off = {token: np.abs(new[token] - self.shown[token]).mean(dtype=np.float64) for token in new}
+        changed = {token for token in new if off[token] > self.reuse.threshold}
+        self.age += 1
+        if not changed:
+            assert not computed and not similar
+            return {}
+        size = next(n for n in (-(-whole * eighths // 8) for eighths in EIGHTHS) if n >= self.fixed + len(changed))
+        assert len(set(computed)) == len(computed) == size
+        assert {*range(self.fixed), *changed} <= set(computed), "and the next most changed"
+        left = set(new) - set(computed)
+        assert min(off[token] for token in new if token in computed) >= max((off[t] for t in left), default=0) - NEAR
+        self._require_similar(new, sorted(set(new) & set(computed)), [t for t in left if off[t] > 0], similar, size)
+        self.shown |= {token: new[token] for token in new if token in computed}
+        self.age = 0 if size == whole else self.age
+        return {"changed": len(changed), "filled": size - len(changed)}
+
+    def _require_similar(
+        self,
+        new: Mapping[int, Array],
+        computed: Sequence[int],
+        others: Sequence[int],
+        similar: Mapping[int, int],
+        most: int,
+    ) -> None:
+        """Those that gain most, of those whose nearest computed patch is nearer than what they were computed for."""
+
+        def apart(one: Array, other: Array) -> float:
+            return float(np.square(one - other).mean(dtype=np.float64))
+
+        nearest = {token: min(apart(new[token], new[one]) for one in computed) for token in others}
+        gain = {token: apart(new[token], self.shown[token]) - nearest[token] for token in others}
+        assert set(similar) <= set(others) and set(similar.values()) <= set(computed) and len(similar) <= most
+        for token, source in similar.items():
+            assert apart(new[token], new[source]) <= nearest[token] + NEAR and gain[token] > -NEAR
+        least = min((gain[token] for token in similar), default=0.0) if len(similar) == most else 0.0
+        assert all(gain[token] <= least + NEAR for token in others if token not in similar)
 
 
 class LiteralTokens:

@@ -176,12 +176,9 @@ def compile_denoiser(
             stays in the artifact too, for plan ``dense``. What it does to the actions is not measured here:
             ``calibrate(..., learn=("precision",))`` does, and leaves out the parts that change them too much.
         keep_fp32: parts that stay in fp32 whatever the precision: ``blocks``; ``prologue``, or a piece of it by name,
-            ``frame_00``, ``condition`` or ``step``.
+            ``frame_00``, ``scene``, ``condition`` or ``step``.
         single_file: see ``convert``; of the policy's own loop.
         explain: told what each stage did.
-
-    Returns:
-        The compiled program.
 
     Raises:
         TtscompileError: it cannot be captured, it has no residual blocks, or the artifact cannot be written.
@@ -246,7 +243,9 @@ def _compile(
         except OSError as error:
             told = f"the single file cannot be written: {error}"
             raise ArtifactError(f"{single_file}: {told}. Give another path.") from error
-        explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB",))
+        other = "reuse tokens, " * bool(program.pieces.tokens) + "have weights of their own or begin with"
+        told = f"it runs plans of loop {loop!r} in {precision}, but none that {other} the chunk of the call before"
+        explain("write_single_file", (f"{len(whole) / 1e6:.1f} MB", f"{told}: ttscompile.load runs these"))
     return program
 
 

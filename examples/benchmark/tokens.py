@@ -36,7 +36,7 @@ from ttscompile.ir.graph import backward_slice
 from ttscompile.ir.pieces import INDEX, NOT_KEPT, PIXELS, PLACES, ROWS, renewed_name
 from ttscompile.ir.tokens import find_tokens
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
-from ttscompile.lower.program import lower_graph
+from ttscompile.lower.program import lower_graphs
 from ttscompile.passes.clean_up import clean_graph
 from ttscompile.passes.reuse_tokens import for_tokens
 from ttscompile.policies.networks.clip import ClipVision, VisionConfig
@@ -131,7 +131,7 @@ def alone(name: str, precisions: Sequence[str], rounds: int) -> list[str]:
     given = {name: np.zeros(part.types()[name].at(1), np.float32) for name in tower.outputs} | kept
     rows = []
     for precision in precisions:
-        models, more = [lower_graph(tower, "whole"), lower_graph(part, "tokens")], dict[str, Array]()
+        models, more = list(lower_graphs({"whole": tower, "tokens": part}).values()), dict[str, Array]()
         if precision == "int8":
             models[0], _ = quantize_model(models[0], weights, LEAST_ROWS)
             models[1], more = quantize_model(models[1], weights, LEAST_ROWS, stream.tokens)  # as the product does

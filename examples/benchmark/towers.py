@@ -31,7 +31,7 @@ from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.pieces import CONDITION
 from ttscompile.lower.integer_attention import HEADS
 from ttscompile.lower.precision import LEAST_ROWS, quantize_model
-from ttscompile.lower.program import lower_graph
+from ttscompile.lower.program import lower_graphs
 from ttscompile.policies.networks.clip import ClipVision, VisionConfig
 from ttscompile.policies.networks.resnet import group_norm, resnet
 from ttscompile.policies.networks.siglip import Siglip, SiglipConfig
@@ -72,7 +72,7 @@ def measure(title: str, tower: nn.Module, size: int, rounds: int, profiled: bool
         chunk=ChunkSpec(2, 0, 4),
     )
     graph, weights = capture(module, spec)
-    model = lower_graph(graph, CONDITION)
+    model = lower_graphs({CONDITION: graph})[CONDITION]
     integer, more = quantize_model(model, weights, LEAST_ROWS)
     draw = np.random.default_rng(0)
     given = {"sample": np.zeros((1, 4, 2), np.float32), "timestep": np.zeros(1, np.float32)}

@@ -18,7 +18,7 @@ import variants
 from environments import Array
 
 from ttscompile.runtimes.frames import FramePieces
-from ttscompile.runtimes.tokens import Lane, TokenTower
+from ttscompile.runtimes.tokens import Lane, TokenTower, TokenWork
 
 
 class OneCamera:
@@ -46,16 +46,16 @@ class OneCamera:
                 self._lanes[streams] = self._of_camera(frames, name, obs)
         return self._values(frames, obs)
 
-    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int, int]:
+    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], TokenWork]:
         """See ``TokenTower``."""
         own = any(lane in lanes for lanes in self._lanes.values())
         known = lane in tower._lanes
         if not own:
             tower._lanes.pop(lane, None)
-        values, count, forward = self._compute(tower, lane, row)
+        values, work = self._compute(tower, lane, row)
         if own and known:
-            self.computed += count, tower.tokens
-        return values, count, forward
+            self.computed += work.computed, work.of
+        return values, work
 
     def _of_camera(self, frames: FramePieces, name: str, obs: Mapping[str, Array]) -> set[Lane]:
         """The lanes whose rows change with the pictures of the camera."""

@@ -25,7 +25,7 @@ from environments import Array
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import update_plans
 from ttscompile.core.plan import DENSE, TokenReuse
-from ttscompile.runtimes.tokens import Lane, TokenTower
+from ttscompile.runtimes.tokens import Lane, TokenTower, TokenWork
 
 REFRESH = 32
 """Of so many new frames one is whole: the most that calibration takes."""
@@ -48,13 +48,13 @@ class Counted:
         if self._kept:
             setattribute(TokenTower, "_similar", lambda tower, old, new, index, off: (index[:0], index[:0]))
 
-    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], int, int]:
+    def compute(self, tower: TokenTower, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], TokenWork]:
         """See ``TokenTower``."""
         known = lane in tower._lanes
-        values, count, forward = self._compute(tower, lane, row)
+        values, work = self._compute(tower, lane, row)
         if known:
-            self.computed.setdefault(tower._reuse.threshold, np.zeros(2, np.int64))[:] += count, tower.tokens
-        return values, count, forward
+            self.computed.setdefault(tower._reuse.threshold, np.zeros(2, np.int64))[:] += work.computed, work.of
+        return values, work
 
 
 @click.command(context_settings={"ignore_unknown_options": True})

@@ -184,6 +184,11 @@ def statistics(plan: str, copied: dict[str, Any], identity: str = "") -> Executo
     return ExecutorStatistics(plan=plan, identity=identity, **{**copied, **summaries})
 
 
+def tokens_of(work: FrameWork | None) -> dict[str, Any]:
+    """Of each new frame whose tokens are reused how many were computed, and why, as arguments of an event."""
+    return {"tokens": [asdict(one) for one in work.by_camera]} if work and work.by_camera else {}
+
+
 Event: TypeAlias = tuple[str, str, int, float, float, Mapping[str, Any] | None]
 """Phase, name, thread, start and duration in seconds, arguments."""
 
@@ -211,7 +216,8 @@ class Trace:
 
     def frame(self, start: float, end: float, work: FrameWork) -> None:
         """What depends on a frame alone was computed before the call that reads it."""
-        self.span(WORKER, "frame", start, end - start, {"computed": work.computed, "known": work.remembered})
+        known = {"computed": work.computed, "known": work.remembered}
+        self.span(WORKER, "frame", start, end - start, known | tokens_of(work))
 
     def call(self, start: float, end: float, args: Mapping[str, Any], timings: Timings | None) -> None:
         """A call of the policy, with its parts if there is a report of them."""

@@ -22,7 +22,7 @@ from .feasibility import Feasibility, LatencyWindow, fast_enough
 from .measure import Clock, measure_latencies
 from .settings import Policy, Resolved, SeeingPolicy, require_number
 from .state import ExecutorState, Job
-from .statistics import Trace
+from .statistics import Trace, tokens_of
 from .window import Frame
 
 
@@ -236,8 +236,9 @@ class Worker:
             args = {"plan": job.plan, "epoch": job.epoch, "chunk": outcome}
             args |= {"stalled": True} if job.stalled else {}
             args |= {"outside": True} if far else {}
-            if self._seeing and report is not None:
-                frames = report.frames
+            frames = getattr(report, "frames", None)
+            args |= tokens_of(frames)
+            if self._seeing and frames is not None:
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}
             self._trace.call(job.started, now, args, None if report is None else report.timings)
 

@@ -35,10 +35,6 @@ class OnnxBackend:
         frames: what depends on one frame alone.
         sessions: by piece; those of single blocks only once a plan needs them.
         workspace: of the batch size under way; None after one that found no memory.
-
-    Raises:
-        RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
-        ArtifactError: onnxruntime refuses a graph.
     """
 
     def __init__(self, view: View, sessions: Sessions, known: dict[object, FramePieces]) -> None:
@@ -56,7 +52,6 @@ class OnnxBackend:
         self._some: dict[int, Workspace] = {}  # for streams of a batch that follow a plan of their own
 
     def lower(self, plan: PlanArray) -> Instructions:
-        """See ``Backend.lower``."""
         return self._lowered.get(plan.tobytes()) or instructions_of(plan, self._manifest.groups)
 
     def prepare(self, streams: int, plans: Sequence[Instructions] | None) -> None:
@@ -72,25 +67,20 @@ class OnnxBackend:
             self._blocks = True
 
     def start(self, call: Call) -> None:
-        """See ``Backend.start``."""
         self._keep = call.keep
         obs = {**call.obs, **self.frames.values(call.obs)} if call.obs else {}
         self._work.start(obs, call.noise, call.correction, call.known)
 
     def condition(self) -> FloatArray:
-        """See ``Backend.condition``."""
         return self._work.condition()
 
     def logits(self) -> FloatArray:
-        """See ``Backend.logits``."""
         return self._work.logits()
 
     def first_step(self) -> None:
-        """See ``Backend.first_step``."""
         decode_first(self._work, self._keep)
 
     def other_steps(self, plans: Sequence[Instructions]) -> FloatArray:
-        """See ``Backend.other_steps``."""
         streams = by_plan(plans)
         if len(streams) == 1:
             decode_rest(self._work, plans[0], self._keep)

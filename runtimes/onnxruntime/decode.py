@@ -19,9 +19,7 @@ from .workspace import Workspace
 def decode_first(work: Workspace, keep: BoolArray) -> None:
     """Step 0, which is dense in every plan, so that it need not wait for one.
 
-    Args:
-        work: observation and noise taken in.
-        keep: bool ``[K, blocks]``; computed residuals that go into the rollout cache.
+    Computed residuals of the cells ``keep``, bool ``[K, blocks]``, go into the rollout cache.
     """
     work.begin()
     _run_dense(work, 0, keep)
@@ -94,7 +92,7 @@ class _Operands:
 
     def __init__(self, work: Workspace, lowered: Instructions) -> None:
         self.lowered = lowered
-        self.hidden, self.current = _flat(work.stream, 0), _flat(work.current, 1)
+        self.hidden, self.current = _flat(work.hidden, 0), _flat(work.current, 1)
         self._table, self._sums = _flat(work.table, 1), _flat(work.sums(lowered.slots), 1)
         self._summed = self._table if lowered.table else self.current
         self._gaps, self._loads = iter(lowered.gaps), zip(lowered.load_rows, lowered.load_from, strict=True)

@@ -23,27 +23,20 @@ WORTH = 3
 
 
 class IdleSteps:
-    """Arrays for B streams.
-
-    Args:
-        session: of the piece ``idle``.
-        sampler: of the policy.
-        sample: ``(T, D)``.
-        streams: B.
-        stream: shape of the residual stream of all streams.
+    """Arrays for B streams, whose residual stream has the shape ``hidden``, and samples ``(T, D)``.
 
     Attributes:
-        total: what the steps add to the stream, of its shape; read by ``prepare``.
+        total: what the steps add to the residual stream, of its shape; read by ``prepare``.
         history: of the correction, ``[D, B, 4 T]``, as it is after the last step that was run.
     """
 
     def __init__(
-        self, session: Any, sampler: SamplerTable, sample: tuple[int, int], streams: int, stream: tuple[int, ...]
+        self, session: Any, sampler: SamplerTable, sample: tuple[int, int], streams: int, hidden: tuple[int, ...]
     ) -> None:
         horizon, dimensions = sample
         self._horizon, self._memories = horizon, sampler.memories
         shape = (dimensions, streams, horizon)
-        self.total = np.zeros(stream, np.float32)
+        self.total = np.zeros(hidden, np.float32)
         product, shift = session.run([PRODUCT, SHIFT], {TOTAL: self.total})
         self._product, self._shift = np.ascontiguousarray(product), np.broadcast_to(shift, shape).copy()
         self._held = not product.any()  # the prediction is the total's, whatever the sample is

@@ -72,21 +72,13 @@ class Sessions:
         self._careful: dict[str, bool] = {}
 
     def of(self, view: View, blocks: bool = True) -> dict[str, Any]:
-        """What runs each ONNX piece of a view, by name: an ``InferenceSession``, or a ``JointBlock``.
-
-        Args:
-            blocks: single blocks, too; else ``of_blocks`` may open them later.
-
-        Raises:
-            RuntimeUnavailableError: onnxruntime is missing, other code has made its global thread pool, or the
-                environment has it ignore options.
-            ArtifactError: onnxruntime refuses a graph.
-        """
+        """What runs each ONNX piece, by name, an ``InferenceSession`` or a ``JointBlock``; of ``blocks`` if asked."""
         manifest = view.manifest
         single = {kinds.block_name(b) for b in range(len(manifest.blocks))}
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
         unused = filter(kinds.of_tokens, manifest.pieces) if view.variant.tokens is None else manifest.tokens
         others = set(filter(kinds.is_of_loop, manifest.pieces))
+        others |= {name for name, piece in manifest.pieces.items() if not piece.outputs}  # nothing is left to compute
         once = set(manifest.pieces) - single - {kinds.JOINT, kinds.LAYERS} - set(unused) - others
         contents = _contents(view)
         sessions = {piece: self._session(view, piece, contents) for piece in sorted(once)}
@@ -94,20 +86,12 @@ class Sessions:
         return sessions | self._of_blocks(view, contents) if blocks else sessions
 
     def of_blocks(self, view: View) -> dict[str, Any]:
-        """What runs single blocks, by name, some time after the artifact was loaded.
-
-        Raises:
-            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
-        """
+        """What runs single blocks, by name, some time after the artifact was loaded."""
         with view.artifact.reading():
             return self._of_blocks(view, _contents(view))
 
     def of_layers(self, view: View) -> dict[str, Any]:
-        """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``.
-
-        Raises:
-            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses the graph.
-        """
+        """What runs the piece ``layers``, by its name, some time after the artifact was loaded; for ``verify``."""
         with view.artifact.reading():
             return {kinds.LAYERS: self._session(view, kinds.LAYERS, _contents(view))}
 
@@ -228,11 +212,9 @@ _TURNS = (np.array(False), np.array(True))
 
 @dataclass(frozen=True)
 class JointBlock:
-    """One block of the session that holds all blocks; takes and gives what the block's own session would.
+    """One block of the session of the piece ``blocks``; takes and gives what the block's own session would.
 
-    Attributes:
-        session: an ``InferenceSession`` of the piece ``blocks``.
-        blanks: by number of streams, zeros for contexts that a block does not read.
+    For contexts that it does not read there are zeros, by number of streams.
     """
 
     session: Any
@@ -293,11 +275,7 @@ def _binding(session: Any, inputs: Mapping[str, Array], outputs: Mapping[str, Ar
 
 
 def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Run a session on arrays of the moment; its outputs by name.
-
-    Raises:
-        ArtifactError: the graph does not do what the manifest says.
-    """
+    """Run a session on arrays of the moment; its outputs by name."""
     try:
         return dict(zip(outputs, session.run(list(outputs), dict(inputs)), strict=True))
     except Exception as error:
@@ -307,11 +285,7 @@ def run_named(session: Any, outputs: Sequence[str], inputs: Mapping[str, Array])
 def run_piece(
     sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], name: str, inputs: Mapping[str, Array]
 ) -> tuple[Array, ...]:
-    """Run a piece on arrays of the moment; its outputs in order. For who must not hold on to a backend, see ``frames``.
-
-    Raises:
-        ArtifactError: the graph does not do what the manifest says.
-    """
+    """Run a piece on arrays of the moment, outputs in order: for ``frames``, which must not hold on to a backend."""
     return tuple(run_named(sessions[name], pieces[name].outputs, inputs).values())
 
 
@@ -325,9 +299,6 @@ def renew_piece(
     """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
 
     A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else.
-
-    Raises:
-        ArtifactError: the graph does not do what the manifest says. What is kept may have some of the new rows.
     """
     into = {kinds.renewed_name(key): array for key, array in kept.items()}
     given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]
@@ -352,12 +323,10 @@ def _failed(error: Exception) -> ArtifactError:
 def run_prologue(
     sessions: Mapping[str, Any], pieces: Mapping[str, PieceRecord], obs: Mapping[str, Array], contexts: ContextValues
 ) -> None:
-    """Keep what the normalised observations ``[B, ...]`` decide before the loop.
-
-    Raises:
-        ArtifactError: the graphs do not do what the manifest says.
-    """
+    """Keep what the normalised observations ``[B, ...]`` decide before the loop."""
     condition, step = pieces[kinds.CONDITION], pieces.get(kinds.STEP)
+    if kinds.SCENE in pieces:
+        contexts.keep((name, obs[name]) for name in pieces[kinds.SCENE].outputs)
     if condition.outputs:
         feed = {name: np.ascontiguousarray(obs[name]) for name in condition.inputs}
         contexts.keep(run_named(sessions[kinds.CONDITION], condition.outputs, feed).items())

@@ -2,8 +2,8 @@
 
 A block writes its residual to its row of ``current``, and nothing else of the call is kept: what TIMESTEP and FORWARD
 read is always the last residual that some block computed. Entries of the rollout cache are copies, made only of those
-that a later call can read. Sessions are bound once, before the first call: a block always reads the same stream and the
-same context buffers, to which the values of the step are copied.
+that a later call can read. Sessions are bound once, before the first call: a block always reads the same residual
+stream and the same context buffers, to which the values of the step are copied.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ KEPT_CORRECTIONS = 64
 class Workspace:
     """Buffers and bindings for B streams.
 
-    ``stem`` and ``advance`` write the stream of a step to ``fresh``; the blocks and ``advance`` read ``stream``. The
+    ``stem`` and ``advance`` write a step's residual stream to ``fresh``; blocks and ``advance`` read ``hidden``. The
     sample has two buffers, taken in turn: step k reads that of ``k % 2``, and ``advance`` writes the other.
 
     Attributes:
         sample: two arrays ``[D, B, T]``.
         fresh: the residual stream as a step begins.
-        stream: the residual stream after what was added to it.
-        current: float32 ``[blocks, *stream]``, what each block computed last.
-        table: float32 ``[blocks, *stream]``, what each reused block adds at the moment.
+        hidden: the residual stream after what was added to it.
+        current: float32 ``[blocks, *hidden]``, what each block computed last.
+        table: float32 ``[blocks, *hidden]``, what each reused block adds at the moment.
         rollout: entries of the rollout cache by flat index ``k * blocks + b``: copies of computed residuals that a
             later call of the episode can read. One is made when it is first kept, and stays for the next episodes.
         idle: for steps without a computed block; None if the network is of another form.
@@ -59,7 +59,7 @@ class Workspace:
         horizon, dimensions = manifest.spec.sample
         self.sample = [np.zeros((dimensions, streams, horizon), np.float32) for _ in range(2)]
         self._initial = np.zeros((streams, horizon, dimensions), np.float32)
-        self.fresh, self.stream = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self.fresh, self.hidden = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self.current = np.zeros((count, *shape), np.float32)
         self.table = np.zeros((count, *shape), np.float32)
         self.rollout: dict[int, Array] = {}
@@ -127,7 +127,7 @@ class Workspace:
         return np.asarray(made[piece.outputs[0]], dtype=np.float32)
 
     def advance(self, k: int) -> None:
-        """Tail, sampler, correction, and the next step's stem: reads ``stream``, writes ``fresh`` and a sample."""
+        """Tail, sampler, correction, and the next step's stem: reads ``hidden``, writes ``fresh`` and a sample."""
         self._advance.steps[k].run()
         if self._advance.anchors[k]:
             remember(self._history, self.sample[k % 2], self._prediction)
@@ -161,7 +161,7 @@ class Workspace:
         self._offset[landing] += added
 
     def leave_idle(self, k: int) -> None:
-        """Take the state of step k back from ``idle``, and make the stream as that step begins."""
+        """Take the state of step k back from ``idle``, and make the residual stream as that step begins."""
         assert self.idle is not None
         self.idle.leave(self.sample[k % 2], self._history, self._memory[k % 2] if self._memory else None)
         if k < self._steps:
@@ -175,14 +175,14 @@ class Workspace:
     def entry(self, cell: int) -> Array:
         """An entry of the rollout cache; a new one holds zeros."""
         if cell not in self.rollout:
-            self.rollout[cell] = np.full(self.stream.shape, 0.0, np.float32)  # which commits its pages now
+            self.rollout[cell] = np.full(self.hidden.shape, 0.0, np.float32)  # which commits its pages now
         return self.rollout[cell]
 
     def bind_blocks(self) -> None:
         """Make what running a single block would have to make; ``sessions`` has those of single blocks."""
         names = map(block_name, range(len(self.current)))
         self._blocks = [
-            BoundBlock(self._sessions[name], self._manifest.pieces[name], self._contexts, self.stream, residual)
+            BoundBlock(self._sessions[name], self._manifest.pieces[name], self._contexts, self.hidden, residual)
             for name, residual in zip(names, self.current, strict=True)
         ]
 
@@ -192,16 +192,16 @@ class Workspace:
         if bound is None:
             piece = self._manifest.pieces[DENSE_STEP]
             inputs = {CONTEXT + name: self._contexts.at(name, k) for name in piece.contexts} | {STREAM: self.fresh}
-            outputs = dict(zip(piece.outputs, (self.stream, *self.current), strict=True))
+            outputs = dict(zip(piece.outputs, (self.hidden, *self.current), strict=True))
             bound = self._dense[k] = Bound(self._sessions[DENSE_STEP if k else FIRST_STEP], inputs, outputs)
         return bound
 
     def run_dense(self, k: int) -> None:
-        """All blocks at step k for all streams: reads ``fresh``, writes ``stream`` and ``current``."""
+        """All blocks at step k for all streams: reads ``fresh``, writes ``hidden`` and ``current``."""
         self.bind_dense(k).run()
 
     def run(self, k: int, b: int) -> None:
-        """Block b at step k for all streams: reads ``stream``, writes ``current[b]``."""
+        """Block b at step k for all streams: reads ``hidden``, writes ``current[b]``."""
         self._blocks[b].run(k)
 
     def take(self, whole: Workspace, streams: Sequence[int], cells: Iterable[int]) -> None:
@@ -222,14 +222,14 @@ class Workspace:
     def _left_by_step_0(self, cells: Iterable[int]) -> list[Array]:
         """What the steps after step 0 go on from, with the streams first: views."""
         state = [(self.sample[1], 1), (self._history, 1), (self._offset, 2), *((each, 1) for each in self._memory[1:])]
-        stream = [(self.fresh, 0), (self.current, 1), *((self.entry(cell), 0) for cell in cells)]
-        state += [(array, self._axis + before) for array, before in stream]
+        residuals = [(self.fresh, 0), (self.current, 1), *((self.entry(cell), 0) for cell in cells)]
+        state += [(array, self._axis + before) for array, before in residuals]
         return [np.moveaxis(array, axis, 0) for array, axis in state]
 
     def sums(self, count: int) -> Array:
-        """Room for sums, float32 ``[>= count, *stream]``; what was in it is lost when it grows."""
+        """Room for sums, float32 ``[>= count, *hidden]``; what was in it is lost when it grows."""
         if len(self._sums) < count:
-            self._sums = np.zeros((count, *self.stream.shape), np.float32)
+            self._sums = np.zeros((count, *self.hidden.shape), np.float32)
         return self._sums
 
     def advances_with(self, correction: Correction | None, known: Known | None = None) -> _Advances:
@@ -252,9 +252,9 @@ class Workspace:
 
     def _bind_advance(self, k: int, update: Array) -> Bound:
         piece = self._manifest.pieces[ADVANCE]
-        following = min(k + 1, self._steps - 1)  # after the last step there is no stream to make; it is not read
+        following = min(k + 1, self._steps - 1)  # after the last step no residual stream is made or read
         inputs = {
-            STREAM: self.stream,
+            STREAM: self.hidden,
             pieces.SAMPLE: self.sample[k % 2],
             pieces.OFFSET: self._offset[k],
             pieces.HISTORY: self._history,
@@ -278,10 +278,10 @@ class Workspace:
 
 
 class BoundBlock:
-    """A block bound to the stream that it reads and the residual that it writes, of all streams."""
+    """A block bound to the residual stream that it reads and the residual that it writes, of all streams."""
 
     def __init__(
-        self, session: Any, piece: PieceRecord, contexts: ContextValues, stream: Array, residual: Array
+        self, session: Any, piece: PieceRecord, contexts: ContextValues, hidden: Array, residual: Array
     ) -> None:
         self._by_step: list[tuple[Array, Array]] = []  # where it is read from, and one value a step
         read: dict[str, Array] = {name: contexts.at(name, 0) for name in piece.contexts}
@@ -289,10 +289,10 @@ class BoundBlock:
             read[name] = read[name].copy()
             self._by_step.append((read[name], contexts.values[name]))
         assert piece.stream is not None
-        self._bound = Bound(session, {piece.stream: stream, **read}, {piece.outputs[0]: residual})
+        self._bound = Bound(session, {piece.stream: hidden, **read}, {piece.outputs[0]: residual})
 
     def run(self, k: int) -> None:
-        """Run at step k on the stream as it is."""
+        """Run at step k on the residual stream as it is."""
         for to, values in self._by_step:
             np.copyto(to, values[k])
         self._bound.run()

@@ -32,7 +32,6 @@ class ReferenceBackend:
         """Nothing: torch takes memory as it goes."""
 
     def start(self, call: Call) -> None:
-        """See ``Backend.start``."""
         self._call = call
         if not call.obs:
             return
@@ -40,12 +39,10 @@ class ReferenceBackend:
             self._contexts = self.model.prologue({key: torch.from_numpy(np.array(a)) for key, a in call.obs.items()})
 
     def condition(self) -> FloatArray:
-        """See ``Backend.condition``."""
         with fitting(self._view), torch.no_grad():
             return np.asarray(self.model.condition(self._contexts).numpy(), dtype=np.float32)
 
     def logits(self) -> FloatArray:
-        """See ``Backend.logits``."""
         with fitting(self._view), torch.no_grad():
             return np.asarray(self.model.logits(self._contexts).numpy(), dtype=np.float32)
 
@@ -53,7 +50,6 @@ class ReferenceBackend:
         """Nothing: the model takes all steps at once."""
 
     def other_steps(self, plans: Sequence[PlanArray]) -> FloatArray:
-        """See ``Backend.other_steps``."""
         call = self._call
         cache = RolloutCache(self._residuals if call.written.any() else {}, call.written)
         noise = noise_tensors(call.noise, self._view.manifest.spec.sampler.stochastic)

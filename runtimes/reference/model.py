@@ -23,8 +23,8 @@ from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import IllegalPlanError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.graph import TensorType, backward_slice
-from ttscompile.ir.pieces import CONDITION, LoopPiece
-from ttscompile.ir.program import Binding, Pieces, frame_values
+from ttscompile.ir.pieces import LoopPiece
+from ttscompile.ir.program import Binding, Pieces, once_values
 from ttscompile.runtimes.inpainting import Known
 
 from .reuse import Caches, Cell, RolloutCache, reuse, stream_axis
@@ -43,16 +43,12 @@ class Contexts:
 
 
 Blocks = Callable[[int, Tensor], Tensor]
-"""From a step and the residual stream after its stem to the stream after its last block."""
+"""From a step and the residual stream after its stem to the residual stream after its last block."""
 
 
 @dataclass(frozen=True)
 class Denoised:
-    """Result of one call.
-
-    Attributes:
-        samples: the sample ``[B, T, D]`` after each step, K of them.
-    """
+    """Result of one call; ``samples`` are those ``[B, T, D]`` after each of the K steps."""
 
     samples: tuple[Tensor, ...]
     cache: RolloutCache
@@ -113,34 +109,22 @@ class ReferenceModel:
 
     @classmethod
     def from_view(cls, view: View, device: torch.device | None = None) -> ReferenceModel:
-        """The model of a view of an artifact, in fp32, on a device; None for the CPU.
-
-        Raises:
-            ArtifactError: its graphs cannot be read.
-        """
+        """The model of a view of an artifact, in fp32, on a device; None for the CPU."""
         manifest, weights = view.manifest, {**view.weights, **view.pruner}
         types = [block.type for block in manifest.blocks]
         return cls(view.pieces, manifest.spec, types, manifest.groups, weights, device, view.first_weights)
 
     def prologue(self, obs: Mapping[str, Tensor]) -> Contexts:
-        """Everything that the observation decides before the loop starts.
-
-        Args:
-            obs: normalised observations by key, ``[B, ...]`` each; nothing is committed unless they say so.
-
-        Returns:
-            Tensors of the device.
-        """
-        graph, streams = self._pieces.condition, len(next(iter(obs.values())))
+        """What normalised observations ``[B, ...]`` decide before the loop; none are committed unless they say so."""
+        streams = len(next(iter(obs.values())))
         uncommitted = {key: _tensor(count) for key, count in self._committed(streams).items()}
         there = {key: value.to(self.device) for key, value in (uncommitted | dict(obs)).items()}
-        there |= frame_values(self._pieces, lambda name, given: self._once[name](given), there)
-        condition = dict(zip(graph.outputs, self._once[CONDITION](there), strict=True))
-        return Contexts(streams, condition)
+        made = once_values(self._pieces, lambda name, given: self._once[name](given), there)
+        return Contexts(streams, {name: made[name] for name in self._pieces.conditions})
 
     def joined(self, parts: Iterable[Contexts], streams: int) -> Contexts:
         """What the loop reads for several batches of streams, as for one batch of all of them."""
-        axes = {name: one.batch_axis for name, one in self._pieces.condition.types().items()}
+        axes = {name: one.batch_axis for name, one in self._pieces.conditions.items()}
         whole, begin = dict[str, Tensor](), 0
         for part in parts:
             for name, value in part.condition.items():
@@ -156,20 +140,13 @@ class ReferenceModel:
 
     def condition(self, contexts: Contexts) -> Tensor:
         """What a correction reads of the observation: the pruner's features, one row a stream, ``[B, N]``."""
-        types = self._pieces.condition.types()
+        types = self._pieces.conditions
         own = [contexts.condition[name].cpu() for name in self._pieces.features]
         rows = [one.movedim(types[n].batch_axis or 0, 0) for one, n in zip(own, self._pieces.features, strict=True)]
         return torch.cat([torch.zeros(contexts.streams, 0), *(row.reshape(contexts.streams, -1) for row in rows)], 1)
 
     def logits(self, contexts: Contexts, weights: Mapping[str, Tensor] | None = None) -> Tensor:
-        """The pruner: float32 ``[B, K, blocks, 4]``.
-
-        Args:
-            weights: tensors to use in place of the pruner's constants of the same names; gradients flow to them.
-
-        Raises:
-            IllegalPlanError: the program has no pruner.
-        """
+        """The pruner: float32 ``[B, K, blocks, 4]``; with gradients for ``weights`` in place of its constants."""
         pruner = self._pieces.pruner
         if pruner is None:
             raise IllegalPlanError("the program has no pruner: run insert_pruner, or give a plan.")
@@ -180,14 +157,14 @@ class ReferenceModel:
         """The residual stream of step k, on the device, from the sample ``[B, T, D]``."""
         return self._stem(self._bind(self._pieces.stem, sample.to(self.device), k, contexts))[0]
 
-    def block(self, b: int, k: int, stream: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
-        """The residual of block b at step k, for all ``streams`` or these: what is added to the stream, not the sum."""
+    def block(self, b: int, k: int, hidden: Tensor, contexts: Contexts, streams: Sequence[int] | None = None) -> Tensor:
+        """The residual of block b at step k, for all ``streams`` or these: what is added, and not the sum."""
         blocks = self._blocks if k else self._first
-        return blocks[b](self._bind(self._pieces.blocks[b], stream, k, contexts, streams))[0]
+        return blocks[b](self._bind(self._pieces.blocks[b], hidden, k, contexts, streams))[0]
 
-    def tail(self, stream: Tensor, k: int, contexts: Contexts) -> Tensor:
+    def tail(self, hidden: Tensor, k: int, contexts: Contexts) -> Tensor:
         """The network's output ``[B, T, D]`` at step k, on the CPU, from the residual stream after the last block."""
-        return self._tail(self._bind(self._pieces.tail, stream, k, contexts))[0].cpu()
+        return self._tail(self._bind(self._pieces.tail, hidden, k, contexts))[0].cpu()
 
     def predict(self, sample: Tensor, k: int, contexts: Contexts, blocks: Blocks) -> Tensor:
         """The network's output ``[B, T, D]`` at step k, from the sample ``[B, T, D]``."""
@@ -207,7 +184,7 @@ class ReferenceModel:
         known: Known | None = None,
         since: tuple[int, Carried] | None = None,
     ) -> Iterator[Carried]:
-        """The denoising loop, whatever the blocks do: what is carried after each step.
+        """The denoising loop, whatever the blocks do: what each step makes, before what is known takes its place.
 
         Args:
             contexts: from ``prologue``.
@@ -218,13 +195,13 @@ class ReferenceModel:
             known: what a prefix makes known of the samples; None for nothing.
             since: a step to begin with, and what is carried to it; None for the whole loop.
         """
-        begin, carried = (0, hold(self.sampler.begin(initial), known, 0)) if since is None else since
+        begin, carried = (0, self.sampler.begin(initial)) if since is None else since
         condition = self.condition(contexts) if correction is not None and correction.reads else None
         for k in range(begin, self.steps):
+            carried = hold(carried, known, k)
             prediction = self.predict(carried.sample, k, contexts, blocks)
             draw = None if noise is None else noise[k]
             carried = self.sampler.advance(carried, prediction, draw, k, correction, condition)
-            carried = hold(carried, known, k + 1)
             yield carried
 
     def denoise(
@@ -240,12 +217,7 @@ class ReferenceModel:
     ) -> Denoised:
         """One call: K steps from noise to sample. A block is evaluated for the streams that compute it, and no others.
 
-        Args:
-            plan: int8 ``[K, blocks]`` or ``[B, K, blocks]``.
-            cache: what the previous call of the episode left; None at its start.
-
-        Raises:
-            IllegalPlanError: a plan of the wrong shape, or that reads what was never computed.
+        The plan is int8 ``[K, blocks]`` or ``[B, K, blocks]``; ``cache`` is what the previous call of the episode left.
         """
         cache = cache if cache is not None else self.empty_cache(contexts.streams)
         plans = check_plan(plan, self.steps, self.blocks, contexts.streams)
@@ -253,32 +225,32 @@ class ReferenceModel:
         gates = torch.nn.functional.one_hot(torch.from_numpy(plans.astype(np.int64)), 4).float().to(self.device)
         caches = Caches(rollout=dict(cache.residuals))
 
-        def blocks(k: int, stream: Tensor) -> Tensor:
+        def blocks(k: int, hidden: Tensor) -> Tensor:
             for b in range(self.blocks):
                 cell = Cell(k, b, self.groups[b], plans[:, k, b], gates[:, k, b], self._types[b])
-                stream = stream + reuse(cell, self._computed(cell, stream, contexts), caches)
-            return stream
+                hidden = hidden + reuse(cell, self._computed(cell, hidden, contexts), caches)
+            return hidden
 
         loop = self.steps_of(contexts, initial, noise, blocks, correction, known)
-        samples = tuple(carried.sample for carried in loop)
+        samples = tuple(hold(carried, known, k).sample for k, carried in enumerate(loop, 1))
         return Denoised(samples, RolloutCache(caches.rollout, cache.written | (plans == Source.COMPUTE)))
 
-    def _computed(self, cell: Cell, stream: Tensor, contexts: Contexts) -> Tensor | None:
+    def _computed(self, cell: Cell, hidden: Tensor, contexts: Contexts) -> Tensor | None:
         """The residual of the streams that compute it, with zeros for the others; None if none do."""
         takers = np.flatnonzero(cell.plan == Source.COMPUTE).tolist()
         if len(takers) == len(cell.plan):
-            return self.block(cell.b, cell.k, stream, contexts)
+            return self.block(cell.b, cell.k, hidden, contexts)
         if not takers:
             return None
-        part, there = self.block(cell.b, cell.k, stream, contexts, takers), torch.tensor(takers, device=stream.device)
-        return torch.zeros_like(stream).index_copy(stream_axis(cell.type), there, part)
+        part, there = self.block(cell.b, cell.k, hidden, contexts, takers), torch.tensor(takers, device=hidden.device)
+        return torch.zeros_like(hidden).index_copy(stream_axis(cell.type), there, part)
 
     def _bind(
         self, piece: LoopPiece, value: Tensor, k: int, contexts: Contexts, streams: Sequence[int] | None = None
     ) -> dict[str, Tensor]:
         """The inputs of a loop piece at step k; of some streams only, if they are given."""
-        stream = {piece.stream: _select(value, piece.type, streams)}
-        return stream | self._contexts(piece.contexts, k, contexts, streams)
+        hidden = {piece.stream: _select(value, piece.type, streams)}
+        return hidden | self._contexts(piece.contexts, k, contexts, streams)
 
     def _contexts(
         self, types: Mapping[str, TensorType], k: int, contexts: Contexts, streams: Sequence[int] | None = None

@@ -17,9 +17,7 @@ from ttscompile.ir.graph import TensorType
 class RolloutCache:
     """``rollout[k, b]`` of every stream: what a call leaves for the next one of the episode.
 
-    Attributes:
-        residuals: by ``(k, b)``, each of the residual's type, detached; holds rubbish for streams that never computed.
-        written: bool ``[B, K, blocks]``; which entries a call of the episode has computed.
+    Residuals are by ``(k, b)``, each of its type, detached, and rubbish for streams that never computed.
     """
 
     residuals: Mapping[tuple[int, int], Tensor]
@@ -28,12 +26,9 @@ class RolloutCache:
 
 @dataclass
 class Caches:
-    """The three caches during a call, for all streams at once; when it starts there is what earlier calls left.
+    """The three caches during a call, for all streams at once.
 
-    Attributes:
-        rollout: by step and block.
-        forward: by group; empty when the call starts.
-        timestep: by block; empty when the call starts.
+    Of earlier calls there is ``rollout``, by step and block; the others, by FORWARD group and by block, begin empty.
     """
 
     rollout: dict[tuple[int, int], Tensor]
@@ -70,7 +65,7 @@ class Cell:
         return self.gates[:, source].reshape(shape)
 
     def written(self, computed: Tensor, old: Tensor | None) -> Tensor:
-        """A cache entry after this cell: computed where the stream computes, as it was elsewhere."""
+        """A cache entry after this cell: computed where a stream computes, as it was elsewhere."""
         if old is None:
             return computed
         gate = self.gate(Source.COMPUTE)  # whose gradient has a part of what later steps read
@@ -78,11 +73,9 @@ class Cell:
 
 
 def reuse(cell: Cell, computed: Tensor | None, caches: Caches) -> Tensor:
-    """What one cell adds to the stream; writes the caches of the streams that compute it.
+    """What one cell adds to the residual stream; writes the caches of the streams that compute it.
 
-    Args:
-        computed: the block's residual, right for the streams that compute it, and where gates train for the others too;
-            None if nobody needs it.
+    ``computed`` is right for these, and where gates train for the others too; None if nobody needs it.
     """
     forward, timestep = caches.forward.get(cell.group), caches.timestep.get(cell.b)
     rollout = caches.rollout.get((cell.k, cell.b))

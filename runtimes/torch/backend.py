@@ -45,9 +45,6 @@ class TorchBackend:
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
         workspace: of the batch size under way.
-
-    Raises:
-        RuntimeUnavailableError: the device does not have the precision.
     """
 
     def __init__(self, view: View, placed: Placed, threads: int = 1, capture: Capture | None = None) -> None:
@@ -72,7 +69,6 @@ class TorchBackend:
         self._whole = False
 
     def lower(self, plan: PlanArray) -> Instructions:
-        """See ``Backend.lower``."""
         return self._own.get(plan.tobytes()) or instructions_of(plan, self._manifest.groups)
 
     def prepare(self, streams: int, plans: Sequence[Instructions] | None) -> None:
@@ -89,7 +85,6 @@ class TorchBackend:
             self.workspace = Workspace(self._parts, streams)
 
     def start(self, call: Call) -> None:
-        """See ``Backend.start``."""
         self._call = call
         with self._settings():
             self.workspace.load(call)
@@ -98,12 +93,10 @@ class TorchBackend:
                 self._lines.run("prologue", self.workspace.network.prologue)
 
     def condition(self) -> FloatArray:
-        """See ``Backend.condition``."""
         with self._settings():
             return np.asarray(self.workspace.network.condition().float().cpu().numpy(), dtype=np.float32)
 
     def logits(self) -> FloatArray:
-        """See ``Backend.logits``."""
         with self._settings():
             if self.device.type == "cuda":  # cuBLAS warns if it comes first in a thread, as in the one that prunes
                 torch.cuda.current_stream(self.device).synchronize()
@@ -113,7 +106,6 @@ class TorchBackend:
         """Nothing: the line begins with it."""
 
     def other_steps(self, plans: Sequence[Instructions]) -> FloatArray:
-        """See ``Backend.other_steps``."""
         with self._settings():
             streams = by_plan(plans)
             if len(streams) == 1:
@@ -234,9 +226,9 @@ class Lines:
 def cuda_graphs(device: torch.device) -> Capture:
     """CUDA graphs of a device that share one pool of memory: they run one after the other.
 
-    They are captured on a stream that computes nothing else. cuBLAS has scratch memory for each stream, which torch
+    They are captured on a CUDA stream that computes nothing else. cuBLAS has scratch memory for each, which torch
     frees when somebody asks for that, as torch.compile does. So a graph has to have it from its own pool, as what is
-    taken in a capture is. A pool and its stream are done with when their graphs are: torch may still hold that memory.
+    taken in a capture is. Pool and CUDA stream are done with when their graphs are: torch may still hold that memory.
     """
     alive: WeakSet[torch.cuda.CUDAGraph] = WeakSet()
     own: list[Any] = []

@@ -39,14 +39,9 @@ _PRODUCTS = frozenset(f"aten.{name}.default" for name in ("linear", "addmm", "mm
 def write_function(
     graph: Graph, weights: Mapping[str, Tensor], examples: Sequence[Tensor], streams: int, narrow: torch.dtype | None
 ) -> Function:
-    """A graph as a function.
+    """A graph as a function of inputs with the shapes and device of these examples, in order.
 
-    Args:
-        examples: its inputs in order. Those of every call must have the same shapes and device.
-        narrow: type to keep the constants of products in; the caller then runs the function under autocast.
-
-    Raises:
-        CaptureError: an operation that ``resolve_op`` refuses, or a constant that is missing.
+    ``narrow`` is the type to keep the constants of products in; the caller then runs the function under autocast.
     """
     device = next((value.device for value in (*examples, *weights.values())), torch.device("cpu"))
     users = graph.users()

@@ -17,22 +17,18 @@ from .sampler import Advance, IdleSteps, State, begin
 
 
 class Network(Protocol):
-    """The pieces of the loop, for the observation at hand.
-
-    Attributes:
-        idle: for steps without a computed block; None if the network is of another form.
-    """
+    """The pieces of the loop, for the observation at hand; ``idle`` is None where the network is of another form."""
 
     idle: IdleSteps | None
 
     def stem(self, sample: Tensor, k: int) -> Tensor:
         """The residual stream of step k from the sample ``[B, T, D]``."""
 
-    def block(self, b: int, k: int, stream: Tensor) -> Tensor:
+    def block(self, b: int, k: int, hidden: Tensor) -> Tensor:
         """The residual of block b at step k."""
 
-    def tail(self, stream: Tensor, k: int) -> Tensor:
-        """The prediction ``[B, T, D]`` of step k from the stream after the last block."""
+    def tail(self, hidden: Tensor, k: int) -> Tensor:
+        """The prediction ``[B, T, D]`` of step k from the residual stream after the last block."""
 
 
 def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
@@ -89,33 +85,28 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
                     state = go_on(state, network.idle.predict(known, state.sample), step)
             k += count
             continue
-        first = stream = network.stem(state.sample.permute(1, 2, 0), k)
+        first = hidden = network.stem(state.sample.permute(1, 2, 0), k)
         reached, operands.whole = 0, None if plan.counts[k] else operands.whole
         for cell in islice(cells, plan.counts[k]):
             b = cell - k * blocks
             if b != reached:
-                stream = stream + operands.total()
-            residual = operands.current[b] = network.block(b, k, stream)
-            stream, reached = stream + residual, b + 1
+                hidden = hidden + operands.total()
+            residual = operands.current[b] = network.block(b, k, hidden)
+            hidden, reached = hidden + residual, b + 1
             if cell in keep:
                 residuals[cell] = residual
         if reached != blocks:
-            stream = stream + operands.total()
+            hidden = hidden + operands.total()
         if plan.counts[k] == blocks:
-            operands.whole = stream - first
-        prediction = network.tail(stream, k).permute(2, 0, 1)
+            operands.whole = hidden - first
+        prediction = network.tail(hidden, k).permute(2, 0, 1)
         state = go_on(state, prediction, k)
         k += 1
     return state.sample.permute(1, 2, 0), residuals
 
 
 class _Operands:
-    """The residuals that the instructions of a plan work on.
-
-    Attributes:
-        current: what each block computed last.
-        whole: the sum of all of these, where one step computed them; None where it is not known.
-    """
+    """What each block computed last, for the instructions of a plan; and the sum of all, where it is known."""
 
     def __init__(self, plan: Instructions, blocks: int, rollout: Mapping[int, Tensor]) -> None:
         nothing = torch.zeros(0)  # step 0 computes all blocks before anything is read

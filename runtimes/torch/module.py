@@ -52,7 +52,7 @@ def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | 
 
     Args:
         path: the directory that ``convert`` wrote, or the same zipped.
-        plan: of the artifact or of one's own, or the name of one; None for the default. The module computes it in fp32.
+        plan: of the artifact or of one's own, or the name of one; None for the default. In fp32, and with all tokens.
 
     Returns:
         On the CPU, in fp32, and in evaluation mode; ``to`` moves it. See ``SparseCall.forward``; and
@@ -60,18 +60,19 @@ def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | 
 
     Raises:
         ArtifactError: the artifact is missing, damaged or of another version, or has no plan of this name.
-        IllegalPlanError: the plan is a schedule that reads the rollout cache, which lives from call to call; or it is
-            the pruner's, and the artifact has no such plan.
+        IllegalPlanError: the plan is in another precision, reuses tokens, or goes on from call to call: it begins with
+            the chunk before, or is a schedule that reads the rollout cache; or it is the pruner's, and there is none.
     """
     artifact = load_artifact(path)
-    chosen = plan_of(artifact, plan)
-    name, own = artifact.told(chosen) or GIVEN, chosen.exact
-    if "@" in name and chosen.precision:
-        problem = f"plan {name!r} has weights of {', '.join(sorted(set(chosen.precision.values())))}"
-        raise IllegalPlanError(f"{problem}, and a module computes in fp32. Leave out what follows the @.")
+    own = plan_of(artifact, plan)
+    name = artifact.told(own) or GIVEN
     if own.otherwise is not None or own.loop in artifact.manifest.starts:
         problem = f"plan {name!r} begins with the chunk of the call before, and a module keeps nothing between calls"
         raise IllegalPlanError(f"{problem}. Give another plan, or use load(..., runtime='torch').")
+    if own is not own.exact:
+        has = " and ".join([*sorted(set(own.precision.values())), *["reused tokens"] * (own.tokens is not None)])
+        problem = f"plan {name!r} has {has}, and a module computes all tokens of all frames in fp32"
+        raise IllegalPlanError(f"{problem}. Give a plan in fp32: 'NAME@fp32', which is plan.exact.")
     view = view_of(artifact, own)
     if own.correction is not None:
         require_fit(own.correction, artifact.manifest, own.loop)
@@ -85,17 +86,7 @@ def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | 
 
 
 class SparseCall(CallModule):
-    """One call of a policy with one schedule.
-
-    Args:
-        view: of an artifact, for the plan.
-        name: of the plan, for messages.
-        plan: int8 ``[K, blocks]``.
-        correction: of the sampler's steps, which belongs to the plan; None for none.
-
-    Raises:
-        IllegalPlanError: the plan is illegal, or reads the rollout cache.
-    """
+    """One call of a policy with one schedule, int8 ``[K, blocks]``; ``name`` is for messages."""
 
     def __init__(self, view: View, name: str, plan: PlanArray, correction: Correction | None) -> None:
         manifest = view.manifest
@@ -171,9 +162,7 @@ class PrunedCall(CallModule):
         """One call.
 
         Args:
-            obs: observations by key, ``[B, ...]`` each, not normalised: as ``predict_action`` takes them.
-            initial: the noise that the sample starts from, float32 ``[B, T, D]``.
-            steps: noise of the steps, float32 ``[K, B, T, D]``; needed if the sampler draws noise, else not looked at.
+            obs, initial, steps: see ``SparseCall.forward``.
             rollout: what the call before gave, or ``empty_rollout`` in the first call of an episode. Without it no
                 residual of an earlier call is there, and cells that want one have TIMESTEP.
 

@@ -11,8 +11,8 @@ from ttscompile.artifact.view import View
 from ttscompile.core.coercion import Array
 from ttscompile.ir.graph import Graph, TensorType
 from ttscompile.ir.idle_form import idle_form
-from ttscompile.ir.pieces import BLOCKS, CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece
-from ttscompile.ir.program import frame_values
+from ttscompile.ir.pieces import BLOCKS, CONDITION, FRAMES, PRUNER, SCENE, STEM, STEP, TAIL, LoopPiece
+from ttscompile.ir.program import once_values
 from ttscompile.runtimes.contexts import ContextValues
 
 from . import devices
@@ -36,11 +36,7 @@ class Placed:
 
 
 class Parts:
-    """What all numbers of streams share.
-
-    Attributes:
-        narrow: by part, the type that its products are computed in; None, or no entry, for float32.
-    """
+    """What all numbers of streams share; ``narrow`` is by part the type that its products are in, if not float32."""
 
     def __init__(self, view: View, placed: Placed) -> None:
         self.manifest, self.pieces, self.device = view.manifest, view.pieces, placed.device
@@ -81,24 +77,20 @@ class StreamsNetwork:
         tables = {name: devices.placed(table, parts.device) for name, table in pieces.tables.items()}
         self.contexts = ContextValues(manifest, streams, torch, parts.zeros, tables)
         self._once: dict[str, Function] = {}
-        seen = frame_values(pieces, self._write_and_run, obs)
-        order = [*obs, *seen]
-        given = [*obs.values(), *seen.values()]
-        self._condition = self._written(CONDITION, pieces.condition, given, streams, order)
         self._step: Function | None = None
-        self.prologue()
+        self.contexts.keep(once_values(pieces, self._write_and_run, obs).items())
         if pieces.step is not None:
             reads = self.contexts.for_step_piece(pieces.step.inputs)
             self._step = self._written(STEP, pieces.step, reads, self._steps * streams)
             self.prologue()
         (horizon, dimensions), kind = manifest.spec.sample, manifest.blocks[0].type
         sample = torch.zeros((dimensions, streams, horizon), device=parts.device).permute(1, 2, 0)
-        stream = parts.zeros(kind.at(streams), kind.dtype)
+        hidden = parts.zeros(kind.at(streams), kind.dtype)
         self._stem, self._stem_reads = self._loop_piece(STEM, pieces.stem, sample)
-        self._tail, self._tail_reads = self._loop_piece(TAIL, pieces.tail, stream)
-        first = blocks = [self._loop_piece(BLOCKS, piece, stream) for piece in pieces.blocks]
+        self._tail, self._tail_reads = self._loop_piece(TAIL, pieces.tail, hidden)
+        first = blocks = [self._loop_piece(BLOCKS, piece, hidden) for piece in pieces.blocks]
         if parts.first is not parts.weights:
-            first = [self._loop_piece(BLOCKS, piece, stream, parts.first) for piece in pieces.blocks]
+            first = [self._loop_piece(BLOCKS, piece, hidden, parts.first) for piece in pieces.blocks]
         self._blocks, self._block_reads = zip(*blocks, strict=True)
         self._first, _ = zip(*first, strict=True)
         self._pruner = None
@@ -109,9 +101,7 @@ class StreamsNetwork:
 
     def prologue(self) -> None:
         """Everything that the observation decides before the loop."""
-        seen = frame_values(self._parts.pieces, self._run_once, self._obs)
-        made = self._condition(*self._obs.values(), *seen.values())
-        self.contexts.keep(zip(self._parts.pieces.condition.outputs, made, strict=True))
+        self.contexts.keep(once_values(self._parts.pieces, self._run_once, self._obs).items())
         step = self._parts.pieces.step
         if self._step is not None and step is not None:
             made = self._step(*self.contexts.for_step_piece(step.inputs))
@@ -119,7 +109,7 @@ class StreamsNetwork:
 
     def _write_and_run(self, name: str, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         graph = self._parts.pieces.once()[name]
-        rows = self.streams if name == FRAMES else len(next(iter(given.values())))
+        rows = self.streams if name in (FRAMES, SCENE, CONDITION) else len(next(iter(given.values())))
         self._once[name] = self._written(name, graph, list(given.values()), rows, list(given))
         return self._run_once(name, given)
 
@@ -138,18 +128,15 @@ class StreamsNetwork:
         return self._pruner(*self._pruner_reads)[0]
 
     def stem(self, sample: Tensor, k: int) -> Tensor:
-        """See ``loop.Network``."""
-        stream = self._stem(sample, *self._stem_reads[k])[0]
-        return stream if self._contiguous else stream.contiguous()
+        hidden = self._stem(sample, *self._stem_reads[k])[0]
+        return hidden if self._contiguous else hidden.contiguous()
 
-    def block(self, b: int, k: int, stream: Tensor) -> Tensor:
-        """See ``loop.Network``."""
-        residual: Tensor = (self._blocks if k else self._first)[b](stream, *self._block_reads[b][k])[0]
+    def block(self, b: int, k: int, hidden: Tensor) -> Tensor:
+        residual: Tensor = (self._blocks if k else self._first)[b](hidden, *self._block_reads[b][k])[0]
         return residual
 
-    def tail(self, stream: Tensor, k: int) -> Tensor:
-        """See ``loop.Network``."""
-        return self._tail(stream, *self._tail_reads[k])[0]
+    def tail(self, hidden: Tensor, k: int) -> Tensor:
+        return self._tail(hidden, *self._tail_reads[k])[0]
 
     def _written(  # a graph, and all that its function depends on
         self,
@@ -178,7 +165,7 @@ class StreamsNetwork:
     def _loop_piece(
         self, part: str, piece: LoopPiece, value: Tensor, weights: Mapping[str, Tensor] | None = None
     ) -> tuple[Function, list[tuple[Tensor, ...]]]:
-        """The function of a piece, with the stream first, and its contexts at each step."""
+        """The function of a piece, with the residual stream first, and its contexts at each step."""
         contexts = list(piece.contexts)
         reads = [tuple(self.contexts.at(name, k) for name in contexts) for k in range(self._steps)]
         order = [piece.stream, *contexts]

@@ -19,8 +19,8 @@ from ttscompile.core.spec import Affine
 from ttscompile.errors import ObservationError
 from ttscompile.ir.evaluate import Evaluator
 from ttscompile.ir.idle_form import idle_form
-from ttscompile.ir.pieces import CONDITION, PRUNER, STEM, STEP, TAIL, block_name
-from ttscompile.ir.program import Binding, frame_values
+from ttscompile.ir.pieces import PRUNER, STEM, STEP, TAIL, block_name
+from ttscompile.ir.program import Binding, once_values
 
 from .sampler import Advance, IdleSteps
 
@@ -48,9 +48,8 @@ class PlainNetwork:
         self.idle = None if module.idle is None else module.idle.on(module.kept("idle"))
         self._streams = streams
         self.stream_type = pieces.blocks[0].type
-        seen = frame_values(pieces, lambda name, given: evaluators[name]({**weights, **given}), obs)
-        made = evaluators[CONDITION]({**weights, **obs, **seen})
-        self._condition = dict(zip(pieces.condition.outputs, made, strict=True))
+        made = once_values(pieces, lambda name, given: evaluators[name]({**weights, **given}), obs)
+        self._condition = {name: made[name] for name in pieces.conditions}
         self._by_step: dict[int, dict[str, Tensor]] = {}  # step values, of steps that read them
         # Of every piece what it reads, and of every context the axis of streams: plain names, which a tracer follows.
         graphs = pieces.graphs()
@@ -61,7 +60,7 @@ class PlainNetwork:
 
     def of(self, members: Tensor) -> PlainNetwork:
         """The same for some of the streams."""
-        other, types = copy(self), self._pieces.condition.types()
+        other, types = copy(self), self._pieces.conditions
         other._streams, other._by_step = len(members), {}
         axes = {name: types[name].batch_axis for name in self._condition}
         other._condition = {
@@ -84,7 +83,7 @@ class PlainNetwork:
 
     def condition(self, features: Sequence[str]) -> Tensor:
         """What a correction reads, ``[B, N]``."""
-        types = self._pieces.condition.types()
+        types = self._pieces.conditions
         rows = [self._condition[name].movedim(types[name].batch_axis or 0, 0) for name in features]
         return torch.cat([row.reshape(self._streams, -1) for row in rows], 1)
 
@@ -93,16 +92,13 @@ class PlainNetwork:
         return self._run(PRUNER, {**self._weights, **self._condition})[0]
 
     def stem(self, sample: Tensor, k: int) -> Tensor:
-        """See ``loop.Network``."""
         return self._at(k, STEM, sample)
 
-    def block(self, b: int, k: int, stream: Tensor) -> Tensor:
-        """See ``loop.Network``."""
-        return self._at(k, self._blocks[b], stream)
+    def block(self, b: int, k: int, hidden: Tensor) -> Tensor:
+        return self._at(k, self._blocks[b], hidden)
 
-    def tail(self, stream: Tensor, k: int) -> Tensor:
-        """See ``loop.Network``."""
-        return self._at(k, TAIL, stream)
+    def tail(self, hidden: Tensor, k: int) -> Tensor:
+        return self._at(k, TAIL, hidden)
 
     def contexts(self, k: Tensor) -> dict[str, Tensor]:
         """All that the pieces of the loop read at a step that only the program knows, int64 ``[1]``; by name."""
@@ -116,9 +112,9 @@ class PlainNetwork:
         return self._run(name, {**contexts, self._streams_of[name]: value})[0]
 
     def _at(self, k: int, name: str, value: Tensor) -> Tensor:
-        stream = self._streams_of[name]
-        reads = {read: self._context(read, k) for read in self._reads[name] if read in self._axes and read != stream}
-        return self._run(name, {**self._weights, **({} if k else self._first), stream: value, **reads})[0]
+        hidden = self._streams_of[name]
+        reads = {read: self._context(read, k) for read in self._reads[name] if read in self._axes and read != hidden}
+        return self._run(name, {**self._weights, **({} if k else self._first), hidden: value, **reads})[0]
 
     def _run(self, name: str, values: Tensors) -> tuple[Tensor, ...]:
         return self._evaluators[name].run([values[read] for read in self._reads[name]], self._streams)

@@ -1,12 +1,12 @@
 """The denoising loop of a plan that only the program knows: for plans that the pruner makes, once they are exported.
 
     while k < K:                                                           while_loop
-        stream = stem(sample)
+        hidden = stem(sample)
         for each block:
-            residual = block(stream), if any stream computes it            cond
+            residual = block(hidden), if any stream computes it            cond
                        what the plan says otherwise, without evaluating it
-            stream += residual
-        sample = the sampler's step of tail(stream)
+            hidden += residual
+        sample = the sampler's step of tail(hidden)
 
 It is in the program once, with every block once, whatever K is. A block is evaluated for all streams if one of them
 computes it; the others then take what they reuse.
@@ -101,7 +101,7 @@ def denoise_as_planned(
         state = State(sample, history, memory)
         contexts, sources = network.contexts(k), plan.index_select(1, k)[:, 0]
         earlier = None if rollout is None else more[-1].index_select(0, k)[0]
-        stream = network.run(STEM, sample.permute(1, 2, 0), contexts)
+        hidden = network.run(STEM, sample.permute(1, 2, 0), contexts)
         own, of_group = list(latest.unbind()), list(newest.unbind())
         kept = []
         for b in range(blocks):
@@ -110,14 +110,14 @@ def denoise_as_planned(
             if earlier is not None:
                 reused = torch.where(is_source[Source.ROLLOUT], earlier[b], reused)
             computing = is_source[Source.COMPUTE]
-            evaluate = partial(_evaluated, network, block_name(b), stream, contexts, computing, reused)
+            evaluate = partial(_evaluated, network, block_name(b), hidden, contexts, computing, reused)
             residual = either(computing.any(), evaluate, reused)
             own[b] = torch.where(computing, residual, own[b])
             of_group[groups[b]] = torch.where(computing, residual, of_group[groups[b]])
             if earlier is not None:
                 kept.append(torch.where(computing, residual, earlier[b]))
-            stream = stream + residual
-        prediction = network.run(TAIL, stream, contexts).permute(2, 0, 1)
+            hidden = hidden + residual
+        prediction = network.run(TAIL, hidden, contexts).permute(2, 0, 1)
         state = advance.at(state, prediction, k, advance.jumped(k, offset.index_select(0, k)[0], read, history))
         after = [k + 1, state.sample, state.history, torch.stack(own), torch.stack(of_group)]
         after += [state.memory.contiguous()] if advance.memories else []
@@ -136,10 +136,10 @@ def denoise_as_planned(
 
 
 def _evaluated(
-    network: PlainNetwork, name: str, stream: Tensor, contexts: Mapping[str, Tensor], computing: Tensor, reused: Tensor
+    network: PlainNetwork, name: str, hidden: Tensor, contexts: Mapping[str, Tensor], computing: Tensor, reused: Tensor
 ) -> Tensor:
     """A block's residual, for the streams that compute it."""
-    residual = torch.where(computing, network.run(name, stream, contexts), reused)
+    residual = torch.where(computing, network.run(name, hidden, contexts), reused)
     return residual.clone(memory_format=torch.contiguous_format)  # both branches of a cond have to have one layout
 
 

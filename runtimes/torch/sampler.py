@@ -174,19 +174,19 @@ class IdleSteps(devices.OnTensors):
 
     def prepare(self, total: Tensor) -> Prepared:
         """What is known as soon as the total is."""
-        stream = (total.transpose(0, 1) if self._turned else total) + self.constant
+        hidden = (total.transpose(0, 1) if self._turned else total) + self.constant
         if self.basis is None:
-            numerator = stream @ self.head
+            numerator = hidden @ self.head
             blank = torch.zeros_like(numerator)
             rows = torch.cat([blank, torch.ones_like(blank[..., :1])], 2)
         else:
-            width = stream.shape[2]
-            centred = stream - stream.mean(2, keepdim=True)
+            width = hidden.shape[2]
+            centred = hidden - hidden.mean(2, keepdim=True)
             along = centred @ self.basis
             across = centred - along @ self.basis.T
             deviation = ((across * across).sum(2, keepdim=True) / width + self._eps).sqrt()
             rows, numerator = torch.cat([along / width**0.5, deviation], 2), centred @ self.head
-        shift = self.shift.expand(-1, len(stream), -1)
+        shift = self.shift.expand(-1, len(hidden), -1)
         return Prepared(rows.permute(2, 0, 1).flatten(1), numerator.permute(2, 0, 1).flatten(1), shift.flatten(1))
 
     def predict(self, known: Prepared, sample: Tensor) -> Tensor:

@@ -20,11 +20,7 @@ from .sampler import Advance
 
 
 class Inlet:
-    """A tensor of the device that the host writes to once a call.
-
-    Attributes:
-        array: what to write to; on the CPU the memory of the tensor itself.
-    """
+    """A tensor of the device, and what the host writes to once a call: on the CPU the memory of the tensor itself."""
 
     def __init__(self, shape: tuple[int, ...], dtype: str, device: torch.device) -> None:
         self.tensor = torch.zeros(shape, dtype=getattr(torch, dtype), device=device)
@@ -40,11 +36,9 @@ class Inlet:
 
 
 class Workspace:
-    """Tensors for B streams.
+    """Tensors for B streams: the denoised sample of the last call, ``[B, T, D]``, among them.
 
-    Attributes:
-        result: the denoised sample of the last call, ``[B, T, D]``.
-        rollout: entries of the rollout cache by flat index ``k * blocks + b``; taken when they are first kept.
+    Entries of the rollout cache, by flat index ``k * blocks + b``, are taken when they are first kept.
     """
 
     def __init__(self, parts: Parts, streams: int) -> None:

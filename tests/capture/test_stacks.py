@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.lower.sessions import run
+from tests.lower.sessions import lower_graph, run
 from tests.passes.specs import toy_spec
 from ttscompile.capture.export import capture
-from ttscompile.lower.program import lower_graph
 
 STACKS = (torch.hstack, torch.vstack, torch.dstack, torch.column_stack)
 

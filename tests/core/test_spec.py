@@ -53,3 +53,19 @@ def test_a_state_in_words_says_in_which_of_256_parts_it_is() -> None:
 def test_one_name_is_no_tuple_of_names() -> None:
     with pytest.raises(SpecError, match="recorded is a tuple of names of arrays; found 'keypoint'"):
         ObservationSpec((2, 8), recorded="keypoint")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("spec", "numbers"),
+    [
+        (ObservationSpec((4,), window=False), True),
+        (ObservationSpec((2, 4)), True),
+        (ObservationSpec((7, 4), window=False), False),
+        (ObservationSpec((2, 3, 8, 8)), False),
+        (ObservationSpec((9,), dtype="int64", window=False), False),
+        (ObservationSpec((9,), dtype="bool", window=False), False),
+    ],
+    ids=["state", "window of states", "tokens of another model", "pictures", "words", "which words count"],
+)
+def test_rows_of_numbers_are_told_from_pictures_and_words(spec: ObservationSpec, numbers: bool) -> None:
+    assert spec.numbers is numbers

@@ -12,9 +12,9 @@ import torch
 
 from tests.calibration import policies
 from tests.lower.modules import captured
+from tests.lower.sessions import lower_graph
 from ttscompile import compile_denoiser
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.lower.program import lower_graph
 
 ROOT = Path(__file__).resolve().parents[2]
 

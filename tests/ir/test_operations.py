@@ -14,7 +14,7 @@ from torch.nn.utils import parametrizations, parametrize
 from tests.ir.meta import assert_types
 from tests.ir.operation_examples import EXAMPLES
 from tests.lower.modules import ALL, captured
-from tests.lower.sessions import run
+from tests.lower.sessions import lower_graph, run
 from tests.passes.graphs import B, Builder
 from tests.passes.specs import toy_spec
 from tests.quick import first_quick
@@ -25,7 +25,6 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.flops import graph_flops
 from ttscompile.ir.graph import Graph, Node, TensorType
 from ttscompile.ir.operations import OPERATIONS, Linear, Movement, axes_along, axis_after, operation, permutation
-from ttscompile.lower.program import lower_graph
 from ttscompile.lower.promotion import may_promote
 
 

@@ -9,9 +9,16 @@ import onnx
 import onnxruntime
 import torch
 
+from ttscompile.ir.graph import Graph
+from ttscompile.lower.program import lower_graphs
 from ttscompile.runtimes.onnxruntime.sessions import EXACT_INTEGERS
 
 Array = npt.NDArray[Any]
+
+
+def lower_graph(graph: Graph, name: str) -> onnx.ModelProto:
+    """The ONNX model of one graph."""
+    return lower_graphs({name: graph})[name]
 
 
 def session(

@@ -9,7 +9,7 @@ import torch
 from onnx import helper
 
 from tests.lower.modules import ALL, TOKENS, WIDTH, captured, random_values, spec, table
-from tests.lower.sessions import run, session
+from tests.lower.sessions import lower_graph, run, session
 from tests.passes.graphs import Builder
 from tests.rounding import Counted, assert_equal_but_for_rounding
 from ttscompile.errors import LoweringError
@@ -19,7 +19,7 @@ from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Pieces, Program
 from ttscompile.lower.advance import fuse_advance
 from ttscompile.lower.onnx_model import live_nodes
-from ttscompile.lower.program import OPSET, lower_graph, lower_program, structural_key
+from ttscompile.lower.program import OPSET, lower_program, structural_key
 
 B = Batch()
 

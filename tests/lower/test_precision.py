@@ -14,7 +14,7 @@ from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_te
 from torch.nn import functional
 
 from tests.lower.modules import captured, random_values
-from tests.lower.sessions import session
+from tests.lower.sessions import lower_graph, session
 from tests.runtimes.toys import B, f32, node
 from ttscompile.core.four_bits import unpack
 from ttscompile.errors import LoweringError
@@ -22,7 +22,6 @@ from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Ref
 from ttscompile.lower import precision as lowering
 from ttscompile.lower.precision import LEAST_ROWS, lower_precision, quantize_matrix, quantize_model
-from ttscompile.lower.program import lower_graph
 from ttscompile.measure.machine import has_integer_dot_product
 
 Array = npt.NDArray[Any]

@@ -5,9 +5,8 @@ import onnx
 import pytest
 import torch
 
-from tests.lower.sessions import run
+from tests.lower.sessions import lower_graph, run
 from ttscompile.ir.graph import Graph, Node, Ref, TensorType
-from ttscompile.lower.program import lower_graph
 from ttscompile.lower.promotion import may_promote
 
 

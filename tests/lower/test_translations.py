@@ -12,9 +12,8 @@ from tests.rounding import Counted, assert_equal_but_for_rounding
 from tests.runtimes.toys import B, f32, node
 from ttscompile.ir.evaluate import evaluate
 from ttscompile.ir.graph import Graph, Node, Ref
-from ttscompile.lower.program import lower_graph
 
-from .sessions import session
+from .sessions import lower_graph, session
 
 CHANNELS = 6
 Call = tuple[str, dict[str, tuple[int, ...]], tuple[Any, ...]]

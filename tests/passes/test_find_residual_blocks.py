@@ -80,7 +80,9 @@ def test_addition_of_a_constant_is_no_block() -> None:
     b = Builder()
     x = b.input("x", B, 4, 8)
     h = b.op("shifted", "add.Tensor", (B, 4, 8), x, b.constant("position", 1, 4, 8))
-    with pytest.raises(NoResidualBlocksError, match=r"%shifted .*added %position does not depend on the stream"):
+    with pytest.raises(
+        NoResidualBlocksError, match=r"%shifted .*added %position does not depend on the residual stream"
+    ):
         find_residual_blocks(b.graph(h), "x")
 
 
@@ -105,7 +107,7 @@ def test_a_long_skip_makes_one_coarse_block() -> None:
     table = find_residual_blocks(b.graph(b.residual("a2", merged)), "x")
     assert [(blk.stream, blk.result) for blk in table.blocks] == [("embed", "a0"), ("a0", "a2")]
     assert table.blocks[1].residual is None
-    assert "the stream is changed by %a1.f = aten.linear.default" in table.blocks[1].reason
+    assert "the residual stream is changed by %a1.f = aten.linear.default" in table.blocks[1].reason
     assert any("a1" in reason and "around it" in reason for reason in table.declined)
 
 

@@ -45,7 +45,7 @@ class FakeWorkspace:
         self._c = rng.standard_normal((steps, blocks, streams, 1, 4))
         shape = (streams, 3, 4) if axis == 0 else (3, streams, 4)
         self.x = np.zeros((streams, 3, 4))
-        self.fresh, self.stream = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self.fresh, self.hidden = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self.sample = [np.zeros((streams, 3, 4), np.float32) for _ in range(2)]
         self.current = np.full((blocks, *shape), np.nan, np.float32)
         self.table = np.full((blocks, *shape), np.nan, np.float32)
@@ -67,20 +67,20 @@ class FakeWorkspace:
     def begin(self) -> None:
         self.sample[0][:] = self.x
         np.moveaxis(self.fresh, self.axis, 0)[:] = 0.5 * self.x
-        self.stream[:] = np.nan
+        self.hidden[:] = np.nan
 
     def entry(self, cell: int) -> np.ndarray:
-        return self.rollout.setdefault(cell, np.full(self.stream.shape, np.nan, np.float32))
+        return self.rollout.setdefault(cell, np.full(self.hidden.shape, np.nan, np.float32))
 
     def sums(self, count: int) -> np.ndarray:
-        return np.full((count, *self.stream.shape), np.nan, np.float32)
+        return np.full((count, *self.hidden.shape), np.nan, np.float32)
 
     def run_dense(self, k: int) -> None:
         self.dense.append(k)
-        self.stream[:] = self.fresh
+        self.hidden[:] = self.fresh
         for b in range(len(self.groups)):
             self.run(k, b)
-            self.stream += self.current[b]
+            self.hidden += self.current[b]
 
     def enter_idle(self, k: int) -> None:
         assert self.idle is not None
@@ -89,22 +89,22 @@ class FakeWorkspace:
     def run_idle(self, first: int, stop: int) -> None:
         assert self.idle is not None
         for k in range(first, stop):
-            self.stream[:] = self.fresh + self.idle.prepared
+            self.hidden[:] = self.fresh + self.idle.prepared
             self.advance(k)
             self.idled.append(k)
 
     def leave_idle(self, k: int) -> None:
-        self.stream[:] = np.nan
+        self.hidden[:] = np.nan
 
     def run(self, k: int, b: int) -> None:
         self.runs.append((k, b))
-        own, h = np.moveaxis(self.current[b], self.axis, 0), np.moveaxis(self.stream, self.axis, 0)
+        own, h = np.moveaxis(self.current[b], self.axis, 0), np.moveaxis(self.hidden, self.axis, 0)
         for s in range(self.streams):
             own[s] = self.toy(s).block(h[s], k, b)
 
     def advance(self, k: int) -> None:
         now, then = k % 2, (k + 1) % 2
-        h = np.moveaxis(self.stream, self.axis, 0)
+        h = np.moveaxis(self.hidden, self.axis, 0)
         self.sample[then][:] = 0.3 * self.sample[now] + np.tanh(h)
         np.moveaxis(self.fresh, self.axis, 0)[:] = 0.5 * self.sample[then]
 

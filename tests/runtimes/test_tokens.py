@@ -29,12 +29,13 @@ from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.onnxruntime.backend import OnnxBackend
 from ttscompile.runtimes.onnxruntime.sessions import Sessions
 from ttscompile.runtimes.policy import CompiledPolicy
-from ttscompile.runtimes.tokens import TokenTower, sizes_of, token_towers
+from ttscompile.runtimes.tokens import Lane, TokenTower, TokenWork, sizes_of, token_towers
 
 pytestmark = pytest.mark.slow
 
 Array = npt.NDArray[Any]
 TOKENS = 37
+LANE = Lane(b"")
 REUSE = TokenReuse(threshold=0.0, refresh=1000)
 FIRST, OTHER = frame((picture(0), picture(1))), frame((moved(picture(0), 7), picture(1)))
 """Of the second a patch of one camera is another."""
@@ -86,8 +87,9 @@ def computed_literally(artifact: Artifact, changes: tuple[int, ...]) -> list[int
     for change in changes:
         for patch in rng.choice(36, size=change, replace=False):
             image = moved(image, patch, rng.uniform(0.1, 1.0))
-        (value, *_), count, forward = tower.compute(b"", {name: image[None]})
-        assert forward == (len(similar) if count else 0)
+        (value, *_), work = tower.compute(LANE, {name: image[None]})
+        count = work.computed
+        assert work.forward == (len(similar) if count else 0)
         if count:
             np.testing.assert_allclose(value, literal(image[None], asked[-1], similar)[0], rtol=0, atol=1e-5)
             assert len(asked[-1]) == count
@@ -151,7 +153,7 @@ def test_a_plan_says_whether_tokens_are_reused(compiled: Path, tmp_path: Path) -
     assert manifest.identity != artifact.manifest.identity
     assert manifest.model_identity == artifact.manifest.model_identity
     assert tokens() == tokens(plan="some") == (5, 37)
-    assert tokens(plan="some@fp32") == tokens(plan="dense") == (0, 0)
+    assert tokens(plan="some@fp32") == tokens(plan="some@int8") == tokens(plan="dense") == (0, 0)
     for runtime in ("torch", "reference"):
         with pytest.raises(
             RuntimeUnavailableError, match=rf"{runtime}' computes all tokens .*Use runtime='onnxruntime'"
@@ -268,7 +270,8 @@ def test_slow_changes_add_up(artifact: Artifact) -> None:
     """A patch is held against what its token was computed for, however many frames ago that was."""
     tower, (name,) = tower_of(artifact, threshold=0.1), artifact.graph("frame_00").inputs
     counts = [
-        tower.compute(b"", {name: moved(2 * picture(0) - 1, 4, by)[None]})[1] for by in (0.0, 0.02, 0.04, 0.06, 0.08)
+        tower.compute(LANE, {name: moved(2 * picture(0) - 1, 4, by)[None]})[1].computed
+        for by in (0.0, 0.02, 0.04, 0.06, 0.08)
     ]
     assert counts == [37, 0, 0, 5, 0], "pixels are read as 2 x - 1, so that 0.06 is 0.12"
 
@@ -276,11 +279,11 @@ def test_slow_changes_add_up(artifact: Artifact) -> None:
 def test_what_is_kept_is_written_where_it_is_and_nothing_else_is_moved(artifact: Artifact) -> None:
     """Copying it would take as long as an eighth of the tokens of a large tower takes."""
     tower, (name,) = tower_of(artifact), artifact.graph("frame_00").inputs
-    tower.compute(b"", {name: picture(0)[None]})
-    before = tower._lanes[b""].arrays
+    tower.compute(LANE, {name: picture(0)[None]})
+    before = tower._lanes[LANE].arrays
     old = {key: array.copy() for key, array in before.items()}
-    assert tower.compute(b"", {name: moved(picture(0), 3)[None]})[1] == 5
-    for key, array in tower._lanes[b""].arrays.items():
+    assert tower.compute(LANE, {name: moved(picture(0), 3)[None]})[1].computed == 5
+    for key, array in tower._lanes[LANE].arrays.items():
         assert array is before[key]
         assert 0 < (array != old[key]).reshape(TOKENS, -1).any(1).sum() <= 5
     nodes = {
@@ -340,11 +343,12 @@ def test_a_token_that_is_not_computed_gets_what_a_similar_one_has(artifact: Arti
     for patch, level in ((0, 0.9), (3, 0.7), (7, 0.8), (20, 1.0), (14, 0.5), (15, 0.45), (16, 0.1)):
         y, x = divmod(patch, 6)
         after[:, 4 * y : 4 * y + 4, 4 * x : 4 * x + 4] = level
-    tower.compute(b"", {name: before[None]})
+    tower.compute(LANE, {name: before[None]})
     literal(before[None], range(TOKENS))
-    (value, *_), count, forward = tower.compute(b"", {name: after[None]})
-    assert (count, forward, fed[INDEX].tolist()) == (5, 2, [0, 1, 4, 8, 21])
-    (seen,) = tower.seen([b""])
+    (value, *_), work = tower.compute(LANE, {name: after[None]})
+    assert work == TokenWork(TOKENS, changed=4, filled=1, forward=2)
+    assert fed[INDEX].tolist() == [0, 1, 4, 8, 21]
+    (seen,) = tower.seen([LANE])
     assert np.flatnonzero(seen.computed).tolist() == [0, 3, 7, 20]
     assert np.flatnonzero(seen.forward).tolist() == [14, 15]
     similar = {15: 4, 16: 4}
@@ -371,5 +375,5 @@ def test_an_artifact_from_before_keeps_what_it_does_not_compute(artifact: Artifa
 
     for manifest in (before, artifact.manifest):
         (tower,) = token_towers(manifest, REUSE, run, renew).values()
-        tower.compute(b"", {"row": image[None]})
+        tower.compute(LANE, {"row": image[None]})
     assert fed == [{PIXELS, INDEX}, {PIXELS, INDEX, PLACES, ROWS}]

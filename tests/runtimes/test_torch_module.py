@@ -11,7 +11,7 @@ import torch
 import ttscompile
 from tests.plans import store_schedules
 from tests.rounding import assert_equal_but_for_rounding
-from ttscompile import Noise, Plan, Source
+from ttscompile import Noise, Plan, Source, TokenReuse
 from ttscompile.artifact import Artifact, load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.artifact.write import update_plans
@@ -89,12 +89,24 @@ def test_the_default_plan_is_the_artifacts(artifact: Artifact) -> None:
 
 
 def test_a_plan_of_ones_own_and_one_that_it_cannot_compute(artifact: Artifact) -> None:
-    given = inputs(1)
-    mixed, own = artifact.plans["mixed"], replace(artifact.plans["mixed"], precision={"blocks": "int8"})
-    found = [ttscompile.to_module(artifact.path, plan)(*given) for plan in ("mixed", mixed, own)]
-    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2]), "in fp32, as it says"
-    with pytest.raises(IllegalPlanError, match="plan 'mixed@bf16' has weights of bf16, and a module computes in fp32"):
-        ttscompile.to_module(artifact.path, "mixed@bf16")
+    """Nothing that a plan says is left out in silence."""
+    given, mixed, reuse = inputs(1), artifact.plans["mixed"], TokenReuse(0.1, 8)
+    found = [ttscompile.to_module(artifact.path, plan)(*given) for plan in ("mixed", mixed, "mixed@fp32")]
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+    int8 = replace(mixed, precision={"blocks": "int8"})
+    lossy: dict[str, str | Plan] = {
+        "'mixed@bf16' has bf16": "mixed@bf16",
+        "'mixed@fp16.blocks' has fp16": "mixed@fp16+blocks",
+        "'given' has int8": int8,
+        "'given' has reused tokens": replace(mixed, tokens=reuse),
+        "'given' has int8 and reused tokens": replace(int8, tokens=reuse),
+    }
+    for told, plan in lossy.items():
+        remedy = r"Give a plan in fp32: 'NAME@fp32', which is plan\.exact"
+        with pytest.raises(IllegalPlanError, match=f"plan {told}, and a module computes all tokens .* fp32. {remedy}"):
+            ttscompile.to_module(artifact.path, plan)
+        if isinstance(plan, Plan):
+            assert torch.equal(found[0], ttscompile.to_module(artifact.path, plan.exact)(*given))
 
 
 @pytest.mark.slow
@@ -170,6 +182,9 @@ def test_moving_it_moves_everything(artifact: Artifact) -> None:
 def test_a_schedule_that_a_module_cannot_have_is_refused(artifact: Artifact) -> None:
     with pytest.raises(IllegalPlanError, match="keeps nothing between calls"):
         ttscompile.to_module(artifact.path, "rollout")
+    for cells, message in ((np.ones((5, 5), np.int8), "step 0 must be dense"), (np.stack([CELLS] * 2), r"\(2, 5, 5\)")):
+        with pytest.raises(IllegalPlanError, match=message):  # though a runtime would repair the first
+            ttscompile.to_module(artifact.path, Plan(cells=cells, repair=True))
 
 
 @pytest.mark.parametrize(

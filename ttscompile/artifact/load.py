@@ -136,9 +136,9 @@ class Artifact:
     def plan(self, name: str) -> Plan:
         """A plan by its name, or in another precision: ``NAME@fp32``, ``NAME@int8``, ``NAME@bf16``.
 
-        In fp32 all tokens are computed, too, which every runtime can do. int8 is of all parts that the artifact has
-        such models of. bf16 and fp16, which torch makes of the weights, are of all parts. Parts may be named in place
-        of these: ``NAME@int8+PART+PART``. What it falls back on (``Plan.otherwise``) is in the same.
+        In each of these all tokens are computed, too, which every runtime can do. int8 is of all parts that the
+        artifact has such models of. bf16 and fp16, which torch makes of the weights, are of all parts. Parts may be
+        named in place of these: ``NAME@int8+PART+PART``. What it falls back on (``Plan.otherwise``) is in the same.
 
         Raises:
             IllegalPlanError: there is none of this name.
@@ -220,18 +220,14 @@ class Artifact:
             features=self.manifest.features,
             frames=self.graphs.get(names.FRAMES),
             towers=tuple(self.graph(name) for name in names.frame_pieces(self.graphs)),
+            scene=self.graphs.get(names.SCENE),
         )
 
 
 def load_artifact(path: str | Path) -> Artifact:
     """Open an artifact and check all of it: schema, sizes and hashes of all files, identity, plans, onnxruntime.
 
-    Returns:
-        The artifact; arrays are mapped, not read.
-
-    Raises:
-        ArtifactChangedError: it was replaced or changed meanwhile.
-        ArtifactError: says what is wrong, where, and what to do.
+    Arrays are mapped, not read. One that was replaced or changed meanwhile is an ``ArtifactChangedError``.
     """
     place = Path(path)
     require_artifact_path(place)
@@ -252,11 +248,7 @@ def require_artifact_path(path: Path) -> None:
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Read ``manifest.json`` of a directory, and nothing else.
-
-    Raises:
-        ArtifactError: not an artifact, or a manifest that is damaged or of another schema version.
-    """
+    """Read ``manifest.json`` of a directory, and nothing else."""
     path = directory / MANIFEST
     require_artifact_path(directory)
     if not os.path.lexists(path):

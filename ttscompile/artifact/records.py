@@ -16,7 +16,7 @@ from ..core.spec import SamplerTable
 from ..core.update import update_flops
 from ..errors import ArtifactError
 from ..ir import pieces as names
-from ..ir.flops import frames_flops, graph_flops
+from ..ir.flops import graph_flops, once_flops
 from ..ir.layers import layers_graph
 from ..ir.pieces import join
 from ..ir.program import Program
@@ -47,13 +47,13 @@ def block_records(program: Program) -> tuple[BlockRecord, ...]:
 
 def flops_record(program: Program) -> FlopsRecord:
     """FLOPs of one call's parts for one stream."""
-    pieces, types = program.pieces, program.pieces.condition.types()
+    pieces, types = program.pieces, program.pieces.conditions
     steps, sample = program.spec.sampler.steps, program.spec.sample
     step = 0 if pieces.step is None else graph_flops(pieces.step) * steps
     read = condition_flops(steps, sample, numbers_of(types[name].at(1) for name in pieces.features))
     return FlopsRecord(
         dense=program.dense_flops,
-        prologue=graph_flops(pieces.condition) + frames_flops(pieces) + step + read,
+        prologue=once_flops(pieces) + step + read,
         pruner=0 if pieces.pruner is None else graph_flops(pieces.pruner),
         stem=graph_flops(pieces.stem.graph),
         tail=graph_flops(pieces.tail.graph) + update_flops(program.spec.sampler, sample),
@@ -89,13 +89,7 @@ def context_records(program: Program) -> dict[str, ContextRecord]:
 def piece_records(
     program: Program, models: Mapping[str, ModelProto], files: Mapping[str, str]
 ) -> dict[str, PieceRecord]:
-    """One record an ONNX model.
-
-    Args:
-        models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
-            ``dense_step``, and perhaps ``idle`` and ``layers``.
-        files: file name of each model.
-    """
+    """One record an ONNX model, of ``lower_program``, in this file."""
     optional = {names.IDLE, *(names.of_loop(names.ADVANCE, loop) for loop in program.spec.loops)}
     expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}
     if set(models) != set(expected):

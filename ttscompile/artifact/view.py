@@ -19,7 +19,7 @@ from ..core.start import Start, rest_of
 from ..core.update import update_flops
 from ..errors import ArtifactError, IllegalPlanError
 from ..ir.flops import graph_flops
-from ..ir.pieces import ADVANCE, PRUNER, STEP, frame_pieces, of_loop, part_of
+from ..ir.pieces import ADVANCE, PRUNER, SCENE, STEP, frame_pieces, of_loop, part_of
 from ..ir.program import Pieces
 from .load import Artifact
 from .manifest import Manifest, WeightsRecord
@@ -87,11 +87,7 @@ class View:
         return {} if self.variant.weights == ORIGINAL else self.artifact.block_weights[self.variant.weights]
 
     def onnx_file(self, piece: str, first_step: bool = False) -> str:
-        """Name of the ONNX file of a piece, in its precision and with its weights.
-
-        Args:
-            first_step: of step 0, whose blocks have the original's weights.
-        """
+        """Name of the ONNX file of a piece, in its precision and with its weights; at step 0 with the original's."""
         manifest = self.artifact.manifest
         own: WeightsRecord | None = None
         if self.variant.weights != ORIGINAL and not first_step:
@@ -110,8 +106,9 @@ class View:
 
     @property
     def frames_key(self) -> object:
-        """Equal for views whose frame pieces remember the same of the same frames."""
-        return self.variant.tokens, tuple(self.onnx_file(piece) for piece in frame_pieces(self.manifest.pieces))
+        """Equal for views whose frame pieces and scene remember the same of the same observations."""
+        pieces = (*frame_pieces(self.manifest.pieces), *{SCENE} & set(self.manifest.pieces))
+        return self.variant.tokens, tuple(map(self.onnx_file, pieces))
 
 
 def view_of(artifact: Artifact, plan: Plan | str | None = None) -> View:

@@ -118,4 +118,5 @@ def convert(
         console = results()
         print_summary(artifact, console)
         if single_file is not None:
-            say(console, f"single file: {single_file}, {single_file.stat().st_size / 1e6:.1f} MB")
+            size, runs = stages[-1]["notes"]
+            say(console, f"single file: {single_file}, {size}; {runs}")

@@ -114,6 +114,11 @@ class ObservationSpec:
         one_pair = self.bounds is not None and len(np.atleast_1d(self.bounds[0])) == 1
         return one_pair and axes >= 3 and np.dtype(self.dtype).kind == "f"
 
+    @property
+    def numbers(self) -> bool:
+        """Whether a frame is a row of numbers, such as the robot's state: hardly the same in two calls."""
+        return len(self.shape) - (self.frames is not None) <= 1 and np.dtype(self.dtype).kind == "f"
+
     def draw(self, rng: np.random.Generator) -> npt.NDArray[np.generic]:
         """One stream's random observation ``[1, *shape]`` of the specified dtype, not normalised.
 

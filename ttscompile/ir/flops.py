@@ -11,6 +11,12 @@ def node_flops(node: Node, types: Types) -> int:
     return 0 if count is None else count(node, types)
 
 
+def once_flops(pieces: Pieces) -> int:
+    """FLOPs of one stream of what the observation alone decides, step values left out."""
+    scene = 0 if pieces.scene is None else graph_flops(pieces.scene)
+    return frames_flops(pieces) + scene + graph_flops(pieces.condition)
+
+
 def frames_flops(pieces: Pieces) -> int:
     """FLOPs of what is computed once a frame, for all frames of a call of one stream."""
     before = 0 if pieces.frames is None else graph_flops(pieces.frames)

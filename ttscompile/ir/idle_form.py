@@ -1,12 +1,13 @@
 """What a step without a computed block comes to where stem and tail are simple.
 
-Such an *idle* step adds a known sum of residuals to the stream, so that sample and prediction are bound by::
+Such an *idle* step adds a known sum of residuals to the residual stream, so that sample and prediction are bound by::
 
     stream     = stem(sample) + total          affine in the sample, each token for itself
     prediction = head(normalise(stream))       a LayerNorm, then affine, each token for itself
 
-The stream of a token has W numbers, but moves in as many directions as a sample has dimensions, D. With an orthonormal
-basis E of these directions, u what the total and the stem's constants say of the token, centred, and x its sample::
+A token of the residual stream has W numbers, but moves in as many directions as a sample has dimensions, D. With an
+orthonormal basis E of these directions, u what the total and the stem's constants say of the token, centred, and x its
+sample::
 
     y          = [x R + u E, rest] / sqrt(W)   rest^2 = |u - (u E) E'|^2 + W eps; its squares add up to the variance
     prediction = (x A H + u H) / |y| + h
@@ -38,7 +39,7 @@ _NORM = "aten.layer_norm.default"
 
 @dataclass(frozen=True, eq=False)
 class IdleForm:
-    """Stem and tail in this form; the sample has D dimensions, the stream W, and there are T tokens.
+    """Stem and tail in this form; the sample has D dimensions, the residual stream W, and there are T tokens.
 
     Attributes:
         type: of the total, which is that of the residual stream.
@@ -100,7 +101,7 @@ def _form(pieces: Pieces, weights: Weights) -> IdleForm:
     norm, rest = _split_at_norm(tail, stream)
     head = _affine(_wide(rest), weights, turned_in=turned)
     if dimensions >= width:
-        raise _Declined(f"the sample has {dimensions} dimensions, and the stream no more than {width}")
+        raise _Declined(f"the sample has {dimensions} dimensions, and the residual stream no more than {width}")
     scale, shift, eps = _norm_arguments(norm, weights, width)
     head = _Affine(scale[:, None] * head.matrix, head.constant + shift @ head.matrix)
     centred = stem.matrix - stem.matrix.mean(axis=1, keepdims=True)

@@ -10,10 +10,8 @@ from .program import Program
 def layers(program: Program) -> dict[str, str]:
     """Layers of the one block of a program: what reads weights or computes products, and no pass has changed.
 
-    Returns:
-        Name of a layer's result, the same in ``program.denoiser`` and in the graph of the block, by the name of the
-        layer: of its weights, or of the result where it has none. In the order of execution; empty for a program of
-        several blocks, each of which ``verify`` names anyway.
+    The name of a layer's result, the same in ``program.denoiser`` and in the graph of the block, by that of its
+    weights, or of the result where it has none, in the order of execution. None of a program of several blocks.
     """
     if len(program.blocks) != 1:
         return {}

@@ -18,6 +18,10 @@ CONDITION = "condition"
 FRAMES: Final = "frames"
 """Observations -> the rows of each frame piece, one a frame, by moving numbers; not every policy has it."""
 
+SCENE: Final = "scene"
+"""Observations that are no numbers of the robot's, and what frame pieces give -> condition values, and what the
+condition piece reads; not every policy has it."""
+
 STEP = "step"
 """Condition values and table rows -> step values, for all K steps in one batch."""
 
@@ -181,7 +185,7 @@ CONTEXT = "context."
 
 
 def dense_step_outputs(blocks: int) -> tuple[str, ...]:
-    """Outputs of ``dense_step``: the stream after the last block, and what each of them added."""
+    """Outputs of ``dense_step``: the residual stream after the last block, and what each of them added."""
     return (STREAM_NEXT, *(f"{RESIDUAL}.{b:02d}" for b in range(blocks)))
 
 
@@ -207,12 +211,12 @@ class LoopPiece:
 
     @property
     def type(self) -> TensorType:
-        """Of the stream that flows in."""
+        """Of the residual stream that flows in."""
         return self.graph.inputs[self.stream]
 
     @property
     def contexts(self) -> dict[str, TensorType]:
-        """Name and type of the values that it reads beside the stream, in order."""
+        """Name and type of the values that it reads beside the residual stream, in order."""
         return {name: type_ for name, type_ in self.graph.inputs.items() if name != self.stream}
 
     @property

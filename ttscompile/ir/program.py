@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..core.spec import PolicySpec
 from .graph import Graph, TensorType
-from .pieces import CONDITION, FRAMES, PRUNER, STEM, STEP, TAIL, LoopPiece, block_name, frame_name
+from .pieces import CONDITION, FRAMES, PRUNER, SCENE, STEM, STEP, TAIL, LoopPiece, block_name, frame_name
 
 Value = TypeVar("Value")
 """Whatever a runtime computes with."""
@@ -57,7 +57,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Loop:
-    """The pieces that run at every step. What they read beside the stream are contexts."""
+    """The pieces that run at every step. What they read beside the residual stream are contexts."""
 
     stem: LoopPiece
     blocks: tuple[LoopPiece, ...]
@@ -83,7 +83,7 @@ class Pieces(Loop):
     """All pieces of a hoisted program.
 
     Attributes:
-        condition: observations and what ``towers`` give -> condition values, once a call.
+        condition: observations and what ``towers`` and ``scene`` give -> condition values, once a call.
         step: condition values and table rows -> step values; run with a batch of K*B, step-major. None if there are
             no step values.
         pruner: condition values -> logits ``[B, K, blocks, 4]``; None before ``InsertPruner``.
@@ -93,7 +93,9 @@ class Pieces(Loop):
         features: condition values that the pruner reads.
         frames: observations -> the rows of each tower ``[m * B, ...]``, in their order; None without towers.
         towers: frame pieces: a row -> what depends on it alone, for any number of rows. What they give for all rows
-            are inputs of ``condition``.
+            are inputs of ``condition`` or ``scene``.
+        scene: observations but for rows of numbers, such as the state, and what ``towers`` give -> condition values and
+            inputs of ``condition``, all with the axis of streams first. None where that is little work.
         tokens: for towers that have tokens, by name: ``pixels_00``, row -> what patches are cut from; and
             ``tokens_00``, the tower for some of its tokens, of one row. There the symbolic size is their number.
         loop_tables: by further loop, what ``tables`` has for the original.
@@ -109,6 +111,7 @@ class Pieces(Loop):
     features: tuple[str, ...] = ()
     frames: Graph | None = None
     towers: tuple[Graph, ...] = ()
+    scene: Graph | None = None
     tokens: Mapping[str, Graph] = field(default_factory=dict)
     loop_tables: Mapping[str, Mapping[str, npt.NDArray[Any]]] = field(default_factory=dict)
     loop_pruners: Mapping[str, Graph] = field(default_factory=dict)
@@ -118,6 +121,13 @@ class Pieces(Loop):
         """How many rows of each tower a stream has."""
         types = {} if self.frames is None else self.frames.types()
         return tuple(types[next(iter(tower.inputs))].at(1)[0] for tower in self.towers)
+
+    @property
+    def conditions(self) -> dict[str, TensorType]:
+        """Name and type of the condition values, those of ``scene`` first."""
+        read = {*self.bindings, *self.features, *self.condition.outputs}
+        parts = [(one.outputs, one.types()) for one in (self.scene, self.condition) if one is not None]
+        return {name: types[name] for outputs, types in parts for name in outputs if name in read}
 
     def graphs(self) -> dict[str, Graph]:
         """Every graph by the name of its piece."""
@@ -129,7 +139,8 @@ class Pieces(Loop):
         """The graphs that the observation alone decides, by the name of their piece, in order."""
         rows = {} if self.frames is None else {FRAMES: self.frames}
         towers = {frame_name(i): tower for i, tower in enumerate(self.towers)}
-        return {**rows, **towers, CONDITION: self.condition}
+        scene = {} if self.scene is None else {SCENE: self.scene}
+        return {**rows, **towers, **scene, CONDITION: self.condition}
 
     def in_loop(self, name: str) -> Pieces:
         """Those of one loop alone, as of the original."""
@@ -138,7 +149,7 @@ class Pieces(Loop):
 
 
 def mapped(record: Value, function: Callable[[Graph], Graph]) -> Value:
-    """A record of this module with another graph in place of each that it holds; inputs of the stream keep names."""
+    """A record of this module with another graph in place of each that it holds; the residual stream's inputs stay."""
     made: Any = record
     match made:
         case Graph():
@@ -152,17 +163,15 @@ def mapped(record: Value, function: Callable[[Graph], Graph]) -> Value:
     return cast(Value, made)
 
 
-def frame_values(
+def once_values(
     pieces: Pieces, run: Callable[[str, Mapping[str, Value]], Sequence[Value]], obs: Mapping[str, Value]
 ) -> dict[str, Value]:
-    """What the condition graph reads beside the observations, by name: every tower, run on all of its rows."""
-    if pieces.frames is None:
-        return {}
-    rows = dict(zip(pieces.frames.outputs, run(FRAMES, obs), strict=True))
+    """What the observation alone decides, step values left out, by name: towers run on the rows of all streams."""
     found: dict[str, Value] = {}
-    for i, tower in enumerate(pieces.towers):
-        given = {name: rows[name] for name in tower.inputs}
-        found |= zip(tower.outputs, run(frame_name(i), given), strict=True)
+    for name, graph in pieces.once().items():
+        if graph.outputs:
+            given = {each: found[each] if each in found else obs[each] for each in graph.inputs}
+            found |= zip(graph.outputs, run(name, given), strict=True)
     return found
 
 

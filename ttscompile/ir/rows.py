@@ -26,13 +26,7 @@ class _Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Rows:
-    """How a value crosses.
-
-    Attributes:
-        name: of the value [.., m * B, ..].
-        crossing: its name where it crosses.
-        unfolded: its type there, with an axis of size B.
-    """
+    """How a value ``[.., m * B, ..]`` crosses: its name there, and its type with an axis of size B."""
 
     name: str
     type: TensorType

@@ -105,10 +105,10 @@ def _verify_contexts(readers: Mapping[str, Mapping[str, TensorType]], given: Con
 def _verify_bindings(pieces: Pieces) -> dict[str, TensorType]:
     """Type of every table."""
     step = () if pieces.step is None else pieces.step.outputs
-    provided = {Binding.CONDITION: pieces.condition.outputs, Binding.TABLE: pieces.tables, Binding.STEP: step}
+    provided = {Binding.CONDITION: pieces.conditions, Binding.TABLE: pieces.tables, Binding.STEP: step}
     given = {name for name, binding in pieces.bindings.items() if name in provided.get(binding, ())}
     for name in pieces.features:
-        if name not in pieces.condition.outputs:
+        if name not in pieces.conditions:
             raise PassError(f"pruner: its feature %{name} is not an output of the condition graph.")
     if pieces.pruner is not None and tuple(pieces.pruner.inputs) != pieces.features:
         raise PassError(f"pruner: reads {list(pieces.pruner.inputs)}; its features are {list(pieces.features)}.")
@@ -146,7 +146,7 @@ def _verify_frames(pieces: Pieces) -> None:
         raise PassError(f"frames: gives the rows {rows}; the towers read {read}.")
     for tower in pieces.towers:
         for name in tower.outputs:
-            if name not in pieces.condition.inputs:
+            if name not in {*pieces.condition.inputs, *(() if pieces.scene is None else pieces.scene.inputs)}:
                 raise PassError(f"frames: %{name} of a tower is no input of the condition graph.")
 
 

@@ -1,4 +1,4 @@
-"""Values that the loop reads beside the stream, in the model of the whole call: made once, read by step."""
+"""Values that the loop reads beside the residual stream, in the model of the whole call: made once, read by step."""
 
 from collections.abc import Mapping
 
@@ -7,8 +7,8 @@ from onnx import ModelProto
 
 from ..errors import LoweringError
 from ..ir.graph import TensorType
-from ..ir.pieces import CONDITION, PRUNER, STEP
-from ..ir.program import Binding, Pieces, frame_values
+from ..ir.pieces import PRUNER, STEP
+from ..ir.program import Binding, Pieces, once_values
 from .graph_writer import GraphWriter, Weights
 
 
@@ -38,10 +38,7 @@ class Contexts:
     ) -> None:
         self._main, self._models, self._weights = main, models, weights
         self.pieces, self.streams, self.steps = pieces, streams, steps
-        condition = models[CONDITION]
-        given = {**observations, **frame_values(pieces, self._inline, observations)}
-        made = self._inline(CONDITION, given)
-        self.conditions: dict[str, str] = dict(zip([v.name for v in condition.graph.output], made, strict=True))
+        self.conditions = once_values(pieces, self._inline, observations)
         self.rows = {name: main.constant(table, table.dtype) for name, table in pieces.tables.items()}
         self.by_step = {} if pieces.step is None else self._step_values(models[STEP])
 
@@ -57,7 +54,7 @@ class Contexts:
 
     def condition(self) -> str:
         """What a correction reads: the pruner's features, one row of numbers a stream, ``[B, N]``."""
-        types, rows = self.pieces.condition.types(), []
+        types, rows = self.pieces.conditions, []
         for name in self.pieces.features:
             axis, value = types[name].batch_axis or 0, self.conditions[name]
             order = [axis, *(i for i in range(len(types[name].shape)) if i != axis)]
@@ -91,12 +88,9 @@ class Contexts:
 
 
 class StreamContexts:
-    """Hands out the value of a context at a step, of some of the streams.
+    """Hands out the value of a context at a step, of the streams of these numbers, int64 ``[S]``.
 
-    Args:
-        w: of a graph inside of the main one; what does not change from step to step is written there.
-        contexts: of all streams.
-        members: numbers of the streams, int64 ``[S]``.
+    Its graph is inside of the main one; what does not change from step to step is written there.
     """
 
     def __init__(self, w: GraphWriter, contexts: Contexts, members: str) -> None:

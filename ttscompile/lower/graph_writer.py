@@ -20,10 +20,6 @@ class GraphWriter:
     """Nodes and constants of one graph; ``inner`` opens a graph for the body of an If, a Loop or a Scan.
 
     Names are unique over all graphs of a model, since a body sees the values of the graphs around it.
-
-    Attributes:
-        nodes: what was written.
-        initializers: its constants.
     """
 
     def __init__(self, names: Iterator[int] | None = None) -> None:

@@ -107,11 +107,7 @@ class DenoisingLoop:
         self._groups = [block.group for block in program.blocks]
 
     def write(self, plan: LoweredPlan, inputs: LoopInputs) -> tuple[str, str]:
-        """Write stem and loop.
-
-        Returns:
-            The sample after the last step ``[B, T, D]``, and the computed residuals ``[computed cells, E]`` in order.
-        """
+        """Write stem and loop: the last sample ``[B, T, D]``, and computed residuals ``[computed, E]`` in order."""
         main = self._main
         self._plan, self._inputs = plan, inputs
         columns = {name: getattr(self._sampler, name)[:, None] for name in names.X0_COLUMNS}
@@ -201,7 +197,7 @@ class DenoisingLoop:
         return w.choose(any_rollout, mixed.body("mixed", both), plain.body("plain", total))[0]
 
     def _group(self, step: _Step, stream: str, before: Sequence[str], members: range) -> GraphProto:
-        """Neighbouring blocks of which some are computed; gives the stream and the computed residuals."""
+        """Neighbouring blocks of which some are computed; gives the residual stream and the computed residuals."""
         w = self._main.inner()
         value, made = stream, list[str]()
         for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
@@ -211,7 +207,7 @@ class DenoisingLoop:
         return w.body(f"group_{members.start}", value, w.op("Concat", *made, axis=0))
 
     def _block(self, step: _Step, stream: str, before: Sequence[str], b: int) -> GraphProto:
-        """The gap before a computed block, and the block; gives the stream and the residual as a row."""
+        """The gap before a computed block, and the block; gives the residual stream and the residual as a row."""
         w = self._main.inner()
         gap = w.op("Gather", step.sums, w.op("Gather", step.position, w.constant(b)))
         value = w.op("Add", stream, w.op("Reshape", gap, self._shape))
@@ -222,12 +218,12 @@ class DenoisingLoop:
         return w.body(name, value, w.op("Reshape", residual, w.constant([1, -1])))
 
     def _reused(self, w: GraphWriter, stream: str, name: str) -> GraphProto:
-        """The other branch: the stream as it is, and no residuals. What is reused is in the sums of the gaps."""
+        """The other branch: the residual stream as it is, and no residuals. What is reused is in the gaps' sums."""
         inner = w.inner()
         return inner.body(f"{name}_reused", inner.op("Identity", stream), inner.op("Identity", self._none))
 
     def _add_in_step(self, w: GraphWriter, step: _Step, stream: str, before: Sequence[str], b: int) -> str:
-        """Add to the stream, in the gap before block b, FORWARD reads of residuals that the step itself has computed.
+        """Add, in the gap before block b, FORWARD reads of residuals that the step itself has computed.
 
         The residuals of the blocks ``before`` b are rows of those that were computed; b is the number of blocks for the
         step's last gap.

@@ -24,7 +24,7 @@ from ..core.four_bits import ATTRIBUTES, BLOCK_PRODUCT, columns_at_once, pack
 from ..core.spec import FP32, INT4, INT8, PRECISIONS
 from ..errors import LoweringError
 from ..ir.flops import graph_flops
-from ..ir.pieces import BLOCKS, CONDITION, NOT_KEPT, OF_ALL_BLOCKS, STEP, frame_name, is_tokens, part_of
+from ..ir.pieces import BLOCKS, CONDITION, NOT_KEPT, OF_ALL_BLOCKS, SCENE, STEP, frame_name, is_tokens, part_of
 from .graph_writer import GraphWriter
 from .integer_attention import HEADS, integer_attention
 from .integer_convolution import DOMAIN, DYNAMIC_PRODUCT, INTEGER_PRODUCT, NO_ZERO, integer_convolution, shapes_of
@@ -54,7 +54,7 @@ MOST_ROWS = 2**31 // (255 * LARGEST) - 1
 LEAST_TABLE = 2**20
 """Numbers of a table whose rows are read in eight bits: an embedding of words has some 10**8."""
 
-FOUR_BITS = (BLOCKS, CONDITION, STEP)
+FOUR_BITS = (BLOCKS, SCENE, CONDITION, STEP)
 """The parts that precision int4 has in four bits, a language model's prefix among them. Image encoders have eight: they
 wait for arithmetic, which takes longer in four."""
 
@@ -65,13 +65,9 @@ Matrices = Mapping[str, tuple[str, Array]]
 def parts_to_lower(
     program: Program, keep_fp32: Collection[str] = ()
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """The parts of a program (``ir.pieces.part_of``) for which another precision is worth while.
+    """The parts of a program (``ir.pieces.part_of``) for which another precision is worth while, in order.
 
-    Args:
-        keep_fp32: parts that stay as they are; ``prologue`` for all of them but ``blocks``.
-
-    Returns:
-        Names of parts in order; those that stay fp32 because it was asked; and notes on what stays.
+    Then those that stay fp32 because ``keep_fp32`` asks for it, ``prologue`` for all but ``blocks``; and notes.
     """
     flops: dict[str, int] = {}
     rows = {frame_name(i): count for i, count in enumerate(program.pieces.rows)}
@@ -85,6 +81,8 @@ def parts_to_lower(
     left = tuple(part for part in flops if part in keep_fp32 or (part != BLOCKS and PROLOGUE in keep_fp32))
     least = LEAST_SHARE * flops[BLOCKS]
     small = [part for part in flops if part not in left and part != BLOCKS and flops[part] < least]
+    if CONDITION in small and SCENE in flops and SCENE not in (*left, *small):  # it may have the same weights
+        small.remove(CONDITION)
     found = tuple(part for part in flops if part not in {*left, *small})
     if not found:
         raise LoweringError(f"everything stays fp32: {', '.join(flops)}. Keep less, or convert with precision 'fp32'.")
@@ -121,7 +119,7 @@ def lower_precision(
                 kept = next(value for value in models[name].graph.input if value.name not in NOT_KEPT)
                 size = int(kept.type.tensor_type.shape.dim[0].dim_value)
             least, bits = 0 if part == BLOCKS else LEAST_ROWS, precision if part in FOUR_BITS else INT8
-            model, own = quantize_model(models[name], weights, least, size, bits)
+            model, own = quantize_model(models[name], weights, least, size, bits, constants)
             if own:
                 lowered[name] = model
                 new.update(own)
@@ -168,7 +166,12 @@ def require_precision(precision: str, keep_fp32: Collection[str] = ()) -> None:
 
 
 def quantize_model(
-    model: ModelProto, weights: Mapping[str, Array], least_rows: int = 0, size: int = 1, precision: str = INT8
+    model: ModelProto,
+    weights: Mapping[str, Array],
+    least_rows: int = 0,
+    size: int = 1,
+    precision: str = INT8,
+    there: Collection[str] = (),
 ) -> tuple[ModelProto, dict[str, Array]]:
     """One model with its products by constants in integers; inputs and outputs stay as they are.
 
@@ -178,6 +181,7 @@ def quantize_model(
         least_rows: that a product has to have; a product whose rows are not known has none.
         size: what B is taken to be where rows are counted: one stream, or in a form for some tokens all of them.
         precision: of matrices; convolutions and tables are in int8 in any.
+        there: constants that other models have; a product by these may have fewer rows.
 
     Returns:
         A new model, and the constants that it has and ``model`` has not, by name: int8 ``[rows, columns]`` and
@@ -188,10 +192,14 @@ def quantize_model(
     matrices, shapes = _matrices(model, known), shapes_of(model, size)
     constants: dict[str, Array] = {}
     w, store = GraphWriter(), partial(_integers, constants)
+
+    def enough(constant: str, rows: int) -> bool:
+        return rows >= least_rows or f"{constant}.{precision}" in there
+
     for node in model.graph.node:
         attributes = _attributes(node)
         if not (
-            _integer_product(w, node, known, matrices, shapes, least_rows, store, precision)
+            _integer_product(w, node, known, matrices, shapes, enough, store, precision)
             or _integer_rows(w, node, attributes, known, store)
             or integer_convolution(w, node, attributes, known, shapes, store)
             or integer_attention(w, node, attributes, shapes, size > 1)
@@ -210,12 +218,7 @@ def quantize_model(
 
 
 def quantize_matrix(matrix: Array) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
-    """A matrix as integers times a scale for each column.
-
-    Returns:
-        int8 ``[rows, columns]`` in -127..127, and float32 ``[columns]``; their product is within half a scale of the
-        matrix.
-    """
+    """A matrix as int8 ``[rows, columns]`` in -127..127 and float32 ``[columns]``; off by half a scale at most."""
     integers, scale = np.empty_like(matrix, np.int8), np.empty(matrix.shape[1], np.float32)
     for columns in columns_at_once(matrix):
         part = matrix[:, columns]
@@ -247,11 +250,11 @@ def _integer_product(
     known: Mapping[str, Array],
     matrices: Matrices,
     shapes: Mapping[str, Sequence[int]],
-    least_rows: int,
+    enough: Callable[[str, int], bool],
     store: Callable[..., tuple[str, str]],
     precision: str,
 ) -> bool:
-    """Write a product by a constant matrix with integers, if it has as many rows; whether it is one."""
+    """Write a product by a constant matrix with integers, if it has rows ``enough``; whether it is one."""
     attributes, flip, bias = _attributes(node), False, ""
     if node.op_type == "Gemm":
         if attributes.get("transA", 0) or attributes.get("alpha", 1.0) != 1 or attributes.get("beta", 1.0) != 1:
@@ -266,7 +269,7 @@ def _integer_product(
     if bias and (bias not in known or known[bias].shape != value.shape[1:]):
         return False
     shape = shapes.get(x, ())
-    if (math.prod(shape[:-1]) if shape else 0) < least_rows:
+    if not enough(constant, math.prod(shape[:-1]) if shape else 0):
         return False
     if precision == INT4 and known[constant].ndim == 2:
         inputs = [x, *store(constant, value, INT4), *(["", "", bias] if bias else [])]

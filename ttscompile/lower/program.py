@@ -47,16 +47,6 @@ EXAMPLE_STREAMS = 3
 """Batch size while exporting; neither 0 nor 1, which torch.export would specialise on."""
 
 
-def lower_graph(graph: Graph, name: str) -> onnx.ModelProto:
-    """The ONNX model of a graph.
-
-    Inputs and outputs are called as in the graph; sizes ``Batch(c)`` are the dynamic dimension ``c*B``. Each constant
-    that is read is an initializer of the constant's name with dtype and dims and no data: ``artifact.bind`` points it
-    into a weights file. The bytes depend on the graph and the versions of torch and onnxscript alone.
-    """
-    return _lower({name: graph})[name]
-
-
 def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     """The models of all pieces of a program.
 
@@ -72,7 +62,7 @@ def lower_program(program: Program) -> dict[str, onnx.ModelProto]:
     inside = layers_graph(program)
     own = advances(program) | ({} if inside is None else {LAYERS: inside})
     own |= {of_loop(PRUNER, loop): graph for loop, graph in pieces.loop_pruners.items()}
-    models = _lower({**graphs, **own})
+    models = lower_graphs({**graphs, **own})
     idle, _ = lower_idle(pieces, program.weights, OPSET)
     return {**models, **lower_all_blocks(pieces.blocks, models), **({} if idle is None else {IDLE: idle})}
 
@@ -87,7 +77,13 @@ def structural_key(graph: Graph) -> str:
     return repr(replace(graph, nodes=tuple(replace(node, source="") for node in graph.nodes)))
 
 
-def _lower(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
+def lower_graphs(graphs: dict[str, Graph]) -> dict[str, onnx.ModelProto]:
+    """ONNX models of graphs, by name.
+
+    Inputs and outputs are called as in the graph; sizes ``Batch(c)`` are the dynamic dimension ``c*B``. Each constant
+    that is read is an initializer of the constant's name with dtype and dims and no data: ``artifact.bind`` points it
+    into a weights file. The bytes depend on the graph and the versions of torch and onnxscript alone.
+    """
     for name, graph in graphs.items():
         if len(set(graph.outputs)) != len(graph.outputs):
             raise LoweringError(f"{name}: the outputs {graph.outputs} hold a value twice; give each a name of its own.")

@@ -20,7 +20,7 @@ from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
 from ..core.update import bounded, clips, matrices
-from ..ir.pieces import ADVANCE, CONDITION, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
+from ..ir.pieces import ADVANCE, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..runtimes.contexts import ContextValues
 from ..runtimes.frames import FramePieces
 from ..runtimes.onnxruntime.sessions import Sessions, run_named, run_piece, run_prologue
@@ -30,11 +30,7 @@ Array = npt.NDArray[Any]
 
 
 class Probe:
-    """The pieces on one observation.
-
-    Args:
-        obs: normalised observations by key, ``[B, ...]``.
-    """
+    """The pieces on one observation, normalised, ``[B, ...]`` by key."""
 
     def __init__(self, view: View, obs: Mapping[str, Array]) -> None:
         self._view, self._manifest, self._pool = view, view.manifest, Sessions(1)
@@ -45,7 +41,8 @@ class Probe:
         named |= {**obs, **{arguments[key]: value for key, value in obs.items()}}
         named |= FramePieces(pieces, partial(run_piece, self._sessions, pieces)).values(named)
         self._contexts = ContextValues(self._manifest, self.streams, np, np.zeros, view.tables)
-        run_prologue(self._sessions, {CONDITION: pieces[CONDITION]}, named, self._contexts)
+        early = {name: piece for name, piece in pieces.items() if name != STEP}
+        run_prologue(self._sessions, early, named, self._contexts)
         if (step := pieces.get(STEP)) is not None:
             for k in range(self._manifest.steps):  # a runtime has them in one batch
                 feed = {name: self._contexts.at(name, k) for name in step.inputs}
@@ -94,11 +91,8 @@ class Probe:
     def trace(self, noise: Noise, plan: PlanArray, correction: Correction | None) -> tuple[FloatArray, FloatArray]:
         """One call, the first of its episode, by the definitions in ``docs/design.md`` section 2.
 
-        Args:
-            plan: int8 ``[B, K, blocks]``, without ROLLOUT.
-
-        Returns:
-            The sample after every step, and the prediction at every step, ``[K, B, T, D]`` each.
+        The plan is int8 ``[B, K, blocks]``, without ROLLOUT. Samples after every step, and predictions, are
+        ``[K, B, T, D]``.
         """
         spec, blocks, groups = self._manifest.spec, self._manifest.blocks, self._manifest.groups
         sampler, horizon = spec.sampler, spec.sample[0]
@@ -219,7 +213,7 @@ def block_errors(
     errors = np.zeros((len(rows), len(manifest.blocks)))
     for b, block in enumerate(manifest.blocks):
         stream = probe_stream(b, block.type, golden.streams, float(golden.scales[b]))
-        # A block may give nothing at some step, or at all: then what counts is the stream that it is added to.
+        # A block may give nothing at some step, or at all: then what counts is the residual stream that it is added to.
         floor = max(1e-3 * float(norms[:, b].max()), 1e-6 * float(np.linalg.norm(stream)))
         for i, row in enumerate(rows.tolist()):
             residual = function(b, int(golden.steps[row]), stream)
