@@ -49,6 +49,8 @@ class PolicyInfo:
             than the one before (``CompiledPolicy.follow`` tells it of one that is not).
         policy_hz: rate of the frames and actions that the policy was trained with, if the recordings or ``build`` said
             it.
+        timed_on: where the plans were timed that the default was chosen among, in words, and what to do if that was
+            another machine; None if none were.
         other_noise: mean difference of two answers of the original to one observation, if the calibration found one.
     """
 
@@ -75,3 +77,4 @@ class PolicyInfo:
     other_noise: float | None = None
     trained_prefix: int = 0
     policy_hz: float | None = None
+    timed_on: str | None = None

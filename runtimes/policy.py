@@ -13,6 +13,7 @@ from ttscompile.core.coercion import Array, integer
 from ttscompile.core.plan import Plan
 from ttscompile.core.spec import FP32, FloatArray, Noise
 from ttscompile.errors import NonFiniteActionsError, TtscompileError
+from ttscompile.measure.machine import elsewhere
 from ttscompile.measure.process import LONGEST_WAIT, Process
 
 from .arrays import check_observation, check_seed, like, read_observation
@@ -46,9 +47,6 @@ class CompiledPolicy:
         plan: see ``load``.
         origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
         instruct: puts tokens in the place of a task's text; None for none.
-
-    Raises:
-        IllegalPlanError: the artifact has no plan of this name.
     """
 
     def __init__(
@@ -111,6 +109,7 @@ class CompiledPolicy:
             other_noise=record.get("other_noise") or None,
             policy_hz=record.get("policy_hz"),
             trained_prefix=manifest.spec.trained_prefix,
+            timed_on=elsewhere(record.get("timed_on")),
         )
 
     @property
@@ -252,8 +251,7 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: a frame or noise that does not fit; nothing was executed, and the frame was not kept.
-            IllegalPlanError: as ``predict_action``.
-            NonFiniteActionsError: as ``predict_action``.
+            IllegalPlanError, NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
             obs, example = self._read(batch, others=True)
@@ -275,8 +273,7 @@ class CompiledPolicy:
 
         Raises:
             ObservationError: a window, a frame, noise or a prefix that does not fit; nothing was executed or kept.
-            IllegalPlanError: as ``predict_action``.
-            NonFiniteActionsError: as ``predict_action``.
+            IllegalPlanError, NonFiniteActionsError: as ``predict_action``.
         """
         with self._turn():
             specs = self._spec.observations
@@ -342,11 +339,7 @@ class CompiledPolicy:
         return NO_PREFIX if own.otherwise is not None else prefix_refusal(self._runtime.view(own).manifest.spec)
 
     def _turn(self) -> threading.Lock:
-        """The lock, to hold during a call. Not a manager of contexts of our own: an interrupt might keep it locked.
-
-        Raises:
-            TtscompileError: a call is under way, the program is ending, or this is another process.
-        """
+        """The lock, to hold during a call. Not a manager of contexts of our own: an interrupt might keep it locked."""
         if self._process.left:
             what = f"the policy was loaded in {self._process}. Threads and locks that a call needs are missing here"
             raise TtscompileError(f"{what}. Load the policy in the process that calls it, after the fork.")

@@ -232,9 +232,15 @@ def test_the_rate_of_training_is_kept_and_decides_the_deadline(
     path = policies.record(directory.parent / "calls.npz")
     if said == "by the recording":
         np.savez(path, **np.load(path), meta=np.array('{"policy_hz": 10}'))
-    ttscompile.build("policy.ckpt", directory, path, control_hz=50, progress=False, **given)
+    notes = dict[str, tuple[str, ...]]()
+    ttscompile.build("policy.ckpt", directory, path, control_hz=50, progress=False, explain=notes.__setitem__, **given)
     info = ttscompile.load(directory).info
     hz = 50 if said == "by nobody" else 10
+    *assumed, kept = notes["loop"]
+    plays = "the executor plays 4 actions of a chunk, and has 3 more in reserve for one that comes late"
+    assert kept == f"calls may take {asked['calibrate']['latency_ms']:.4g} ms: {plays}, at {hz} Hz"
+    told = "nobody says at which rate the policy was trained: 50 Hz are assumed (--policy-hz)"
+    assert assumed == [told] * (said == "by nobody")
     assert asked["calibrate"]["policy_hz"] == (None if said == "by nobody" else 10)
     longest = settings.resolve(settings.ExecutorSettings(policy_hz=hz), info, 50).feasibility(1e-3).max_latency
     assert asked["calibrate"]["latency_ms"] == pytest.approx(1e3 * longest)
@@ -264,7 +270,17 @@ def test_a_checkpoint_becomes_a_policy(
     assert instructed not in result.output
     monkeypatch.setattr(summary, "instruct_of", lambda each: each is artifact)  # of a policy that is told its task
     summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1)
-    assert instructed in printed.getvalue()
+    assert instructed in printed.getvalue() and "AsyncExecutor" not in printed.getvalue()
+    summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1, control_hz=50.0)
+    loop = printed.getvalue().partition("    with ttscompile.")[2].splitlines()
+    assert loop[0] == "AsyncExecutor(policy, control_hz=50) as executor:"
+    assert loop[3].startswith(f"            {instructed}")
+    assert [line.strip() for line in loop[4:8]] == [
+        "executor.observe(observation)  # one frame, by key",
+        "if executor.ready:",
+        "robot.move(executor.action())",
+        "wait_for_the_next_tick()",
+    ]
     assert not (tmp_path / "compiled" / STATE).exists()
 
 

@@ -67,10 +67,10 @@ def build(
         trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on
             (``frontends.recordings_of``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
-            plan is then the nearest of those whose longest call keeps up.
+            plan is then the nearest of those of whose calls 99 of 100 keep up.
         policy_hz: rate of the frames and actions that the policy was trained with; see ``calibrate``. If nobody says
             it, the deadline is that of ``control_hz``.
-        latency_ms: that the longest call may take, in place of ``control_hz``.
+        latency_ms: that 99 of 100 calls may take at most, in place of ``control_hz``.
         max_distance: from the original, that a plan may have (``calibration.proposer.near``), in units of what other
             noise changes; None for a tenth for the default, and a quarter for faster plans (``artifact.ceiling``).
         threads: that calls have.
@@ -79,9 +79,6 @@ def build(
         resume: go on where the same build was interrupted.
         observation, progress, ray: see ``calibrate``.
         of_checkpoint: ``format``, ``task``, ``encoders``, ``without_cameras`` and ``base`` of ``convert``.
-
-    Returns:
-        What was tried and chosen.
 
     Raises:
         CalibrationFailedError: no plan is near enough, or none of these keeps up; says how far the nearest is.
@@ -108,7 +105,7 @@ def build(
         _convert(checkpoint, made, resume, explain, how)
         if control_hz is not None:
             policy_hz = policy_hz or recorded_rate(trajectories)
-            latency_ms = _deadline(made, control_hz, policy_hz)
+            latency_ms = _deadline(made, control_hz, policy_hz, explain)
         artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))  # a goal that none of these reads
         rows = [row for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]
         result = calibrate(
@@ -169,13 +166,18 @@ def _convert(
         )
 
 
-def _deadline(directory: Path, control_hz: float, policy_hz: float | None) -> float:
-    """Milliseconds that the longest call may take for the policy to keep up with a control loop."""
+def _deadline(directory: Path, control_hz: float, policy_hz: float | None, explain: Explain) -> float:
+    """Milliseconds that a call may take for the policy to keep up with a control loop; says why."""
     info = open_policy(load_artifact(directory), plan="dense").info
-    longest = resolve(ExecutorSettings(policy_hz=policy_hz), info, control_hz).feasibility(1e-3).max_latency
+    loop = resolve(ExecutorSettings(policy_hz=policy_hz), info, control_hz)
+    longest = loop.feasibility(1e-3).max_latency
     if longest <= 0:
         raise CalibrationFailedError(
             f"no call is short enough for a control loop of {control_hz:g} Hz: a chunk is over before the next frame."
             " Give the rate that the policy was trained with, --policy-hz."
         )
+    unknown = f"nobody says at which rate the policy was trained: {control_hz:g} Hz are assumed (--policy-hz)"
+    actions = f"{loop.horizon} actions of a chunk, and has {loop.reserve} more in reserve for one that comes late"
+    allowed = f"calls may take {1e3 * longest:.4g} ms: the executor plays {actions}"
+    explain("loop", (*[unknown] * (policy_hz is None), f"{allowed}, at {loop.policy_hz:g} Hz"))
     return 1e3 * longest

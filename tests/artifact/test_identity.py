@@ -180,6 +180,8 @@ def test_names_of_plans_are_held_to_what_they_are_written_by(written: Path, name
         ({"skipped": {"fast": 1}}, "calibration.skipped.fast: expected a string"),
         ({"told": {"weights": ["a"]}}, "calibration.told.weights: expected a string"),
         ({"frontier": {}}, "calibration.frontier: expected a list"),
+        ({"timed_on": 3}, "calibration.timed_on: expected a string"),
+        ({"frontier": [{"calls": 1.5}]}, r"calibration.frontier\[0\].calls: expected an integer"),
         ({"frontier": [{"name": "a"}, {"worst": "1"}]}, r"calibration.frontier\[1\].worst: expected a number"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ttscompile.measure.points import best_plan
-from ttscompile.measure.timer import Timer, Times
+from ttscompile.measure.timer import MANY, Timer, Times
 
 
 class Clock:
@@ -45,11 +45,24 @@ def test_medians_and_quartiles_are_numpys() -> None:
         assert times.quartiles == pytest.approx(np.percentile(ms, [25, 75]))
 
 
-@pytest.mark.parametrize("deadline_ms", [None, 100.0])
-def test_of_plans_whose_distances_are_printed_alike_the_faster_is_the_nearest(deadline_ms: float | None) -> None:
+def test_the_longest_of_a_hundred_calls_is_their_99th_percentile() -> None:
+    draw = np.random.default_rng(0).exponential(size=200)
+    assert Times(tuple(draw.tolist())).longest == pytest.approx(np.percentile(draw, 99))
+    assert Times(tuple(draw[:MANY].tolist())).longest == pytest.approx(np.percentile(draw[:MANY], 99))
+    assert Times((1.0,) * 98 + (7.0,)).longest == 7.0
+
+
+def test_of_plans_whose_distances_are_printed_alike_the_faster_is_the_nearest() -> None:
     """That in eight bits, say, of which the other is the same in fp32; a plan that is really nearer is taken."""
     times = {"fp32": Times((68.5,)), "int8": Times((41.4,)), "near": Times((90.0,))}
     distances = {"fp32": 0.11156, "int8": 0.11162, "near": 0.104}
     alike = {name: times[name] for name in ("fp32", "int8")}
-    assert best_plan(alike, distances, (), deadline_ms) == "int8"
-    assert best_plan(times, distances, (), deadline_ms) == "near"
+    assert best_plan(alike, distances, 100.0) == "int8"
+    assert best_plan(times, distances, 100.0) == "near"
+
+
+def test_without_a_deadline_it_is_the_fastest_and_of_none_there_is_none() -> None:
+    times = {"slow": Times((9.0,)), "fast": Times((1.0,))}
+    assert best_plan(times, {"slow": 0.0, "fast": 0.1}, None) == "fast"
+    assert best_plan({}, {}, None) is None and best_plan({}, {}, 1.0) is None
+    assert best_plan(times, {"slow": 0.0, "fast": 0.1}, 0.5) is None

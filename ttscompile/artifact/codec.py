@@ -7,6 +7,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 from ..core.plan import DENSE, ORIGINAL
@@ -29,11 +30,7 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def decode(content: bytes, where: str = MANIFEST) -> Manifest:
-    """Read ``manifest.json``.
-
-    Raises:
-        ArtifactError: no manifest, another schema version, or one that was changed or damaged.
-    """
+    """Read a ``manifest.json`` of this schema, or of the one before."""
     document = _document(content, where)
     if document.get("format") != FORMAT:
         raise ArtifactError(
@@ -80,11 +77,7 @@ def to_json(manifest: Manifest) -> dict[str, Any]:
 
 
 def from_json(root: Value) -> Manifest:
-    """Inverse of ``to_json``; checks that the parts fit each other.
-
-    Raises:
-        ArtifactError: names the path in the document, expected and found.
-    """
+    """Inverse of ``to_json``; checks that the parts fit each other. Errors name the path in the document."""
     members = root.members()
     document = {key: member.data for key, member in members.items() if key != "format"}
     manifest = typed_json.from_json(Manifest, Value(document, root.path))
@@ -103,7 +96,7 @@ def from_json(root: Value) -> Manifest:
 
 
 def identities(manifest: Manifest) -> tuple[str, str]:
-    """Identity and model identity of what a manifest describes; its own two fields are not read.
+    """Identity and model identity of what a manifest describes, two sha256; its own two fields are not read.
 
     The model identity covers graphs, weights, tables, loops, normalisers, observations, chunk and block table. The
     identity covers that, pruners, all fields of all plans by name, which of them is the default, and by name the
@@ -111,9 +104,6 @@ def identities(manifest: Manifest) -> tuple[str, str]:
     has a file of its own for what fp32 alone reads. Every file stands in them with its name, by which others name it,
     and its hash. Neither covers what no action depends on: source, FLOPs, reasons, sparsities, calibration record,
     versions, what is required, and the golden record.
-
-    Returns:
-        Two sha256 of 64 digits.
     """
     document, own = to_json(manifest), (names.PRUNER, names.of_loop(names.PRUNER, ""))
     pieces, stores = document["pieces"], {k: v for k, v in document["stores"].items() if k not in _GOLDEN}
@@ -200,7 +190,8 @@ def _check_parts(manifest: Manifest, fields: Mapping[str, Value]) -> None:  # no
         if not set(piece.contexts) <= set(manifest.contexts):
             fields["pieces"].fail(f"contexts of {name} that are among {list(manifest.contexts)}")
     # The pruner may read what no piece of the loop does.
-    known = {*manifest.contexts, *manifest.pieces[names.CONDITION].outputs}
+    once = [manifest.pieces[name].outputs for name in (names.SCENE, names.CONDITION) if name in manifest.pieces]
+    known = {*manifest.contexts, *chain(*once)}
     if not set(manifest.features) <= known:
         fields["features"].fail(f"some of the contexts {sorted(known)}")
     rows = manifest.pieces[names.FRAMES].outputs if names.FRAMES in manifest.pieces else ()
@@ -305,6 +296,7 @@ _RECORD: Mapping[str, Any] = {
     "skipped": Mapping[str, str],
     "told": Mapping[str, str],
     "frontier": tuple[Mapping[str, Any], ...],
+    "timed_on": str | None,
 }
 _TRIED: Mapping[str, Any] = {
     "name": str,
@@ -314,6 +306,9 @@ _TRIED: Mapping[str, Any] = {
     "milliseconds": float,
     "worst": float,
     "near": bool,
+    "within": float,
+    "calls": int,
+    "weights": int,
 }
 
 

@@ -73,6 +73,13 @@ def check_models(directory: Path, names: Iterable[str], files: Mapping[str, File
             raise ArtifactError(f"{path}: expected an ONNX model; found {found}. {REMEDY}") from error
 
 
+def weight_bytes(directory: Path, names: Iterable[str]) -> int:
+    """What these models read of the files beside them, in bytes, each weight once. They were checked."""
+    models = (memoryview(read_file(directory / name, MAX_BYTES)) for name in names)
+    places = (place for model in models for place in _places(model, "model", 0, iter(range(MAX_FIELDS))))
+    return sum({tuple(place.items()): int(place["length"]) for place in places}.values())
+
+
 def _places(
     message: memoryview, kind: str, depth: int, left: Iterator[int], scanned: bool = False
 ) -> Iterator[dict[str, str]]:

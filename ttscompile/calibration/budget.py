@@ -75,11 +75,7 @@ def goal_of(
     *,
     usual: float = TYPICAL_SPARSITY,
 ) -> Goal:
-    """The one thing that was asked for; the sparsity ``usual`` if nothing was.
-
-    Raises:
-        CalibrationError: more than one, or a value that nothing can have.
-    """
+    """The one thing that was asked for; the sparsity ``usual`` if nothing was. Budgets exclude each other."""
     asked = {SPARSITY: target_sparsity, FLOPS: target_flops, LATENCY: latency_ms, ERROR: max_action_error}
     given = {kind: value for kind, value in asked.items() if value is not None}
     if len(given) > 1:
@@ -99,14 +95,7 @@ def goal_of(
 
 
 def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
-    """Computed cells of a goal that can be worked out: ``target_sparsity`` or ``target_flops``.
-
-    Args:
-        pruned: whether the pruner may run.
-
-    Raises:
-        CalibrationError: no plan, or only the dense one, is what was asked for.
-    """
+    """Computed cells of a ``target_sparsity`` or ``target_flops``; ``pruned`` where the pruner may run."""
     steps, blocks, flops = manifest.steps, len(manifest.blocks), manifest.flops
     step = sum(flops.blocks)
     fixed = flops.call(dense_plan(steps, blocks), pruned) - steps * step  # a call without its blocks

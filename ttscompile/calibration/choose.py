@@ -1,18 +1,24 @@
 """Which of the plans that were kept is the default: all of them judged and timed, in one run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ..artifact.load import Artifact
+from ..artifact.onnx_files import weight_bytes
+from ..artifact.view import view_of
 from ..core.plan import DENSE, FULL, SCHEDULE, Plan
 from ..errors import CalibrationFailedError
-from ..measure.points import ALIKE, Point, best_plan, efficient, fastest
-from ..measure.timer import Times
+from ..ir.pieces import LAYERS, is_of_loop
+from ..measure.points import ALIKE, best_plan, fastest
 from .judge import Score, judge, timed
 from .kept import Kept
-from .proposer import SAFER, Request, near
-from .proposers.loops import too_far
+from .proposer import SAFER, Request, least_bound
+from .proposers.loops import too_far, would_help
 from .step_counts import FAST, SAFE
+
+TIMED_LONG = 200
+"""Calls of a plan that may be the default by a deadline: their 99th percentile has to keep it."""
 
 
 @dataclass(frozen=True)
@@ -22,103 +28,135 @@ class Frontier:
     Attributes:
         tried: all plans, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
             called while it was tried; ``told`` what it does, in words; ``distance`` and ``interval`` how far it is from
-            the original on held-out episodes, with 95 % limits (``judge``); ``milliseconds`` and ``worst`` the median
-            and the longest of its calls on this machine, in milliseconds; ``near`` whether it is within
-            ``Request.farthest``; ``on_frontier`` whether no other is faster and nearer; ``kept`` whether the artifact
-            gets it.
-        plans: that the artifact gets, by name; ``schedule`` is the default.
+            the original on held-out episodes, with 95 % limits (``judge``), and ``within`` the least bound that allows
+            that; ``milliseconds`` and ``worst`` the median and ``Times.longest`` of its ``calls`` on this machine, in
+            milliseconds; ``weights`` the bytes of those that its models read; ``near`` whether it is within
+            ``Request.farthest``; ``kept`` whether the artifact gets it.
+        plans: that the artifact gets, by name.
+        default: ``schedule``, or ``dense`` where no plan may be the default unasked.
     """
 
     tried: tuple[dict[str, Any], ...]
     plans: dict[str, Plan]
     scores: dict[str, Score]
+    default: str
 
 
 def choose(kept: Kept, request: Request) -> Frontier:
     """Judge and time every plan, in each precision that it can have, and with all tokens, and choose.
 
-    The default is ``best_plan`` of those within ``Request.farthest``, where those within ``Request.bound`` are near
-    enough; there is a warning if it is not one of them. ``schedule`` is the name of the default, ``safe`` that of the
-    fastest plan that is near enough and a good deal nearer, and ``fast`` that of the fastest within
-    ``Request.farthest``, where it saves more than what counts as equally fast.
+    ``schedule`` is ``best_plan`` of those within ``Request.bound``, which are near enough, and the default; if there
+    is none, it is the nearest within ``Request.farthest``, and ``dense`` the default. ``safe`` is the fastest that is
+    near enough and a good deal nearer, and ``fast`` the fastest within ``Request.farthest``, where it saves more than
+    what counts as equally fast.
 
     Raises:
-        CalibrationFailedError: no plan is near enough, or none of those keeps the deadline; says what the nearest does.
+        CalibrationFailedError: no plan is within ``Request.farthest``; or none that is near enough keeps the deadline,
+            nor does ``dense``.
     """
-    entered, scores = {DENSE: kept.plans[DENSE]}, dict[str, Score]()
-    for name, plan in kept.plans.items():
-        if name in (DENSE, FULL):
-            continue
-        entered[name] = plan
-        if plan.precision:
-            entered[f"{name}@fp32"] = replace(plan, precision={})
-        if plan.tokens is not None:  # looking for changes may take longer than a small encoder
-            entered[f"{name}, all tokens"] = replace(plan, tokens=None)
-    kept.trials.bar.stage("held-out calls", len(entered))
-    for number, (name, plan) in enumerate(entered.items(), 1):
-        scores[name] = kept.scores[name] if kept.judged.get(name) is plan else judge(kept.trials, plan)
-        kept.trials.bar.update(number, f"{name}: {scores[name].distance:.3g}", kept.trials.clock.left())
-    kept.trials.bar.stage("timing", 1)
-    times = dict(zip(entered, timed([(kept.trials, plan) for plan in entered.values()], request.threads), strict=True))
-    points = {name: Point("", name, scores[name].distance, times[name].median) for name in entered}
-    on_frontier = {point.name for point in efficient(list(points.values()))}
-
-    def up_to(bound: float) -> list[str]:
-        return [n for n, one in scores.items() if n != DENSE and near(one.distance, one.interval, bound)]
-
-    allowed, close = up_to(request.farthest), up_to(request.bound)
-    chosen = _chosen(close, allowed, scores, times, request)
-    named = {chosen: SCHEDULE}
-    wanted, took = SAFER * scores[chosen].distance, times[chosen].median
-    slower = [name for name in close or allowed if times[name].median > took]
-    if nearer := [name for name in slower if scores[name].distance <= wanted]:
-        named[min(nearer, key=lambda name: times[name].median)] = SAFE
-    faster = {name: times[name].median for name in allowed if ALIKE * times[name].median < times[chosen].median}
-    if faster:
-        named[fastest(faster, {name: scores[name].distance for name in faster})] = FAST
-    plans = {DENSE: kept.plans[DENSE], **{named[name]: entered[name] for name in named}}
-    plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
-    tried = [
-        {
-            "name": named.get(name, name),
-            "told": entered[name].in_words(),
-            "distance": scores[name].distance,
-            "interval": list(scores[name].interval),
-            "milliseconds": times[name].median,
-            "worst": max(times[name].ms),
-            "near": name == DENSE or name in allowed,
-            "on_frontier": name in on_frontier,
-            "kept": name == DENSE or name in named,
-        }
-        for name in sorted(entered, key=lambda one: times[one].median)
-    ]
-    if chosen not in close:
-        in_time = "" if request.deadline_ms is None else f" that keeps {request.deadline_ms:.3g} ms"
-        kept.trials.bar.warn(
-            f"no plan{in_time} is surely within {request.bound:g} of the original: the default is"
-            f" {scores[chosen].distance:.2g} away, and {scores[chosen].interval[1]:.2g} at worst. Such plans lost"
-            " several points of success where they were driven. Evaluate it, record more episodes, or allow more time."
-        )
-    return Frontier(tuple(tried), plans, {named[name]: scores[name] for name in named})
-
-
-def _chosen(
-    close: Sequence[str],
-    allowed: Sequence[str],
-    scores: Mapping[str, Score],
-    times: Mapping[str, Times],
-    request: Request,
-) -> str:
+    entrants = _Entrants(kept, request)
+    times, distances, scores, within = entrants.times, entrants.distances, entrants.scores, entrants.within
+    allowed, close = ([n for n in within if within[n] <= bound] for bound in (request.farthest, request.bound))
     if not allowed:
-        name = min((n for n in scores if n != DENSE), key=lambda n: scores[n].interval[1])
-        raise CalibrationFailedError(too_far(name, scores[name], request.farthest))
-    distances = {name: scores[name].distance for name in allowed}
-    chosen = best_plan({name: times[name] for name in allowed}, distances, close, request.deadline_ms)
+        name = min(within, key=lambda n: scores[n].interval[1])
+        raise CalibrationFailedError(too_far(kept.trials, request, name, scores[name]))
+    chosen, default = entrants.best(close), SCHEDULE
     if chosen is None:
-        name = min(allowed, key=lambda name: max(times[name].ms))
-        raise CalibrationFailedError(
-            f"no plan that is near enough keeps {request.deadline_ms:.3g} ms: the fastest, {name!r}, took"
-            f" {times[name].median:.3g} ms, and {max(times[name].ms):.3g} at worst, with {request.threads} thread"
-            f"{'s' * (request.threads > 1)}. Allow more threads, a larger error, or a slower loop."
+        chosen, default = entrants.nearest(allowed, close), DENSE
+    named, took = {chosen: SCHEDULE}, times[chosen].median
+    if nearer := [n for n in close if times[n].median > took and distances[n] <= SAFER * distances[chosen]]:
+        named[min(nearer, key=lambda name: times[name].median)] = SAFE
+    if faster := {name: times[name].median for name in allowed if ALIKE * times[name].median < took}:
+        named[fastest(faster, distances)] = FAST
+    plans = {DENSE: kept.plans[DENSE], **{named[name]: entrants.plans[name] for name in named}}
+    plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
+    held = {**named, DENSE: DENSE} if default == DENSE else named
+    return Frontier(entrants.rows(named, allowed), plans, {held[name]: scores[name] for name in held}, default)
+
+
+class _Entrants:
+    """The plans to choose among by name, judged and timed; ``within`` are their least bounds, but for ``dense``."""
+
+    def __init__(self, kept: Kept, request: Request) -> None:
+        self._trials, self._request = kept.trials, request
+        self.plans = {DENSE: kept.plans[DENSE]}
+        for name, plan in kept.plans.items():
+            if name in (DENSE, FULL):
+                continue
+            self.plans[name] = plan
+            if plan.precision:
+                self.plans[f"{name}@fp32"] = replace(plan, precision={})
+            if plan.tokens is not None:  # looking for changes may take longer than a small encoder
+                self.plans[f"{name}, all tokens"] = replace(plan, tokens=None)
+        bar, self.scores = self._trials.bar, dict[str, Score]()
+        bar.stage("held-out calls", len(self.plans))
+        for number, (name, plan) in enumerate(self.plans.items(), 1):
+            self.scores[name] = kept.scores[name] if kept.judged.get(name) is plan else judge(self._trials, plan)
+            bar.update(number, f"{name}: {self.scores[name].distance:.3g}", self._trials.clock.left())
+        bar.stage("timing", 1)
+        each = timed([(self._trials, plan) for plan in self.plans.values()], request.threads)
+        self.times = dict(zip(self.plans, each, strict=True))
+        self.distances = {name: one.distance for name, one in self.scores.items()}
+        self.within = {n: least_bound(one.distance, one.interval) for n, one in self.scores.items() if n != DENSE}
+
+    def best(self, names: Iterable[str]) -> str | None:
+        """``best_plan`` of these; by a deadline the nearest are timed long enough to tell, two at a time."""
+        if (deadline := self._request.deadline_ms) is None:
+            return best_plan({name: self.times[name] for name in names}, self.distances, None)
+        left = sorted((name for name in names if self.times[name].median <= deadline), key=self._nearness)
+        for two in (left[n : n + 2] for n in range(0, len(left), 2)):
+            again = timed([(self._trials, self.plans[name]) for name in two], self._request.threads, TIMED_LONG)
+            self.times |= zip(two, again, strict=True)
+            if (found := best_plan({name: self.times[name] for name in two}, self.distances, deadline)) is not None:
+                return found
+        return None
+
+    def nearest(self, allowed: Sequence[str], close: Sequence[str]) -> str:
+        """What is nearest of the plans that are not near enough; with a warning, since ``dense`` is the default."""
+        deadline, bound = self._request.deadline_ms, self._request.bound
+        keeping = [name for name in allowed if deadline is None or self.times[name].longest <= deadline]
+        if deadline is not None and self.best([DENSE]) is None:
+            name = min(close or allowed, key=lambda n: self.times[n].longest)
+            median, longest = self.times[name].median, self.times[name].longest
+            larger = min((self.within[n] for n in keeping), default=None)
+            raise CalibrationFailedError(
+                f"no plan that is surely within {bound:g} of the original keeps {deadline:.3g} ms: the fastest,"
+                f" {name!r} ({self.plans[name].in_words()}), takes {median:.3g} ms, and {longest:.3g} at worst,"
+                f" {longest / deadline:.3g} times as long. {would_help(self._trials, self._request, larger)}"
+            )
+        in_time = "" if deadline is None else f" that keeps {deadline:.3g} ms"
+        self._trials.bar.warn(
+            f"no plan{in_time} is surely within {bound:g} of the original, so {DENSE!r} stays the default. What came"
+            f" nearest is kept as {SCHEDULE!r}, to be asked for: such plans lost several points of success where they"
+            " were driven."
         )
-    return chosen
+        return min(keeping or allowed, key=self._nearness)
+
+    def _nearness(self, name: str) -> tuple[float, float]:
+        return round(self.distances[name], 3), self.times[name].median
+
+    def rows(self, named: dict[str, str], allowed: Sequence[str]) -> tuple[dict[str, Any], ...]:
+        """See ``Frontier.tried``, given the names that plans get, and which may be taken."""
+        return tuple(
+            {
+                "name": named.get(name, name),
+                "told": self.plans[name].in_words(),
+                "distance": self.distances[name],
+                "interval": list(self.scores[name].interval),
+                "within": self.within.get(name, 0.0),
+                "milliseconds": times.median,
+                "worst": times.longest,
+                "calls": len(times.ms),
+                "weights": weights_read(self._trials.artifact, self.plans[name]),
+                "near": name == DENSE or name in allowed,
+                "kept": name == DENSE or name in named,
+            }
+            for name, times in sorted(self.times.items(), key=lambda one: one[1].median)
+        )
+
+
+def weights_read(artifact: Artifact, plan: Plan) -> int:
+    """Bytes of the weights that a plan's models read, each counted once."""
+    view = view_of(artifact, plan)
+    pieces = [name for name in view.manifest.pieces if name != LAYERS and not is_of_loop(name)]
+    return weight_bytes(artifact.files, {view.onnx_file(name) for name in pieces})

@@ -16,6 +16,7 @@ from ..artifact.write import update_plans
 from ..core.coercion import integer
 from ..core.plan import ORIGINAL, SCHEDULE
 from ..errors import CalibrationError, CalibrationFailedError
+from ..measure.machine import timed_on
 from ..pool import opened_pool
 from ..runtimes.torch.devices import device_of, exact_arithmetic
 from ..trajectories import recorded_rate
@@ -66,6 +67,7 @@ class CalibrationResult:
         told: by proposer, what became of it.
         held_out: what tells the episodes of the validation from others.
         frontier: where the default was chosen among many plans, all of them, fastest first; JSON.
+        timed_on: where these were timed (``measure.machine``).
     """
 
     learned: tuple[str, ...]
@@ -86,6 +88,7 @@ class CalibrationResult:
     told: Mapping[str, str] = field(default_factory=dict)
     held_out: str = ""
     frontier: tuple[Mapping[str, Any], ...] = ()
+    timed_on: str | None = None
 
     @property
     def doubtful(self) -> bool:
@@ -160,7 +163,7 @@ def calibrate(
         learn: what is learned, names of ``ttscompile.calibration.proposer.PROPOSERS``, in their order there.
         target_flops: share of the FLOPs of a dense call to save, prologue and pruner counted.
         latency_ms: of a call with onnxruntime on this machine. Measured once, for as many whole steps as fit. Where
-            loops are learned the nearest plan is taken whose longest call keeps it.
+            loops are learned the nearest plan is taken of whose calls 99 of 100 keep it.
         max_action_error: mean absolute error of the executed actions on held-out episodes, in their units; the plan is
             the sparsest that was found below it. Only with a strategy that fits corrections.
         max_distance: by how much further from the original a plan may be that costs less than the one it was made from;
@@ -186,9 +189,6 @@ def calibrate(
         ray: address of a Ray cluster that answers dense calls and compares candidates, or ``local`` for one of this
             machine's cores; the outcome is the same. All its machines see the artifact under the same path. None
             works in this process.
-
-    Returns:
-        What was achieved.
 
     Raises:
         CalibrationFailedError: nothing that was proposed was kept: the budget was not, or nothing is better than what
@@ -270,7 +270,7 @@ def calibrate(
             _hear(kept, rows, proposers, clock)
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
-                kept.keep_only(frontier.plans, frontier.scores, SCHEDULE)
+                kept.keep_only(frontier.plans, frontier.scores, frontier.default)
             else:
                 kept.judge_changed(artifact.plans)
         # Where no schedule is learned: what one would have been asked for.
@@ -295,6 +295,7 @@ def calibrate(
             told=kept.told,
             held_out=digest_of([episodes[n] for n in trials.split.validation]),
             frontier=() if frontier is None else frontier.tried,
+            timed_on=None if frontier is None else timed_on(goal.threads),
         )
         _warn_of_result(bar, result, max_minutes)
         _write(directory, artifact, result, kept, anew)

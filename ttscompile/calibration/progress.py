@@ -23,10 +23,11 @@ class Bar:
             TextColumn("{task.fields[note]}"),
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
+            TextColumn("{task.fields[best]}"),
         )
         self._shown, console = shown, Console(stderr=True)
         self._progress = progress.Progress(*columns, console=console, disable=not (shown and console.is_terminal))
-        self._task = self._progress.add_task("", total=None, note="", left="")
+        self._task = self._progress.add_task("", total=None, note="", left="", best="")
 
     def __enter__(self) -> Bar:
         self._progress.start()
@@ -51,6 +52,12 @@ class Bar:
         if what != self._progress.tasks[self._task].description:
             self.stage(what, total, done)
         self._progress.update(self._task, completed=done, total=total)
+
+    def best(self, what: str) -> None:
+        """Say what the best so far is."""
+        if self._shown and self._progress.disable:
+            self._progress.console.print(f"best so far: {what}", markup=False, soft_wrap=True)
+        self._progress.update(self._task, best=f"best so far: {what}")
 
     def update(self, done: int, note: str, seconds_left: float) -> None:
         """Say how far it is."""

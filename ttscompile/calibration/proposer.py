@@ -35,9 +35,14 @@ SAFER = 0.7
 """Of the default's distance: at most so much has the plan ``safe`` where the default is chosen among many."""
 
 
+def least_bound(distance: float, interval: Sequence[float]) -> float:
+    """The smallest bound that a plan this far away is within, by its distance and by the 95 % limits of that."""
+    return max(distance, max(interval) / SURE)
+
+
 def near(distance: float, interval: Sequence[float], bound: float) -> bool:
-    """Whether a plan this far away is within a bound, by its distance and by the 95 % limits of that."""
-    return distance <= bound and max(interval) <= SURE * bound
+    """Whether a plan this far away is within a bound; see ``least_bound``."""
+    return least_bound(distance, interval) <= bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +114,8 @@ Proposals: TypeAlias = Generator[Proposal, bool, None]
 class Proposer(ABC):
     """Something that learns. Made of a ``Request``.
 
-    Attributes:
-        told: one sentence on what became of it, for people; read after ``propose`` is exhausted or left.
-        margin: its own ``Proposal.margin``, or what was asked for in place of that.
+    ``told`` is a sentence for people on what became of it, once ``propose`` is exhausted or left; ``margin`` its own
+    ``Proposal.margin``, or what was asked for in place of that.
     """
 
     margin = 0.0

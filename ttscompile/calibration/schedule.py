@@ -95,10 +95,7 @@ BETTER = 0.9
 class Schedule(Proposer):
     """Plans of whole steps, corrected; or what another strategy finds. See ``Proposer``.
 
-    Attributes:
-        budget: what was asked for, once it is known what it comes to.
-        stopped: why it ended: ``finished`` or ``time limit``.
-        skipped: why there is no plan of a name that there might be.
+    It tells its budget, once it is known what it comes to, why it stopped, and why there is no plan of a name.
     """
 
     def __init__(self, request: Request) -> None:
@@ -108,7 +105,6 @@ class Schedule(Proposer):
         self.skipped: dict[str, str] = {}
 
     def applies(self, artifact: Artifact) -> str | None:
-        """See ``Proposer``."""
         view, goal = view_of(artifact, base_of(artifact)), self.request.goal
         if view.manifest.steps == 1:
             told = "the policy has one denoising step, which every plan computes: nothing can be reused"
@@ -129,7 +125,6 @@ class Schedule(Proposer):
         return None
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
-        """See ``Proposer``."""
         view, request = trials.runner.view, self.request
         self._manifest = view.manifest
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)

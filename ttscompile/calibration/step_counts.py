@@ -66,21 +66,16 @@ BESIDE_SHARE = 0.2
 
 
 class Best(NamedTuple):
-    """The best schedule of a family.
-
-    ``error`` is that on calls that its correction was not fitted on, in the units of the actions.
-    """
+    """The best schedule of a family, and its error on calls that its correction was not fitted on, in units."""
 
     steps: tuple[int, ...]
     error: float
 
 
 class SpacedSchedules:
-    """Compares crowded schedules, and remembers every comparison in the state.
+    """Compares crowded schedules, and remembers every comparison in the state, under ``key``.
 
-    Args:
-        clock: nothing is begun that would end, with the correction and the judgement that follow, after its limit.
-        key: what the state calls the comparisons.
+    Nothing is begun that would end, with the correction and the judgement that follow, after the clock's limit.
     """
 
     def __init__(self, whole: WholeSteps, state: StateFile, clock: Clock, bar: Bar, key: str = "crowded") -> None:

@@ -14,7 +14,7 @@ STRATEGIES: tuple[Strategy, ...] = (
     ),
     Strategy(
         "tts-paper",
-        "test-time sparsity as published, arXiv 2605.13316: gates trained for each observation",
+        "test-time sparsity, arXiv 2605.13316, with a smaller head: gates trained for each observation",
         "calibration.pruner.paper:Paper",
         uses_pruner=True,
         consecutive=True,

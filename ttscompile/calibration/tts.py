@@ -21,11 +21,7 @@ MOVED_BY = (8, 4, 2, 1)
 
 
 class Tts:
-    """The search of this module; see ``Search``.
-
-    Attributes:
-        loss: error of the plan on calls that its correction was not fitted on.
-    """
+    """The search of this module; its loss is that of the plan on calls that its correction was not fitted on."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._whole = task, task.whole

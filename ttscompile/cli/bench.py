@@ -29,7 +29,7 @@ from ttscompile.cli.types import PATH, PICTURE, RATE, TEXT
 from ttscompile.core.plan import DENSE, UNIFORM
 from ttscompile.core.spec import FP32
 from ttscompile.errors import ArtifactError
-from ttscompile.measure.machine import fingerprint, one_line
+from ttscompile.measure.machine import fingerprint, one_line, timed_on
 from ttscompile.measure.points import best_plan
 from ttscompile.measure.timer import Times
 from ttscompile.measure.units import ms, number
@@ -41,6 +41,8 @@ from ttscompile.runtimes.open import CPU
 
 THIS = "this artifact"
 MOST_CALLS = 10_000
+
+NONE_KEEPS = "failed: no plan that is near enough keeps the deadline. The default stays {!r}; --plan names another one."
 
 WORTH = 0.1
 """Share of a call's time that more threads have to save: they take their cores from the rest of the robot."""
@@ -105,8 +107,9 @@ SECTIONS = (
     "--choose",
     "chooses",
     is_flag=True,
-    help="Make the plan the default that 'ttscompile build' would choose by these times, without calibrating again."
-    " With --control-hz it is the nearest plan that keeps up. The exit status is 1 if none does.",
+    help="Make the plan the default that 'ttscompile build' would choose by these times, without calibrating again; or"
+    " the best of those that --plan names. With --control-hz it is the nearest that keeps up. The exit status is 1 if"
+    " none does.",
 )
 @click.option(
     "--plot",
@@ -143,7 +146,7 @@ def bench(
     ways, artifacts = _ways(runtime, device, threads), _artifacts(directory, others)
     require_recordings(trajectories)
     artifact, console = artifacts[THIS], progress()
-    plans = _choices(directory, artifact, plans) if chooses else plans
+    named, plans = plans, _choices(directory, artifact, plans) if chooses else plans
     executor = ExecutorSettings(**settings)
     with console.status("loading"):
         entered = contestants(artifacts, plans, ways)
@@ -153,7 +156,7 @@ def bench(
             entered = [*originals(checkpoint, encoders, threads[0], artifact, device), *entered]
     default = artifact.manifest.default_plan
     warn_if_busy(console)
-    if default == DENSE and artifact.manifest.steps > 1:
+    if default == DENSE and artifact.manifest.steps > 1 and artifact.manifest.calibration is None:
         say(console, f"warning: {directory} is not calibrated: its default plan is the dense one.")
     seed = (artifact.manifest.calibration or {}).get("seed", 0)  # holds out the episodes that its calibration held out
     asked = {"observation": sources, "plans": plans, "calls": calls, "seed": int(seed), **vars(ways[0])}
@@ -163,7 +166,7 @@ def bench(
     # The longest call has to fit.
     verdicts = {m.label: resolved[m.label].feasibility(max(m.times_ms) / 1e3) for m in measured if m.label in resolved}
     limit = 1e3 * max(min(one.max_latency for one in verdicts.values()), 0.0) if verdicts else None
-    chosen = choose_again(directory, artifact, measured, limit, threads[0]) if chooses else None
+    chosen = choose_again(directory, artifact, measured, limit, threads[0], bool(named)) if chooses else None
     by_threads = _by_threads(entered, measured, plans[0] if plans else default)
     identities = {path: artifacts[path.resolve().name].manifest.identity for path in others}
     if as_json:
@@ -195,9 +198,9 @@ def bench(
         print_identity(artifact.manifest.identity, output)
         say(output, *(f"{path}: identity {abbreviated(identity)}" for path, identity in identities.items()))
     drawn = [draw_comparison(compared, directory, picture)] if compared is not None and picture is not None else []
-    failed = [f"failed: no plan keeps the deadline. The default stays {default!r}."] * (chooses and chosen is None)
+    failed = [NONE_KEEPS.format(default)] * (chooses and chosen is None)
     say(console, *drawn, *failed)
-    if failed or (verdicts and not any(one.feasible for one in verdicts.values())):
+    if failed or (verdicts and chosen is None and not any(one.feasible for one in verdicts.values())):
         context.exit(1)
 
 
@@ -232,6 +235,9 @@ def _choices(directory: Path, artifact: Artifact, asked: tuple[str, ...]) -> tup
     known = tuple(choosable(artifact))
     if asked and not set(asked) & set(known):
         raise click.UsageError(f"--choose: no --plan may be the default; expected one of {', '.join(known)}.")
+    if not asked and not choosable(artifact, BOUND):
+        told = f"no plan is surely within {BOUND:g} of the original. Evaluate one, and name it with --plan"
+        raise click.UsageError(f"--choose: {told}: {', '.join(known)}.")
     return asked or known
 
 
@@ -308,7 +314,12 @@ def choosable(artifact: Artifact, usual: float = FARTHEST) -> dict[str, float]:
 
 
 def choose_again(
-    directory: Path, artifact: Artifact, measured: Sequence[Measurement], deadline_ms: float | None, threads: int
+    directory: Path,
+    artifact: Artifact,
+    measured: Sequence[Measurement],
+    deadline_ms: float | None,
+    threads: int,
+    asked: bool = False,
 ) -> str | None:
     """Make the plan the default that the rule of ``build`` chooses by these times, and keep them in the record.
 
@@ -316,6 +327,7 @@ def choose_again(
         measured: of plans that are ``choosable``, and of others, on this machine.
         deadline_ms: that the longest call may take; None for that of the build, if it had one.
         threads: that these calls had.
+        asked: whether somebody named these plans, so that one may be the default that is not near for sure.
 
     Returns:
         What was chosen, for people; None where no plan keeps the deadline, and nothing was changed.
@@ -326,13 +338,13 @@ def choose_again(
     for one in measured:
         if one.plan in far:  # of another artifact, or with more threads, it is timed later
             times.setdefault(one.plan, Times(one.times_ms))
-    chosen = best_plan(times, far, close.keys() & times.keys(), deadline)
+    chosen = best_plan({n: one for n, one in times.items() if asked or n in close}, far, deadline)
     if chosen is None:
         return None
     (name, _, wanted), before = chosen.partition("@"), artifact.manifest.default_plan
     told = ", ".join(f"{each} {ms(one.median)} ms" for each, one in times.items())
-    here = f"{fingerprint()['processor']}, {threads} thread{'s' * (threads > 1)}: {told}"
-    record |= {"default_plan": name, "chosen_on": here}
+    here = timed_on(threads)
+    record |= {"default_plan": name, "chosen_on": f"{here}: {told}", "timed_on": here}
     precision: dict[str, str] | None = None
     if wanted:
         own, precision = artifact.plans[name].precision, dict(artifact.plan(chosen).precision)

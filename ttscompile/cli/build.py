@@ -9,7 +9,7 @@ import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
 from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
-from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, warn_if_busy
+from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, warn_if_busy
 from ttscompile.cli.sections import (
     LEROBOT,
     Recordings,
@@ -46,14 +46,14 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 @number_option(
     "--latency-ms",
     MILLISECONDS,
-    "Choose among the plans whose longest call takes no more than so many milliseconds, in place of --control-hz.",
+    "Choose among the plans of whose calls 99 of 100 take at most so many milliseconds, in place of --control-hz.",
 )
 @number_option(
     "--error",
     ERROR,
     "Largest distance from the original that a plan may have, in units of what other noise changes; with 95 %"
-    " confidence at most a quarter more. Without this option it is 0.1 for the default plan, and 0.25 for others; if"
-    " no plan is within 0.1, the nearest is the default, with a warning.",
+    " confidence at most a quarter more. Without this option it is 0.1 for the default plan, and 0.25 for others. If"
+    " no plan is surely within 0.1, the original stays the default.",
 )
 @threads_option("Threads that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)
@@ -88,8 +88,8 @@ def build(
 
         def explain(stage: str, notes: tuple[str, ...]) -> None:
             status.update(f"compiling: after {stage}")
-            if stage == "recordings":
-                console.print(*notes)
+            if stage in ("recordings", "loop"):
+                say(console, *notes)
             if stage == "write":
                 status.stop()  # the search has a bar of its own
 
@@ -107,4 +107,4 @@ def build(
     if as_json:
         print_json(document(artifact))
     else:
-        print_frontier(artifact, directory, results(), how["threads"])
+        print_frontier(artifact, directory, results(), how["threads"], how["control_hz"])

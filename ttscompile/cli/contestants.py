@@ -65,11 +65,6 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
     Args:
         plans: of the first artifact, and of the others where they have one of this name; all where none is named.
             ``NAME@PRECISION`` is one in another precision.
-
-    Raises:
-        ArtifactError: one cannot be run, or has no models of a plan's precision.
-        IllegalPlanError: the first has no plan of this name.
-        RuntimeUnavailableError: a runtime or device cannot be had, or cannot do what a plan asks for.
     """
     made: list[Contestant] = []
 
@@ -113,10 +108,6 @@ def originals(
         checkpoint: see ``original_policy``, as for ``encoders``.
         threads: of PyTorch.
         device: where PyTorch computes, None for the CPU. Its settings are torch's own: convolutions may use TF32.
-
-    Raises:
-        RuntimeUnavailableError: there is no torch, or no such device.
-        SpecError: the checkpoint is of another policy.
     """
     with needing("the original network", "compile", ", or leave --checkpoint out"):
         import torch
@@ -146,12 +137,9 @@ def original_policy(checkpoint: Path, spec: PolicySpec, encoders: Path | None = 
     """The network of the checkpoint that an artifact was made from, and what the checkpoint says about it; needs torch.
 
     Args:
-        checkpoint: as ``convert`` took it.
+        checkpoint: as ``convert`` took it; that of another policy is a SpecError.
         spec: of the policy in the artifact.
         encoders: the folder that ``convert`` was given with the checkpoint, if it was.
-
-    Raises:
-        SpecError: the checkpoint is of another policy.
     """
     from ttscompile.frontends import load_checkpoint_policy
     from ttscompile.frontends.families import as_converted
@@ -195,12 +183,7 @@ def _different_statistics(found: PolicySpec, expected: PolicySpec) -> list[str]:
 def compare(
     directory: Path, artifacts: Mapping[str, Artifact], others: Sequence[Path], recordings: Recordings, **how: Any
 ) -> Comparison:
-    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error.
-
-    Raises:
-        ArtifactChangedError: an artifact was replaced meanwhile.
-        RuntimeUnavailableError: there is no torch.
-    """
+    """Hold plans against the dense policy on held-out calls, as ``calibration.compare``; warns on standard error."""
     with needing("-t", "compile"):
         from ttscompile.calibration.compare import compare as measure
     with only_results_on_stdout(), Bar(shown=True) as bar:

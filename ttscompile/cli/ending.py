@@ -177,11 +177,7 @@ def _open_standard_streams() -> None:
 
 
 def _flush() -> None:
-    """Write what was printed, to know now whether that can be done.
-
-    Raises:
-        OSError: it cannot; ``BrokenPipeError`` where nobody reads on.
-    """
+    """Write what was printed, to know now whether that can be done: ``BrokenPipeError`` where nobody reads on."""
     if sys.stdout is None:
         return
     try:

@@ -134,19 +134,7 @@ def require_page(path: Path) -> None:
 def write_page(
     path: Path, artifact: Artifact, policy: CompiledPolicy, extras: Extras, progress: Callable[[str], None]
 ) -> str:
-    """Write the page; it replaces another one only when it is whole.
-
-    Args:
-        path: see ``require_page``.
-        policy: the same, with a seed; its calls are timed now.
-        extras: what the page shows beside the artifact.
-
-    Returns:
-        What was written, for people.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write the page, which replaces another one only when it is whole, and say so; calls of the policy are timed."""
     page = render(build(artifact, policy, extras, progress))
     try:
         replace_file(path, page.encode())
@@ -158,11 +146,7 @@ def write_page(
 def checked(
     directory: Path, identity: str, trajectories: Recordings, sources: Sources, progress: Callable[[str], None]
 ) -> tuple[bool, OfPage]:
-    """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says.
-
-    Raises:
-        ArtifactChangedError: another one is there by now.
-    """
+    """Whether the checks of ``ttscompile verify`` hold for the artifact of this identity, and what the page says."""
     try:
         found = ttscompile.verify(
             directory, trajectories, sources=sources, progress=lambda it: progress(f"verifying: {it}")

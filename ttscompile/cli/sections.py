@@ -70,11 +70,7 @@ def trajectories_options(required: bool = True, what: str = "Learn from these re
 
 @dataclass(frozen=True)
 class Section:
-    """Options that belong together.
-
-    Attributes:
-        needs: parameters of which one must be given where one of the options is; none for no such condition.
-    """
+    """Options that belong together; where one is given, so must be one of the parameters that they need, if any."""
 
     title: str
     options: tuple[str, ...]

@@ -60,12 +60,14 @@ def print_facts(console: Console, made: Table) -> None:
         console.print(shown)
 
 
-def print_frontier(artifact: Artifact, directory: Path, output: Console, threads: int) -> None:
-    """The plans that were tried, the verdict on the default, and how to go on."""
+def print_frontier(
+    artifact: Artifact, directory: Path, output: Console, threads: int, control_hz: float | None = None
+) -> None:
+    """The plans that were tried, the verdict on the default, and how to go on: in a control loop, if one was given."""
     record, default = artifact.manifest.calibration or {}, artifact.manifest.default_plan
     rows = record["frontier"]
     dense = next(row for row in rows if row["name"] == DENSE)
-    made = table("plan", "what it does", "ms a call", "longest", "times faster", "distance", "95 %", "")
+    made = table("plan", "what it does", "ms a call", "longest", "times faster", "MB", "distance", "95 %", "")
     for row in rows:
         made.add_row(
             f"{row['name']} (default)" if row["name"] == default else row["name"],
@@ -73,23 +75,35 @@ def print_frontier(artifact: Artifact, directory: Path, output: Console, threads
             ms(row["milliseconds"], 4),
             ms(row["worst"], 4),
             f"{dense['milliseconds'] / row['milliseconds']:.1f} x",
+            f"{row['weights'] / 1e6:.1f}",
             f"{row['distance']:.3f}",
             "..".join(f"{one:.3f}" for one in row["interval"]),
             "" if row["near"] else "too far",
         )
     made.columns[1].justify = "left"
     output.print(made)
+    task = ["observation['task'] = 'pick up the cup'  # say"] if instruct_of(artifact) else []
+    loop = ["policy.reset()  # a new episode", *task, "actions = policy.predict_action(observation)['action']"]
+    if control_hz is not None:
+        loop = [
+            f"with ttscompile.AsyncExecutor(policy, control_hz={control_hz:g}) as executor:",
+            "    executor.reset(seed=0)  # a new episode",
+            "    while running:",
+            *(f"        {line}" for line in (*task, "executor.observe(observation)  # one frame, by key")),
+            "        if executor.ready:",
+            "            robot.move(executor.action())",
+            "        wait_for_the_next_tick()",
+        ]
     say(
         output,
-        "Times faster: than the same policy with every step computed, compiled too. Distance: between the actions and"
+        "Times faster: than the same policy with every step computed, compiled too. MB: of weights that its models"
+        " read; a process takes more. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
         f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
         *((*facts.chosen(record), *facts.learned(record)) if record.get("other_noise") else facts.remarks(record)),
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",
-        "    policy.reset()  # a new episode",
-        *(["    observation['task'] = 'pick up the cup'  # say"] if instruct_of(artifact) else []),
-        "    actions = policy.predict_action(observation)['action']",
+        *(f"    {line}" for line in loop),
         "",
         one_line(fingerprint()),
     )

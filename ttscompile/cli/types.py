@@ -21,7 +21,6 @@ class NumberOption(click.Option):
     """Shows no range in the help: nobody has a use for its ends, and the message about a number beyond says it."""
 
     def get_help_extra(self, ctx: click.Context) -> Any:
-        """See ``click.Option``."""
         extra = super().get_help_extra(ctx)
         extra.pop("range", None)
         return extra
@@ -36,7 +35,6 @@ class Number(click.FloatRange):
         super().__init__(least, most, min_open=above)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """See ``click.ParamType``."""
         found: float = super().convert(value, param, ctx)
         if math.isnan(found):  # neither below nor above anything
             self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
@@ -63,7 +61,6 @@ class Words(click.ParamType[str]):
         self.may_be_empty = may_be_empty
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """See ``click.ParamType``."""
         text = str(value)
         if not text and not self.may_be_empty:
             self.fail("nothing was given.", param, ctx)
@@ -83,7 +80,6 @@ class PathName(click.Path):
         super().__init__(exists, file_okay, dir_okay, path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """See ``click.ParamType``."""
         text = os.fspath(value)
         if not text:
             self.fail("nothing was given.", param, ctx)
@@ -107,7 +103,6 @@ class PathOrHub(PathName):
     """The same, or ``hf://org/name`` and what may follow, which stays text."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """See ``click.ParamType``."""
         return TEXT.convert(value, param, ctx) if on_hub(value) else super().convert(value, param, ctx)
 
 
@@ -122,7 +117,6 @@ class PictureName(PathName):
     """A file for a picture, told by the end of its name, in a folder that exists."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """See ``click.ParamType``."""
         path = super().convert(value, param, ctx)
         try:
             require_picture_name(path)
@@ -141,7 +135,6 @@ class PageOrPictureName(PictureName):
     """A file for a page, or for a picture, told by the end of its name."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """See ``click.ParamType``."""
         path = PathName.convert(self, value, param, ctx)
         if path.suffix.lower() in PAGES:
             return path
@@ -159,7 +152,6 @@ class Address(click.ParamType[str]):
     name = "address"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """See ``click.ParamType``."""
         if value == "localhost":
             return "localhost"
         try:

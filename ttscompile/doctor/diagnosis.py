@@ -20,10 +20,9 @@ MARKS = {Level.OK: "ok", Level.NOTE: "-", Level.WARNING: "!", Level.PROBLEM: "PR
 
 
 def examine(target: Path | str | None = None, **more: Any) -> list[Finding]:
-    """Everything that is found, in the order of the report; see ``target_findings`` for the arguments.
+    """Everything that is found, in the order of the report; nothing raises. Its arguments are ``target_findings``'.
 
-    Returns:
-        Findings; none raises. What stops an artifact from running has the level ``PROBLEM``.
+    What stops an artifact from running has the level ``PROBLEM``.
     """
     of_target = [] if target is None else target_findings(target, **more)
     return [*package_findings(), *machine_findings(), *of_target]

@@ -63,7 +63,7 @@ def _needs(artifact: Artifact) -> list[Finding]:
     remedy = f"{(available or 0) / 2**20:.0f} MiB are available: free some, or raise the limit of the control group."
     short = available is not None and needed > available
     found.append(Finding.judged(PART, "memory", told, short, remedy, Level.PROBLEM))
-    if manifest.steps > 1 and (manifest.calibration is None or manifest.default_plan == "dense"):
+    if manifest.steps > 1 and manifest.calibration is None:
         remedy = "It computes everything, in many times the time. Run: ttscompile calibrate DIR --trajectories FILE."
         found.append(Finding(PART, "plan", "dense: not calibrated", Level.WARNING, remedy))
     else:

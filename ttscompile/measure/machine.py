@@ -28,7 +28,7 @@ def fingerprint() -> dict[str, Any]:
         with suppress(PackageNotFoundError):
             versions[name] = version(name)
     return {
-        "processor": fields.get("model name", platform.processor() or platform.machine()),
+        "processor": _processor(),
         "instructions": [name for name in _INSTRUCTIONS if name in flags],
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load_average": round(os.getloadavg()[0], 2),
@@ -37,6 +37,22 @@ def fingerprint() -> dict[str, Any]:
         "python": platform.python_version(),
         **versions,
     }
+
+
+def _processor() -> str:
+    return cpuinfo().get("model name", platform.processor() or platform.machine())
+
+
+def timed_on(threads: int) -> str:
+    """Where times are taken now: the processor, and how many threads a call has."""
+    return f"{_processor()}, {threads} thread{'s' * (threads > 1)}"
+
+
+def elsewhere(there: str | None) -> str | None:
+    """Where times were taken, given ``timed_on`` of then, and what to do if this is another processor; None of None."""
+    if there is None or there.rpartition(",")[0] == (here := _processor()):
+        return there and f"timed on {there}"
+    return f"timed on {there}; this is {here}: 'ttscompile bench DIR --choose' chooses by the times of this one"
 
 
 def busy() -> str | None:

@@ -4,7 +4,7 @@ The distance between what a plan and the original answer is the energy distance 
 ``calibration.judge``.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, TypeVar
@@ -150,25 +150,17 @@ def fastest(times_ms: Mapping[str, float], distances: Mapping[str, float]) -> st
     return min(alike, key=lambda name: (distances[name], times_ms[name]))
 
 
-def best_plan(
-    times: Mapping[str, Times], distances: Mapping[str, float], near: Collection[str], deadline_ms: float | None
-) -> str | None:
-    """The rule by which one of several plans is the default: its name.
+def best_plan(times: Mapping[str, Times], distances: Mapping[str, float], deadline_ms: float | None) -> str | None:
+    """The name of the plan, of those that may be the default, that is it.
 
-    Without a deadline it is the ``fastest`` of those that are near enough, or the nearest of all if none is. With one
-    it is the nearest of those whose longest call keeps it, of those that are near enough where one of them keeps it;
-    None if none at all does. The faster of two is the nearest where three decimals do not tell their distances apart.
-
-    Args:
-        times: of the plans that may be taken.
-        near: names of those that are near enough.
-        deadline_ms: that a call may take, milliseconds.
+    Without a deadline, in milliseconds, it is the ``fastest``. With one it is the nearest of those whose longest call
+    keeps it; None if none does. The faster of two is the nearest where three decimals do not tell their distances
+    apart.
     """
-    if near and deadline_ms is None:
-        return fastest({name: times[name].median for name in times if name in near}, distances)
-    in_time = [name for name, one in times.items() if deadline_ms is None or max(one.ms) <= deadline_ms]
-    of = [name for name in in_time if name in near] or in_time
-    return min(of, key=lambda name: (round(distances[name], 3), times[name].median), default=None)
+    if deadline_ms is None:
+        return fastest({name: one.median for name, one in times.items()}, distances) if times else None
+    in_time = [name for name, one in times.items() if one.longest <= deadline_ms]
+    return min(in_time, key=lambda name: (round(distances[name], 3), times[name].median), default=None)
 
 
 @dataclass(frozen=True)

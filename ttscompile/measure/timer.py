@@ -8,6 +8,9 @@ from typing import TypeVar
 
 Result = TypeVar("Result")
 
+MANY = 100
+"""Calls from which on their 99th percentile is told in place of the longest."""
+
 
 @dataclass(frozen=True)
 class Times:
@@ -23,6 +26,11 @@ class Times:
     def median(self) -> float:
         """Milliseconds a call."""
         return float(median(self.ms))
+
+    @property
+    def longest(self) -> float:
+        """What 99 of 100 calls take at most, in milliseconds; of fewer than ``MANY`` calls all."""
+        return max(self.ms) if len(self.ms) < MANY else quantiles(self.ms, n=100, method="inclusive")[98]
 
     @property
     def quartiles(self) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """How figures are written for people."""
 
+import math
 from collections.abc import Mapping
 
 
@@ -25,6 +26,11 @@ def number(value: float, digits: int = 3) -> str:
 
 ms = number
 """Of milliseconds, whose unit stands at the head of their column."""
+
+
+def rounded_up(value: float) -> str:
+    """To hundredths, never below it."""
+    return f"{math.ceil(100 * value - 1e-9) / 100:g}"
 
 
 def plain(value: object) -> str:

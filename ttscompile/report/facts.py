@@ -11,12 +11,14 @@ from ..artifact.manifest import BlockRecord, Manifest, PlanRecord, marked
 from ..artifact.view import view_of
 from ..core.envelope import FAR
 from ..core.lattice import dense_plan
-from ..core.plan import DENSE
+from ..core.plan import DENSE, SCHEDULE
 from ..core.poses import NUMBERS
 from ..core.spec import ObservationSpec, SamplerTable
-from ..ir.flops import frames_flops, graph_flops
+from ..ir.flops import frames_flops, graph_flops, once_flops
 from ..ir.program import Binding
-from ..measure.units import flops, ms, plain, share
+from ..measure.machine import elsewhere
+from ..measure.timer import MANY
+from ..measure.units import flops, ms, plain, rounded_up, share
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
@@ -118,7 +120,11 @@ def hoisting(artifact: Artifact) -> Section:
     record, steps = manifest.flops, manifest.steps
     bound = Counter(context.binding for context in manifest.contexts.values())
     table_bytes = sum(table.nbytes for table in artifact.tables.values())
-    condition = graph_flops(artifact.pieces.condition)
+    pieces, frames = artifact.pieces, frames_flops(artifact.pieces)
+    condition = graph_flops(pieces.condition)
+    scene = once_flops(pieces) - frames - condition
+    late = [key for key, one in manifest.spec.observations.items() if one.numbers]
+    told = 0 < len(late) < len(manifest.spec.observations)  # else nothing could stand still, or nothing moves
     loop = steps * (record.stem + record.tail + sum(record.blocks))
     dense = record.prologue + loop
 
@@ -126,12 +132,13 @@ def hoisting(artifact: Artifact) -> Section:
         return name, when, values, flops(cost), share(cost / record.dense)
 
     tables = f"{len(artifact.tables)} tables of {steps} rows, {table_bytes / 1e6:.1f} MB"
-    frames, count = frames_flops(artifact.pieces), sum(artifact.pieces.rows)
-    batched = max(record.prologue - condition - frames, 0)
+    count, batched = sum(pieces.rows), max(record.prologue - once_flops(pieces), 0)
+    when = "once a call" + f", since it reads {' and '.join(late)}" * told
     rows = (
         row("table", "when it was compiled", tables, 0),
         *([row("frame", "once a frame, or instruction", f"of {count} frames a call", frames)] if count else []),
-        row("condition", "once a call", f"{bound[Binding.CONDITION]} values", condition),
+        *([row("scene", "once, until a picture or a word changes", "", scene)] if scene else []),
+        row("condition", when, f"{bound[Binding.CONDITION]} values", condition),
         row("step", f"once a call, {steps} steps in one batch", f"{bound[Binding.STEP]} values", batched),
         row("loop", f"{steps} times a call", f"stem, {len(record.blocks)} blocks, tail", loop),
         row("all, every cell computed", "", "", dense),
@@ -248,18 +255,29 @@ def remarks(record: Mapping[str, Any]) -> tuple[str, ...]:
     """What the figures of a calibration mean, in words."""
     noise = "Noise changes nothing here: in its place stands a tenth of what another observation changes."
     unit = [noise] * (record.get("other_noise") == 0)
-    return (*(chosen(record) or verdict(record)), *unit, *learned(record), *left_out(record))
+    timed = [f"The plans were {told}."] if (told := elsewhere(record.get("timed_on"))) else []
+    return (*(chosen(record) or verdict(record)), *timed, *unit, *learned(record), *left_out(record))
 
 
 def chosen(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """The verdict of a build on its default plan."""
-    rows = [row for row in record.get("frontier", ()) if row.get("name") == record.get("default_plan")]
-    if not rows:
+    """The verdict of a build on its default plan; where that is the original, on the plan that came nearest."""
+    tried, default = record.get("frontier", ()), record.get("default_plan")
+    rows, asked = {row.get("name"): row for row in tried}, record.get("budget", {})
+    if (row := rows.get(SCHEDULE if default == DENSE else default)) is None:
         return ()
-    (row,) = rows
     told = f"{row['told']}: {row['distance']:.2g} of what other noise changes, {max(row['interval']):.2g} at worst"
-    times = f"{ms(row['milliseconds'])} ms a call on the machine that built it, {ms(row['worst'])} at worst"
-    return (f"Chosen among {len(record['frontier'])} plans: {told}; {times}. Evaluate it before a robot moves.",)
+    longest = f"{ms(row['worst'])} at {'worst' if row.get('calls', 0) < MANY else 'the 99th percentile'}"
+    longest += "" if (deadline := asked.get("latency_ms")) is None else f" of {deadline:.3g} allowed"
+    times = f"{ms(row['milliseconds'])} ms a call on the machine that built it, {longest}"
+    last = "Not driven yet: evaluate it before a robot moves (examples/evaluation/README.md)."
+    if default != DENSE:
+        return (f"Chosen among {len(tried)} plans: {told}; {times}. {last}",)
+    bound, in_time = asked.get("max_distance", BOUND), " that keeps the deadline" * (deadline is not None)
+    none = f"No plan{in_time} is surely within {bound:g} of the original, so the default is {DENSE!r}, which is the"
+    none += f" original and takes {ms(rows[DENSE]['milliseconds'])} ms a call. The nearest of {len(tried)} plans is"
+    how = f"'ttscompile bench DIR --choose --plan {SCHEDULE}' makes it the default; a build with --error"
+    may = f"{rounded_up(row['within'])}, or with more recorded episodes, may."
+    return (f"{none} {SCHEDULE!r}, {told}; {times}. {last} {how} {may}",)
 
 
 def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -270,14 +288,14 @@ def verdict(record: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     if record.get("other_noise") == 0:
         return (f"Plan {name!r} is {distance:.2f} from the original.",)  # what noise changes is no unit here
-    where, lost = "above a quarter", "one lost 18.5"
+    where, driven, lost, most = "above a quarter", 36, 20, 68.0
     if distance <= BOUND:
-        where, lost = "within a tenth", "they lost at most 9.0"
+        where, driven, lost, most = "within a tenth", 39, 1, 9.0
     elif distance <= FARTHEST:
-        where, lost = "within a quarter", "they lost at most 16.5"
+        where, driven, lost, most = "within a quarter", 33, 8, 16.5
     told = f"Plan {name!r} is {distance:.2f} from the original, {where} of what other noise changes"
-    page = "docs/evidence/results.md, 'What a distance means'"
-    return (f"{told}. Where such plans were driven, {lost} points of success ({page}).",)
+    more = f"Of {driven} such plans that were driven {lost} lost more than 5 points of success, {most} at most"
+    return (f"{told}. {more} (docs/evidence/results.md, 'What a distance means').",)
 
 
 def learned(record: Mapping[str, Any]) -> tuple[str, ...]:
@@ -322,7 +340,8 @@ def limits(artifact: Artifact) -> Section:
     sampler = manifest.spec.sampler
     points = []
     if manifest.calibration is None or manifest.default_plan == DENSE:
-        points.append("Not calibrated: its default plan computes every cell of its loop.")
+        told = "Not calibrated: its" if manifest.calibration is None else "Its"
+        points.append(f"{told} default plan computes every cell of its loop.")
     else:
         points.append(
             "Errors are of the actions, on recorded episodes, against the dense policy with the same noise. They are no"

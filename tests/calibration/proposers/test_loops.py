@@ -1,10 +1,11 @@
 """Which loop, and how few of its steps."""
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,24 +14,25 @@ import pytest
 import ttscompile
 from tests.calibration import policies
 from tests.calibration.killed import killed
+from tests.families import cameras
 from tests.once import Once
-from ttscompile import SamplerTable
+from ttscompile import PolicySpec, SamplerTable
 from ttscompile.artifact.load import load_artifact
 from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.calls import Calls
-from ttscompile.calibration.choose import choose
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, judge
-from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import SAFER, Proposal, near
 from ttscompile.calibration.proposers import loops
-from ttscompile.calibration.proposers.loops import REACH, Cost, Loops
+from ttscompile.calibration.proposers.loops import REACH, Cost, Loops, would_help
 from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.task import Task
 from ttscompile.calibration.trials import Trials
-from ttscompile.core.plan import DENSE, ORIGINAL, Plan
+from ttscompile.core.plan import DENSE, ORIGINAL
+from ttscompile.core.tokenizer import Instruction
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.measure.machine import timed_on
 from ttscompile.measure.timer import Times
 from ttscompile.pool import Pool
 from ttscompile.report import Extras, build
@@ -218,6 +220,7 @@ def test_a_calibration_of_loops_keeps_what_it_chooses(directory: Path, recording
     assert told.startswith(f"Chosen among {len(rows)} plans: {rows['schedule']['told']}: ")
     assert chosen_of({}) == ()
     policy = ttscompile.load(directory)
+    assert policy.info.timed_on == f"timed on {timed_on(1)}" == f"timed on {result.timed_on}"
     assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
     page = build(artifact, policy, Extras(calls=1))
     assert told in page.lead
@@ -238,7 +241,7 @@ def test_killed_at_random_moments_and_resumed_it_ends_the_same(
     milliseconds = {loop: Times((one,)) for loop, (one, _) in COSTS.items()}
     monkeypatch.setattr(Clock, "elapsed", lambda self: 0.0)
     monkeypatch.setattr(
-        "ttscompile.calibration.choose.timed", lambda entrants, threads: [milliseconds[p.loop] for _, p in entrants]
+        "ttscompile.calibration.choose.timed", lambda entrants, *_: [milliseconds[p.loop] for _, p in entrants]
     )
     own = shutil.copytree(directory, tmp_path / "own")
     how: dict[str, Any] = {"learn": ("loops",), "max_distance": 0.4, "progress": False}
@@ -258,6 +261,29 @@ def test_killed_at_random_moments_and_resumed_it_ends_the_same(
     assert {p.name: p.read_bytes() for p in directory.iterdir()} == {p.name: p.read_bytes() for p in own.iterdir()}
 
 
+def test_where_no_loop_keeps_the_deadline_it_is_told_how_far_and_what_may_help(
+    directory: Path, recording: Path, timed: None
+) -> None:
+    """More time would not."""
+    told = "no plan keeps 2 ms: one computed step of 'short', .*, takes 4 ms, 2 times as long. What may help: more"
+    with pytest.raises(CalibrationFailedError, match=told):
+        proposed(Loops(request(bound=0.4, deadline_ms=2.0)), trials_of(directory, [recording]))
+
+
+def test_what_may_help_is_what_the_policy_has() -> None:
+    def told(spec: PolicySpec, within: float | None = None) -> str:
+        trials: Any = SimpleNamespace(artifact=SimpleNamespace(manifest=SimpleNamespace(spec=spec)))
+        return would_help(trials, request(threads=2), within)
+
+    one = "What may help: more than 2 threads (--threads), a larger --error, or a slower loop."
+    assert told(policies.spec()) == one
+    assert told(policies.spec(), 0.2272) == one.replace("a larger --error", "--error 0.23")
+    told_so = Instruction("tokens", "mask", new_line=False)
+    seeing = replace(cameras.policy("shared", told=True)[1], instruction=told_so)
+    more = "(--threads), a camera less (--without-camera), one instruction compiled in (--task), a larger"
+    assert told(seeing) == one.replace("(--threads), a larger", more)
+
+
 def test_what_was_timed_with_other_threads_is_not_gone_on_with(directory: Path, recording: Path, timed: None) -> None:
     how: dict[str, Any] = {"learn": ("loops",), "max_distance": 0.4, "progress": False}
     with killed():
@@ -273,85 +299,3 @@ def test_what_loops_cannot_keep_is_refused(directory: Path, recording: Path) -> 
         calibrate(directory, [recording], 0.8, learn=("loops",), progress=False)
     with pytest.raises(CalibrationError, match="loops need the strategy 'tts'; found 'bac'"):
         calibrate(directory, [recording], strategy="bac", learn=("loops",), progress=False)
-
-
-def chosen(
-    monkeypatch: pytest.MonkeyPatch, trials: Trials, figures: Mapping[str, tuple[float, float, float]], **asked: float
-) -> Mapping[str, str]:
-    """What the names of the artifact's plans were called while they were tried.
-
-    Args:
-        monkeypatch: fixture.
-        trials: of any policy.
-        figures: distance, upper end of its interval, and milliseconds of plans by name.
-        asked: of ``Request``.
-    """
-    kept = Kept(trials, anew=True)
-    plans = {name: replace(trials.base) for name in figures}
-    kept.plans |= plans
-    names = {id(plan): name for name, plan in kept.plans.items()}
-    figures = {DENSE: (0.0, 0.0, 100.0), **figures}
-
-    def scored(_: Trials, plan: Plan) -> Score:
-        distance, limit, _ms = figures[names[id(plan)]]
-        return Score(distance, (0.0, limit), None, None, 0.0, 0.0, 0.0, 1)
-
-    monkeypatch.setattr("ttscompile.calibration.choose.judge", scored)
-    monkeypatch.setattr(
-        "ttscompile.calibration.choose.timed",
-        lambda entrants, threads: [Times((figures[names[id(plan)]][2],) * 3) for _, plan in entrants],
-    )
-    warned: list[str] = []
-    monkeypatch.setattr(kept.trials.bar, "warn", warned.append)
-    frontier = choose(kept, request(**asked))
-    assert len(warned) == (frontier.scores["schedule"].distance > request(**asked).bound)
-    return {name: names[id(plan)] for name, plan in frontier.plans.items() if name != "dense"}
-
-
-def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, directory: Path, recording: Path) -> None:
-    trials = trials_of(directory, [recording])
-    figures = {
-        "a": (0.24, 0.60, 1.0),  # within the bound, but for its upper limit
-        "b": (0.20, 0.25, 2.0),
-        "c": (0.15, 0.20, 3.0),  # not much nearer than b
-        "d": (0.13, 0.20, 4.0),
-        "e": (0.05, 0.60, 5.0),
-        "f": (0.16, 0.20, 3.5),  # slower than c and further
-    }
-    assert chosen(monkeypatch, trials, figures, bound=0.25) == {"schedule": "b", "safe": "d"}
-    # Where a fifth of the time makes it nearer, it is nearer; what is safe has to be near enough itself, as e is not.
-    closer = figures | {"g": (0.10, 0.20, 2.3)}
-    assert chosen(monkeypatch, trials, closer, bound=0.25) == {"schedule": "g"}
-    assert chosen(monkeypatch, trials, closer | {"g": (0.1, 0.2, 2.5)}, bound=0.25)["schedule"] == "b"
-    # By a deadline the nearest that keeps it; the nearest of all, e, is not surely near enough.
-    assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=3.2)["schedule"] == "c"
-    assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=50.0)["schedule"] == "d"
-    with pytest.raises(CalibrationFailedError, match="keeps 1.5 ms: the fastest, 'b', took 2 ms"):
-        chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=1.5)
-    with pytest.raises(CalibrationFailedError, match="'c', is 0.15 away, and 0.2 at worst; 0.1 and 0.125 are"):
-        chosen(monkeypatch, trials, figures, bound=0.1)
-
-
-def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(
-    monkeypatch: pytest.MonkeyPatch, directory: Path, recording: Path
-) -> None:
-    trials = trials_of(directory, [recording])
-    figures = {"a": (0.20, 0.25, 1.0), "b": (0.12, 0.20, 2.0), "c": (0.08, 0.12, 4.0), "d": (0.01, 0.02, 9.0)}
-    bounds = {"bound": 0.1, "farthest": 0.25}
-    assert chosen(monkeypatch, trials, figures, **bounds) == {"schedule": "c", "fast": "a", "safe": "d"}
-    # What is fast is surely near enough for that, and of those that are as fast it is the nearest.
-    surely = figures | {"a": (0.20, 0.60, 1.0)}
-    assert chosen(monkeypatch, trials, surely, **bounds)["fast"] == "b"
-    assert chosen(monkeypatch, trials, figures | {"e": (0.15, 0.2, 1.1)}, **bounds)["fast"] == "e"
-    # By a deadline, too, what is surely near enough comes before what may be nearer; and so does what is safe.
-    unsure = {"a": (0.09, 0.25, 5.0), "b": (0.095, 0.11, 5.0), "c": (0.06, 0.30, 10.0), "d": (0.06, 0.12, 12.0)}
-    assert chosen(monkeypatch, trials, unsure, deadline_ms=8.0, **bounds) == {"schedule": "b", "safe": "d"}
-    assert chosen(monkeypatch, trials, unsure, **bounds) == {"schedule": "b", "safe": "d"}
-    # One that may be a half further than the bound is as far as some that have lost successes.
-    doubtful = figures | {"c": (0.08, 0.15, 4.0)}
-    assert chosen(monkeypatch, trials, doubtful, **bounds) == {"schedule": "d", "fast": "a"}
-    # Without it, and where it does not keep the deadline, the nearest is taken, and said to be far (``chosen``).
-    far = {name: figures[name] for name in "ab"}
-    assert chosen(monkeypatch, trials, far, **bounds) == {"schedule": "b", "fast": "a"}
-    assert chosen(monkeypatch, trials, figures, deadline_ms=3.0, **bounds)["schedule"] == "b"
-    assert chosen(monkeypatch, trials, figures, deadline_ms=5.0, **bounds)["schedule"] == "c"

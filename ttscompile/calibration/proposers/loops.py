@@ -25,6 +25,7 @@ from ...core.plan import ORIGINAL, Plan
 from ...core.spec import Noise
 from ...errors import CalibrationFailedError
 from ...measure.points import TENTH
+from ...measure.units import rounded_up
 from ...runtimes.open import open_runtime
 from ...runtimes.random_calls import Observation
 from ...runtimes.runtime import Runtime
@@ -107,7 +108,7 @@ class Loops(Proposer):
         best = self._best or self._nearest
         found = "computes the least of those that are near enough" if self._best else "is the nearest"
         if best is None:
-            raise CalibrationFailedError(self._none())
+            raise CalibrationFailedError(self._none(trials, min(order, key=lambda loop: costs[loop].one), costs))
         yield best
         left = f"left out: {', '.join(self._left_out)}" if self._left_out else ""
         more = self._tasks[best.name].whole.told_of_episodes(best.notes["steps"])
@@ -140,7 +141,8 @@ class Loops(Proposer):
         calls, few = own.calls, max(own.limits.usual, MOST_NEEDED)
         small = calls.count > few
         # Each number of steps is fitted to all: with thousands the time would end before the steps are enough.
-        first = own.runner.select(calls, range(few)) if small else calls
+        late = calls.late and own.runner.select(calls.late, range(min(few, calls.late.count)))
+        first = replace(own.runner.select(calls, range(few)), late=late) if small else calls
         task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
         if small and clock.left() > 0:
@@ -154,7 +156,7 @@ class Loops(Proposer):
             share = _ending(clock, clock.left() / (len(counts) - number))
             search = open_search("tts", replace(task, clock=share, budget=count * own.runner.model.blocks))
             found = resumed_search(own, search, share, None, f"search, {loop}, {count} steps")[0]
-            yield from self._judged(self._proposal(task, loop, count, found), cost.of(count))
+            yield from self._judged(own, self._proposal(task, loop, count, found), cost.of(count))
             before, reached = reached, self._reached(loop, count, wanted)
             if before or (reached and wanted < self._bound):
                 break
@@ -180,7 +182,8 @@ class Loops(Proposer):
             if quick.error > hopeless and count != counts[-1]:
                 continue
             hopeful.append(count)
-            yield from self._judged(self._proposal(task, loop, count, task.whole_steps(quick.steps)), cost.of(count))
+            proposal = self._proposal(task, loop, count, task.whole_steps(quick.steps))
+            yield from self._judged(own, proposal, cost.of(count))
             before, reached = reached, self._reached(loop, count, wanted)
             if before or (reached and safer):
                 break
@@ -196,7 +199,7 @@ class Loops(Proposer):
         self._tasks[name] = task
         return Proposal(name, made, found.notes, beside=True, refusal=partial(self._refusal, name))
 
-    def _judged(self, proposal: Proposal, cost: float) -> Proposals:
+    def _judged(self, own: Trials, proposal: Proposal, cost: float) -> Proposals:
         """Have a plan judged; where it is kept, it may be the best so far."""
         held = yield proposal
         if not held:
@@ -208,6 +211,8 @@ class Loops(Proposer):
         nearest = None if self._nearest is None else self._scores[self._nearest.name].distance
         if near(score.distance, score.interval, self._farthest) and (nearest is None or score.distance <= nearest):
             self._nearest = alone
+        if alone is (self._best or self._nearest):
+            own.bar.best(f"{proposal.plan.in_words()}, {cost:.3g} ms, {score.distance:.2g} away")
 
     def _reached(self, loop: str, count: int, wanted: float) -> bool:
         """Whether a plan of so many steps is as near as is wanted; with a deadline as many are tried as keep it."""
@@ -239,12 +244,17 @@ class Loops(Proposer):
             return None
         return f"is {score.distance:.3g} from the original; {self._farthest:g} is allowed"
 
-    def _none(self) -> str:
-        if not self._scores:
-            left = "; ".join(self._left_out) or "the time ended the search"
-            return f"no plan could be tried: {left}. Allow more time."
-        nearest = min(self._scores, key=lambda name: self._scores[name].interval[1])
-        return too_far(nearest, self._scores[nearest], self._farthest)
+    def _none(self, trials: Trials, least: str, costs: Mapping[str, Cost]) -> str:
+        if self._scores:
+            nearest = min(self._scores, key=lambda name: self._scores[name].interval[1])
+            return too_far(trials, self.request, nearest, self._scores[nearest])
+        deadline, takes = self.request.deadline_ms, costs[least].one
+        if deadline is not None and takes > deadline:
+            one = f"one computed step of {least!r}, the least that a call can have, takes {takes:.3g} ms,"
+            told = f"no plan keeps {deadline:.3g} ms: {one} {takes / deadline:.3g} times as long."
+            return f"{told} {would_help(trials, self.request)}"
+        left = "; ".join(self._left_out) or "the time ended the search"
+        return f"no plan could be tried: {left}. Allow more time."
 
     def _cost(self, trials: Trials, loop: str, clock: Clock) -> Cost:
         """What calls of a loop take on this machine, in the faster precision; measured once."""
@@ -280,13 +290,24 @@ def _ending(clock: Clock, seconds: float) -> Clock:
     return clock.until(min(1.0, (clock.elapsed() + seconds) / clock.limit))
 
 
-def too_far(name: str, score: Score, bound: float) -> str:
+def too_far(trials: Trials, request: Request, name: str, score: Score) -> str:
     """What a user is told where no plan is near enough, given the nearest."""
+    bound, more = request.farthest, "Record more episodes, or allow more time or a larger error."
     return (
         f"no plan is near enough to the original: the nearest, {name!r}, is {score.distance:.3g} away, and"
-        f" {score.interval[1]:.3g} at worst; {bound:g} and {SURE * bound:g} are allowed. Record more episodes, or allow"
-        " more time or a larger error."
+        f" {score.interval[1]:.3g} at worst; {bound:g} and {SURE * bound:g} are allowed."
+        f" {more if request.deadline_ms is None else would_help(trials, request)}"
     )
+
+
+def would_help(trials: Trials, request: Request, within: float | None = None) -> str:
+    """What a user is told whose deadline no plan keeps that is near enough; one that is ``within`` does, if given."""
+    spec = trials.artifact.manifest.spec
+    told = [f"more than {request.threads} thread{'s' * (request.threads > 1)} (--threads)"]
+    told += ["a camera less (--without-camera)"] * (sum(one.image for one in spec.observations.values()) > 1)
+    told += ["one instruction compiled in (--task)"] * (spec.instruction is not None)
+    told += ["a larger --error" if within is None else f"--error {rounded_up(within)}"]
+    return f"What may help: {', '.join(told)}, or a slower loop."
 
 
 def _call(runtime: Runtime, obs: Observation, noise: Noise, plan: Plan) -> None:

@@ -25,13 +25,11 @@ class Pruner(Proposer):
     """Gates for each observation, on average within the cells that the plan so far computes. See ``Proposer``."""
 
     def applies(self, artifact: Artifact) -> str | None:
-        """See ``Proposer``."""
         if has_head(view_of(artifact, base_of(artifact)).pruner):
             return None
         return "the artifact has no pruner that could learn. Convert the checkpoint again."
 
     def propose(self, trials: Trials, plan: Plan, clock: Clock) -> Proposals:
-        """See ``Proposer``."""
         cells = plan.cells
         if cells is None or plan.loop != trials.base.loop:
             raise CalibrationFailedError(
@@ -41,7 +39,8 @@ class Pruner(Proposer):
         task = Task.of(trials.runner, trials.windows, computed, trials.seed, trials.pool)
         search = Paper(replace(task, clock=clock))
         found, updates, _ = resumed_search(trials, search, clock, self.request.intervals, PRUNER)
-        self.told = f"{updates} updates; its best head is {found.error:.4g} off on calls that it was not trained on"
+        chosen = "on the calls that it was chosen on, and not trained on"
+        self.told = f"{updates} updates; its best head is {found.error:.4g} off {chosen}"
         share = float(np.mean(cells != Source.COMPUTE))
 
         def refusal(score: Score, others: Mapping[str, Score]) -> str | None:

@@ -68,7 +68,7 @@ class Tokens(Proposer):
         if (told := _too_many(score, {})) is not None:
             raise _refused(f"it {told}")
         assert best.tokens is not None
-        self.told = f"{score.tokens:.0%} of the tokens of new frames are computed"
+        self.told = f"on the calls that it was chosen on, {score.tokens:.0%} of the tokens of new frames are computed"
         notes, shared = {**asdict(best.tokens), "computed": score.tokens}, {"tokens": best.tokens}
         yield Proposal(trials.changed_name, best, notes, margin=self.margin, shared=shared, refusal=_too_many)
 

@@ -60,11 +60,7 @@ SMALLEST = 2
 
 
 def trainable(artifact: Artifact, rank: int) -> tuple[str, ...]:
-    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads.
-
-    Raises:
-        CalibrationError: there are none for so large a rank.
-    """
+    """Constants that can be changed: matrices, or kernels, of residual blocks that no other piece reads."""
     others = {name for key, graph in artifact.graphs.items() if not is_block(key) for name in graph.constants}
     mine = {name for piece in artifact.pieces.blocks for name in piece.graph.constants} - others
     values = {name: artifact.weights[name] for name in mine}
@@ -87,7 +83,7 @@ def _sides(shape: tuple[int, ...]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Lesson:
-    """Calls, and what their loop carries to step ``Student.begin``, the first that is trained."""
+    """Calls, and what their loop carries to step ``Student.begin``."""
 
     calls: Calls
     carried: Carried
@@ -132,14 +128,7 @@ class Student:
         return Lesson(calls, Carried(*(torch.cat(each) for each in zip(*carried, strict=True))))
 
     def update(self, lesson: Lesson, passed: float) -> float:
-        """Learn from one batch.
-
-        Args:
-            passed: share of the time that there is; the rate falls with it, or with the updates done.
-
-        Returns:
-            The loss of the batch.
-        """
+        """Learn from one batch; its loss. The rate falls with the share of the time that passed, or with updates."""
         part = max(passed, self.done / self._updates)
         rate = RATE * min(1.0, (self.done + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
         batch = self._batch(lesson.calls.count)

@@ -74,10 +74,7 @@ class Practice:
 
 
 def legal(wished: PlanArray, window: int) -> PlanArray:
-    """Plans ``[N, K, blocks]`` of calls in windows as a runtime executes them.
-
-    ROLLOUT is TIMESTEP where no earlier call of the window computed the cell.
-    """
+    """Plans ``[N, K, blocks]`` of calls in windows as a runtime executes them: TIMESTEP for an unwritten ROLLOUT."""
     plans = wished.copy()
     plans[:, 0] = Source.COMPUTE
     plans[(plans == Source.ROLLOUT) & ~written(plans, window)] = Source.TIMESTEP

@@ -1,0 +1,181 @@
+"""Which plan is the default of many: by distance, time and deadline."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ttscompile
+from tests.calibration import policies
+from ttscompile.artifact.load import load_artifact
+from ttscompile.calibration import pipeline
+from ttscompile.calibration.choose import choose, weights_read
+from ttscompile.calibration.judge import Score
+from ttscompile.calibration.kept import Kept
+from ttscompile.calibration.pipeline import calibrate
+from ttscompile.calibration.proposer import least_bound
+from ttscompile.calibration.trials import Trials
+from ttscompile.core.plan import DENSE, Plan
+from ttscompile.errors import CalibrationFailedError
+from ttscompile.measure.timer import Times
+from ttscompile.report.facts import chosen as chosen_of, limits
+
+from .proposers.trying import request, trials_of
+
+
+def score_of(distance: float) -> Score:
+    return Score(distance, (distance, distance), None, None, 0.0, 0.0, 0.0, 1)
+
+
+def chosen(
+    monkeypatch: pytest.MonkeyPatch, trials: Trials, figures: Mapping[str, tuple[float, float, float]], **asked: float
+) -> Mapping[str, str]:
+    """What the names of the artifact's plans were called while they were tried.
+
+    Args:
+        monkeypatch: fixture.
+        trials: of any policy.
+        figures: distance, upper end of its interval, and milliseconds of plans by name.
+        asked: of ``Request``.
+    """
+    kept = Kept(trials, anew=True)
+    plans = {name: replace(trials.base) for name in figures}
+    kept.plans |= plans
+    names = {id(plan): name for name, plan in kept.plans.items()}
+    figures = {DENSE: (0.0, 0.0, 100.0), **figures}
+
+    def scored(_: Trials, plan: Plan) -> Score:
+        distance, limit, _ms = figures[names[id(plan)]]
+        return Score(distance, (0.0, limit), None, None, 0.0, 0.0, 0.0, 1)
+
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", scored)
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.timed",
+        lambda entrants, threads, rounds=3: [Times((figures[names[id(plan)]][2],) * rounds) for _, plan in entrants],
+    )
+    warned: list[str] = []
+    monkeypatch.setattr(kept.trials.bar, "warn", warned.append)
+    frontier = choose(kept, request(**asked))
+    assert len(warned) == (frontier.default == DENSE)
+    assert (DENSE in frontier.scores) == (frontier.default == DENSE)
+    found = {name: names[id(plan)] for name, plan in frontier.plans.items() if name != DENSE}
+    return found if frontier.default == "schedule" else {"kept": found.pop("schedule"), **found}
+
+
+def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path) -> None:
+    trials = trials_of(artifact, [recording])
+    figures = {
+        "a": (0.24, 0.60, 1.0),  # within the bound, but for its upper limit
+        "b": (0.20, 0.25, 2.0),
+        "c": (0.15, 0.20, 3.0),  # not much nearer than b
+        "d": (0.13, 0.20, 4.0),
+        "e": (0.05, 0.60, 5.0),
+        "f": (0.16, 0.20, 3.5),  # slower than c and further
+    }
+    assert chosen(monkeypatch, trials, figures, bound=0.25) == {"schedule": "b", "safe": "d"}
+    # Where a fifth of the time makes it nearer, it is nearer; what is safe has to be near enough itself, as e is not.
+    closer = figures | {"g": (0.10, 0.20, 2.3)}
+    assert chosen(monkeypatch, trials, closer, bound=0.25) == {"schedule": "g"}
+    assert chosen(monkeypatch, trials, closer | {"g": (0.1, 0.2, 2.5)}, bound=0.25)["schedule"] == "b"
+    # By a deadline the nearest that keeps it; the nearest of all, e, is not surely near enough.
+    assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=3.2)["schedule"] == "c"
+    assert chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=50.0)["schedule"] == "d"
+    told = "surely within 0.25 .* keeps 1.5 ms: the fastest, 'b' .10 of 10 .*, takes 2 ms, and 2 at worst, 1.33 times"
+    with pytest.raises(CalibrationFailedError, match=told + " as long. What may help: more than 1 thread .*, a larger"):
+        chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=1.5)
+    with pytest.raises(CalibrationFailedError, match="'c', is 0.15 away, and 0.2 at worst; 0.1 and 0.125 are"):
+        chosen(monkeypatch, trials, figures, bound=0.1)
+
+
+def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    trials = trials_of(artifact, [recording])
+    figures = {"a": (0.20, 0.25, 1.0), "b": (0.12, 0.20, 2.0), "c": (0.08, 0.12, 4.0), "d": (0.01, 0.02, 9.0)}
+    bounds = {"bound": 0.1, "farthest": 0.25}
+    assert chosen(monkeypatch, trials, figures, **bounds) == {"schedule": "c", "fast": "a", "safe": "d"}
+    # What is fast is surely near enough for that, and of those that are as fast it is the nearest.
+    surely = figures | {"a": (0.20, 0.60, 1.0)}
+    assert chosen(monkeypatch, trials, surely, **bounds)["fast"] == "b"
+    assert chosen(monkeypatch, trials, figures | {"e": (0.15, 0.2, 1.1)}, **bounds)["fast"] == "e"
+    # By a deadline, too, what is surely near enough comes before what may be nearer; and so does what is safe.
+    unsure = {"a": (0.09, 0.25, 5.0), "b": (0.095, 0.11, 5.0), "c": (0.06, 0.30, 10.0), "d": (0.06, 0.12, 12.0)}
+    assert chosen(monkeypatch, trials, unsure, deadline_ms=8.0, **bounds) == {"schedule": "b", "safe": "d"}
+    assert chosen(monkeypatch, trials, unsure, **bounds) == {"schedule": "b", "safe": "d"}
+    # One that may be a half further than the bound is as far as some that have lost successes.
+    doubtful = figures | {"c": (0.08, 0.15, 4.0)}
+    assert chosen(monkeypatch, trials, doubtful, **bounds) == {"schedule": "d", "fast": "a"}
+    assert chosen(monkeypatch, trials, figures, deadline_ms=5.0, **bounds)["schedule"] == "c"
+
+
+def test_nothing_that_may_cost_success_is_the_default_unasked(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    """The nearest is kept to be asked for: by ``--error``, whose value the row has, or by its name."""
+    trials, bounds = trials_of(artifact, [recording]), {"bound": 0.1, "farthest": 0.25}
+    figures = {"a": (0.20, 0.25, 1.0), "b": (0.12, 0.20, 2.0)}
+    assert chosen(monkeypatch, trials, figures, **bounds) == {"kept": "b", "fast": "a"}
+    assert chosen(monkeypatch, trials, figures, bound=least_bound(0.12, (0.0, 0.2)), farthest=0.25) == {
+        "schedule": "b",
+        "fast": "a",
+    }
+    # By a deadline the original stays the default only if it keeps it, as it does with its 100 ms.
+    near_but_slow = figures | {"c": (0.08, 0.12, 4000.0)}
+    assert chosen(monkeypatch, trials, near_but_slow, deadline_ms=120.0, **bounds)["kept"] == "b"
+    with pytest.raises(CalibrationFailedError, match="fastest, 'c' .* takes 4e.03 ms, .*, --error 0.16, or a slower"):
+        chosen(monkeypatch, trials, near_but_slow, deadline_ms=3.0, **bounds)
+
+
+@pytest.mark.slow
+def test_a_calibration_without_a_near_plan_leaves_the_original_the_default(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "choose", lambda kept, request: choose(kept, replace(request, bound=1e-9)))
+    result = calibrate(artifact, [recording], learn=("loops",), max_distance=3.0, progress=False, max_minutes=1)
+    made = load_artifact(artifact)
+    assert result.default_plan == made.manifest.default_plan == DENSE and "schedule" in made.plans
+    assert result.sparsity == 0 and not result.doubtful
+    (told,) = chosen_of(made.manifest.calibration or {})
+    assert told.startswith("No plan is surely within 3 of the original, so the default is 'dense'")
+    assert "Its default plan computes every cell of its loop." in limits(made).points
+    policy = ttscompile.load(artifact)
+    assert policy.info.default_plan == DENSE
+    assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
+
+
+def test_by_a_deadline_the_nearest_are_timed_until_99_of_100_calls_are_known(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    """One slow call of sixteen does not exclude a plan, and five of 200 do."""
+    kept, rounds = Kept(trials_of(artifact, [recording]), anew=True), list[tuple[int, int]]()
+    slow = {"hiccup": 1, "late": 5, "last": 1, DENSE: 0}  # of 200 calls
+    kept.plans |= {name: replace(kept.trials.base) for name in ("late", "hiccup", "last")}
+    names = {id(plan): name for name, plan in kept.plans.items()}
+    far = {"late": 0.01, "hiccup": 0.02, "last": 0.03, DENSE: 0.0}
+    monkeypatch.setattr("ttscompile.calibration.choose.judge", lambda _, plan: score_of(far[names[id(plan)]]))
+
+    def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int, calls: int = 16) -> list[Times]:
+        rounds.append((len(entrants), calls))
+        count = [slow[names[id(plan)]] for _, plan in entrants]
+        return [Times((9.0,) * some + (1.0,) * (calls - some)) for some in count]
+
+    monkeypatch.setattr("ttscompile.calibration.choose.timed", timed)
+    frontier = choose(kept, request(deadline_ms=5.0))
+    assert names[id(frontier.plans["schedule"])] == "hiccup"
+    assert rounds == [(4, 16), (2, 200)], "the third is not as near"
+    (row,) = (row for row in frontier.tried if row["name"] == "schedule")
+    assert (row["worst"], row["calls"]) == (1.0, 200)
+
+
+def test_weights_are_those_that_the_models_of_a_plan_read(tmp_path: Path) -> None:
+    """Of three layers of ``Mixer`` in eight bits less than in fp32, whatever else the artifact holds."""
+    module, path = policies.Mixer(0).eval(), tmp_path / "mixer"
+    ttscompile.compile_denoiser(module, policies.spec(), path, precision="int8")
+    made = load_artifact(path)
+    whole, narrow = (weights_read(made, made.plan(name)) for name in (DENSE, "dense@int8"))
+    large = sum(4 * one.weight.numel() for one in (*module.wide, *module.narrow))
+    stored = {name: one.bytes for name, one in made.manifest.files.items() if name.endswith(".safetensors")}
+    assert large < whole < sum(stored.values()) - stored["golden.safetensors"] - stored["weights_int8.safetensors"]
+    assert large / 2 < whole - narrow < large, "each weight is a quarter as long, and has a scale"
