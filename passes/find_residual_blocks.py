@@ -22,12 +22,7 @@ _LEAST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class BlockTable:
-    """The residual stream of a denoiser.
-
-    Attributes:
-        blocks: in the order of execution.
-        declined: additions and other values that were looked at and are no block of their own, each with its reason.
-    """
+    """The blocks of a denoiser, in the order of execution; and values that are none, with the reason."""
 
     blocks: tuple[Block, ...]
     declined: tuple[str, ...]
@@ -61,9 +56,9 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
     """The chain of additions ``a_i = a_{i-1} + r_i`` through which everything goes from the sample to the output.
 
     ``a_{i-1}`` has to be a value that every path from the sample to the output crosses (a dominator), and ``r_i`` has
-    to depend on it. Where the chain is broken between two dominators of the stream's type (a long skip, a value
-    that is added but does not depend on the stream, a normalisation of the stream itself), what lies between them is
-    one coarse block, whose residual is the difference.
+    to depend on it. Where the chain is broken between two dominators of the residual stream's type (a long skip, an
+    added value that does not depend on it, a normalisation of itself), what lies between them is one coarse block,
+    whose residual is the difference.
 
     Raises:
         NoResidualBlocksError: there is no such addition, and names the node at which the search ended; or what is
@@ -121,14 +116,14 @@ def _links(graph: Graph, points: Sequence[str], loop: set[str]) -> tuple[list[_L
                 declined.append(f"{where}: another path to the output goes around it")
             continue
         if not streams:
-            declined.append(f"{where}: neither operand carries the stream with the shape of the sum, {node.type}")
+            declined.append(f"{where}: no operand carries the residual stream with the shape of the sum, {node.type}")
             continue
         stream = streams[0]
         others = [o for o in operands if o != stream]
         if len(others) != 1:
             declined.append(f"{where}: it adds a value to itself")
         elif others[0] not in loop:
-            declined.append(f"{where}: the added %{others[0]} does not depend on the stream")
+            declined.append(f"{where}: the added %{others[0]} does not depend on the residual stream")
         elif dict(node.kwargs).get("alpha", 1) != 1:
             declined.append(f"{where}: it adds with a factor alpha")
         elif types[others[0]] != node.type:
@@ -154,8 +149,8 @@ def _main_stream(graph: Graph, links: list[_Link], declined: list[str]) -> list[
 def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: list[str], loop: set[str]) -> list[Block]:
     """Blocks from links, with coarse blocks over what lies between and around them.
 
-    Blocks of one kind are one FORWARD group. The residual of a coarse block also holds what happens to the stream
-    before the addition, so it is of another kind.
+    Blocks of one kind are one FORWARD group. The residual of a coarse block also holds what happens to the residual
+    stream before the addition, so it is of another kind.
     """
     types = graph.types()
     stream_type = types[links[0].result]
@@ -179,7 +174,8 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
         else:
             gap = between(graph, cursor, link.stream)
             hides = _hides_residuals(graph, cursor, link.stream, stream_type)
-            add(cursor, link.result, None, f"the stream is changed by {_describe(gap)} before the addition", hides)
+            changed = f"the residual stream is changed by {_describe(gap)} before the addition"
+            add(cursor, link.result, None, changed, hides)
             declined.append(f"%{link.result}: merged with what comes before it; {blocks[-1].reason}")
         cursor = link.result
     if late != cursor and _hides_residuals(graph, cursor, late, stream_type):
@@ -188,7 +184,7 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
 
 
 def _hides_residuals(graph: Graph, start: str, stop: str, stream_type: TensorType) -> bool:
-    """Whether two values of the stream's type that depend on ``start`` are added or joined on the way to ``stop``."""
+    """Whether two values of the residual stream's type, from ``start`` on, are added or joined before ``stop``."""
     inside = between(graph, start, stop)
     names = {n.name for n in inside} | {start}
     types = graph.types()

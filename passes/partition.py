@@ -45,7 +45,7 @@ class Partition(Pass[Captured, Cut]):
 
         def outline(start: str, result: str) -> LoopPiece:
             piece = backward_slice(graph, (result,), {start: types[start], **outside})
-            if start not in piece.inputs:  # the result does not read the stream: keep the signature
+            if start not in piece.inputs:  # the result does not read the residual stream: keep the signature
                 piece = replace(piece, inputs={start: types[start], **piece.inputs})
             return LoopPiece(_own_output(piece), start)
 

@@ -12,7 +12,7 @@ _ADD = "aten.add.Tensor"
 
 
 class RegroupSums(Pass[Captured, Captured]):
-    """Add the branches of parallel blocks to each other first, and then to the stream.
+    """Add the branches of parallel blocks to each other first, and then to the residual stream.
 
     Before (``x + attention(n) + feed_forward(n)``, as Python reads it)::
 
@@ -24,8 +24,8 @@ class RegroupSums(Pass[Captured, Captured]):
         %y.branches = aten.add.Tensor(%attention, %feed_forward)
         %y          = aten.add.Tensor(%x, %y.branches)
 
-    The result differs from the original by rounding only. Sums in which every term but the stream depends on the sample
-    are regrouped; a term that does not (a position, say) is no residual, and stays where it is.
+    The result differs from the original by rounding only. Sums in which all terms but the residual stream depend on the
+    sample are regrouped; a term that does not (a position, say) is no residual, and stays where it is.
     """
 
     def call(self, program: Captured) -> PassResult[Captured]:

@@ -30,7 +30,7 @@ class UnfoldBatch(Pass[Cut, Cut]):
             return PassResult(program)
         blocks = program.blocks
         if stream in rows:
-            # Every value of the stream is made from the first, and residuals are added to it: their rows are alike.
+            # All values of the residual stream are made from the first, and residuals added to it: rows are alike.
             like = rows[stream]
             for piece in (*loop.blocks, loop.tail):
                 for name in (piece.stream, *(() if piece is loop.tail else piece.graph.outputs)):

@@ -6,6 +6,10 @@
 - ``torch``: a call as one straight line, on any device that torch has.
 - ``instructions``: what several of them make of a plan.
 - ``policy``: the object that users hold, around any of them; ``load``: how they get it.
+
+What a caller gives that does not fit is an ``ObservationError`` or an ``IllegalPlanError`` of any function of this
+room. Parts of an artifact that do not fit each other are an ``ArtifactError``, and what this machine lacks a
+``RuntimeUnavailableError``.
 """
 
 from .open import open_runtime

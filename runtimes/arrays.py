@@ -40,9 +40,6 @@ def read_observation(
     Returns:
         The arrays, not checked but for images that the policy resizes, which are; and the first of them that came as a
         tensor, as it came, or None.
-
-    Raises:
-        ObservationError: no mapping, another set of keys, or what ``plain`` or ``fitted`` refuses.
     """
     if not isinstance(obs, Mapping):
         expected = f"a dictionary with the keys {sorted(specs)}"
@@ -69,9 +66,6 @@ def check_observation(arrays: Mapping[str, Array], specs: Mapping[str, Observati
     """Copies of arrays ``[B, ...]`` of their specified shapes and dtypes, with numbers that can be, and one B.
 
     They are copied before their numbers are looked at: another thread may write into the caller's.
-
-    Raises:
-        ObservationError: names the key, what was expected, what was found and the remedy.
     """
     own = {}
     for key, spec in specs.items():
@@ -121,9 +115,6 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
         noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
             sampler draws no noise in its steps, ``noise.steps`` is not looked at; of those of a longer loop the first
             K are taken.
-
-    Raises:
-        ObservationError: missing, of the wrong shape or dtype, or not finite.
     """
     if not isinstance(noise, Noise):
         raise ObservationError(f"noise is a {type(noise).__name__}; expected ttscompile.Noise(initial, steps).")

@@ -67,18 +67,12 @@ class Backend(Protocol[Lowered]):
     keeps: BoolArray
 
     def lower(self, plan: PlanArray) -> Lowered:
-        """What ``other_steps`` needs of the plan of one stream. The runtime keeps it, and gives it again.
-
-        Args:
-            plan: int8 ``[K, blocks]``, legal.
-        """
+        """What ``other_steps`` needs of a legal plan, int8 ``[K, blocks]``. The runtime keeps it for the next time."""
 
     def prepare(self, streams: int, plans: Sequence[Lowered] | None) -> None:
-        """Have everything that a call needs beside its inputs: memory, for the most part. It is not timed.
+        """Have the memory that a call of B streams needs, until the episode ends. It is not timed.
 
-        Args:
-            streams: B of the calls from here on, at least until the episode ends.
-            plans: of each stream; None for the pruner's, which are not known yet.
+        Of each stream there is its plan, or None for the pruner's, which are not known yet.
         """
 
     def start(self, call: Call) -> None:
@@ -99,11 +93,7 @@ class Backend(Protocol[Lowered]):
 
 @contextmanager
 def fitting(view: View) -> Iterator[None]:
-    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit.
-
-    Raises:
-        ArtifactError: in place of any exception that is not the package's own, but for a package that is missing.
-    """
+    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit."""
     try:
         yield
     except (TtscompileError, ModuleNotFoundError):
@@ -114,12 +104,7 @@ def fitting(view: View) -> Iterator[None]:
 
 
 def stream_type(manifest: Manifest, streams: int) -> TensorType:
-    """The type of the residual stream, which is float32, and the same for all blocks.
-
-    Raises:
-        ArtifactError: it is not.
-        ObservationError: it has no axis for the streams, of which there are several.
-    """
+    """The type of the residual stream, which is float32, and the same for all blocks."""
     kind = manifest.blocks[0].type
     if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
         types = sorted({str(block.type) for block in manifest.blocks})

@@ -1,4 +1,4 @@
-"""What the pieces read beside the stream, for one number of streams: numpy arrays, or tensors of torch, that stay."""
+"""What the pieces read beside the residual stream, for one number of streams: arrays or tensors that stay."""
 
 from __future__ import annotations
 
@@ -58,11 +58,7 @@ class ContextValues:
                 self.values[name][...] = value
 
     def for_step_piece(self, names: Iterable[str]) -> list[Any]:
-        """What the step piece reads for all steps in one batch of K * B, step-major.
-
-        Raises:
-            ArtifactError: one of them has no axis for the streams.
-        """
+        """What the step piece reads for all steps in one batch of K * B, step-major."""
         found, steps, together = list[Any](), self._manifest.steps, self._module.concatenate
         for name in names:
             value, axis = self.values[name], self._manifest.contexts[name].type.batch_axis

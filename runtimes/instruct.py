@@ -15,12 +15,7 @@ from ttscompile.errors import ObservationError
 
 
 class Instruct:
-    """Puts the tokens of a task into an observation.
-
-    Args:
-        spec: of a policy that is told its task in words.
-        read: gives its tokenizer; called when the first text comes.
-    """
+    """Puts the tokens of a task into an observation; ``read`` gives the tokenizer when the first text comes."""
 
     def __init__(self, spec: PolicySpec, read: ReadTokenizer) -> None:
         assert spec.instruction is not None
@@ -33,11 +28,7 @@ class Instruct:
         return self._read(ObservationError)
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The observation with tokens and mask of its ``task``, a text or one for each stream; as it is if it has them.
-
-        Raises:
-            ObservationError: it has neither, or the task is no text, or one without the state that it is told with.
-        """
+        """The observation with tokens and mask of its ``task``, a text or one a stream; as it is if it has them."""
         if not isinstance(obs, Mapping) or self._told.tokens in obs:
             return obs
         if TASK not in obs:
@@ -89,12 +80,8 @@ class Instruct:
 def instruct_of(artifact: Artifact, tokenizer: str | os.PathLike[str] | None = None) -> Instruct | None:
     """What puts tokens into a policy's observations; None where the policy has no tokenizer, or is told no task.
 
-    Args:
-        tokenizer: see ``Tokenizer``; read at once. None for the artifact's own, which is read when the first text
-            comes: whoever gives tokens needs neither it nor the package that reads it.
-
-    Raises:
-        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
+    A tokenizer that is given is read at once, the artifact's own when the first text comes: whoever gives tokens needs
+    neither it nor the package that reads it.
     """
     spec = artifact.manifest.spec
     if tokenizer is not None:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from ttscompile.core.lattice import UNWRITTEN, BoolArray, PlanArray, Source, origins, require_legal
 
 Add = tuple[int, int, int, int]
-"""Add a sum to the stream, after making it if it is new: the slot where it is kept while it is needed; the first row
+"""Add a sum to the residual stream, after making it if it is new: its slot, kept while it is needed; the first row
 that it sums; one past the last, which is the first if the sum is in its slot already; and how many of the entries of
 ``Instructions.load_rows`` and ``load_from`` that are left to load before it is made."""
 
@@ -69,15 +69,7 @@ class Instructions:
 
 
 def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
-    """What executes the plan of one stream.
-
-    Args:
-        plan: int8 ``[K, blocks]``.
-        groups: FORWARD group of each block.
-
-    Raises:
-        IllegalPlanError: it reads a residual that was never computed; ROLLOUT reads are taken to be written.
-    """
+    """What executes the plan of one stream, int8 ``[K, blocks]``, with the FORWARD group of each block."""
     steps, blocks = plan.shape
     resolved = origins(plan, groups)
     computed = plan == Source.COMPUTE.value

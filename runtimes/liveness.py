@@ -16,13 +16,9 @@ HEAD = ("pruner.base", "pruner.mask", "pruner.step", "pruner.block")
 
 @dataclass(frozen=True)
 class RolloutNeeds:
-    """The rollout cache of one stream.
+    """The rollout cache of one stream: entries that schedules and pruner of its plans can read, and their bytes.
 
-    Attributes:
-        read: entries that schedules and pruner of its plans can read.
-        bytes_read: what these take.
-        cells: K * blocks, what a plan that the caller gives can read.
-        bytes_most: what these take.
+    Beside them what a plan that the caller gives can read, K * blocks, and the bytes of that.
     """
 
     read: int

@@ -14,17 +14,11 @@ Lowered = TypeVar("Lowered")
 
 
 def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tuple[int, ...]]:
-    """The plan of every stream without illegal reads.
+    """Every stream's plan without illegal reads, int8 ``[B, K, blocks]``; and how many cells were replaced in each.
 
     Args:
         plan: ``[K, blocks]`` or ``[B, K, blocks]``.
         written: bool ``[B, K, blocks]``; rollout entries that exist.
-
-    Returns:
-        A legal plan, int8 ``[B, K, blocks]``, and the number of replaced cells of each stream.
-
-    Raises:
-        IllegalPlanError: wrong dtype, shape or values.
     """
     streams, steps, blocks = written.shape
     plans = check_plan(plan, steps, blocks, streams)
@@ -33,11 +27,7 @@ def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tup
 
 
 def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
-    """Plans from the pruner's logits ``[B, K, blocks, 4]``: the largest of the four sources, int8 ``[B, K, blocks]``.
-
-    Raises:
-        IllegalPlanError: the logits are not numbers.
-    """
+    """Plans from the pruner's logits ``[B, K, blocks, 4]``: the largest of four sources, int8 ``[B, K, blocks]``."""
     if np.isnan(logits).any():
         problem = "the pruner's logits hold NaN, so there is no plan to execute: its weights are broken."
         raise IllegalPlanError(f"{problem} Calibrate the artifact again, or use plan='dense'.")
@@ -46,24 +36,14 @@ def pruner_plan(logits: npt.NDArray[np.float32]) -> PlanArray:
 
 
 class LoweringCache(Generic[Lowered]):
-    """The last plans that were lowered: schedules are lowered once, the pruner's plans when they change.
-
-    Args:
-        lower: what a backend makes of a plan ``[K, blocks]``.
-        capacity: plans to keep.
-    """
+    """The last plans, ``capacity`` of them, that were lowered: schedules once, the pruner's plans when they change."""
 
     def __init__(self, lower: Callable[[PlanArray], Lowered], capacity: int = 64) -> None:
         self._lower, self._capacity = lower, capacity
         self._plans: OrderedDict[bytes, Lowered] = OrderedDict()
 
     def lower(self, plan: PlanArray, check: Callable[[], object] = lambda: None) -> Lowered:
-        """The plan lowered, or what an equal one was lowered to.
-
-        Args:
-            plan: int8 ``[K, blocks]``, contiguous.
-            check: called before a plan is lowered that is not remembered; raises if it may not be.
-        """
+        """A plan, int8 ``[K, blocks]``, lowered, or what an equal one was; ``check`` raises if a new one may not be."""
         key = plan.tobytes()
         found = self._plans.get(key)
         if found is None:

@@ -35,13 +35,7 @@ class Queues:
         """The frames with one more of every stream; the first of an episode fills the window. Nothing is kept yet.
 
         A call that fails after this, and is made again, must not push its frame twice: ``keep`` what it used when it
-        succeeded.
-
-        Args:
-            frame: by key ``[B, ...]``, from ``read_observation``: of a window's key one frame.
-
-        Raises:
-            ObservationError: an array does not fit.
+        succeeded. Of a window's key ``frame`` has one frame.
         """
         own = check_observation(frame, self._frame_specs)
         streams = len(next(iter(own.values())))

@@ -25,7 +25,6 @@ import ttscompile
 from tests.commands_of_docs import NOT_RUN, SHORTER
 from tests.pages import EXTENDING, ROOT, examples, load
 from tests.passes.modules import MODULES, spec
-from ttscompile.artifact.ceiling import BOUND, FARTHEST
 from ttscompile.cli import main
 
 PAGES = examples.pages()
@@ -264,36 +263,6 @@ def test_a_picture_is_drawn_by_its_script(tmp_path: Path, name: str) -> None:
     assert made.size == kept.size
     difference = np.abs(np.asarray(made, np.int16) - np.asarray(kept, np.int16))
     assert difference.mean() < 2, f"the picture in the tree is not the script's: python docs/pictures/{name}.py"
-
-
-def test_what_the_pages_say_of_driven_plans_is_what_was_driven() -> None:
-    """The default's bound was chosen by these numbers."""
-    picture = load(ROOT / "docs" / "pictures" / "distance.py", "docs_distance")
-    plans = picture.plans()
-    within = [row for row in plans if row["distance"] <= BOUND]
-    few, many = (
-        min((row for row in within if (row["episodes"] < picture.FEW) == hollow), key=lambda row: row["points"])
-        for hollow in (True, False)
-    )
-    between = [row["points"] for row in plans if BOUND < row["distance"] <= FARTHEST]
-    beyond = [row["points"] for row in plans if row["distance"] > FARTHEST]
-    losses = f"{-few['points']:.1f} points of success in {few['episodes']} episodes"
-    numbers = "none one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen".split()
-    lost, much = (numbers[sum(points <= -6 for points in some)] for some in (between, beyond))
-    said = (
-        f"Within a tenth the largest loss was {losses}**, where nothing can be told, **and {-many['points']:.1f} in"
-        f" {many['episodes']:,}**; between a tenth and a quarter {lost} of {len(between)} lost 6 points or more,"
-        f" {-min(between):.1f} at most; of the {numbers[len(beyond)]} beyond {much} did, {-min(beyond):.1f} at most"
-    )
-    facts = (ROOT / "ttscompile" / "report" / "facts.py").read_text()
-    for end, lost in (("they", few["points"]), ("they", min(between)), ("one", min(beyond))):
-        at_most = "" if end == "one" else "at most "
-        assert f'"{end} lost {at_most}{-lost:.1f}"' in facts
-    for page in ("design.md", "howto/calibrate.md", "howto/budget.md"):
-        text = " ".join((ROOT / "docs" / page).read_text().split())
-        assert f"{losses} and {-many['points']:.1f} in {many['episodes']:,}, those up to 0.25 as many as" in text, page
-    assert said in " ".join((ROOT / "docs" / "evidence" / "results.md").read_text().split())
-    assert all(row["low"] <= row["points"] <= row["high"] for row in plans)
 
 
 def headings(page: Path) -> set[str]:

@@ -129,11 +129,7 @@ def first_line(error: BaseException) -> str:
 def needing(what: str, extra: str, otherwise: str = "") -> Iterator[None]:
     """Within the block, which imports, a package that is not installed is told with the extra that installs it.
 
-    Args:
-        what: is in need of it, for the message; ``otherwise`` says after the command what else can be done.
-
-    Raises:
-        RuntimeUnavailableError: see above.
+    ``what`` is in need of it, for the message; ``otherwise`` says after the command what else can be done.
     """
     try:
         yield

@@ -42,11 +42,7 @@ class Work:
 
 
 class Pool(Protocol):
-    """See ``Here`` and ``RayPool``.
-
-    Attributes:
-        count: how many parts are worth giving at once.
-    """
+    """See ``Here`` and ``RayPool``; ``count`` parts are worth giving at once."""
 
     count: int
 

@@ -81,7 +81,7 @@ class Deciding:
     def _step(self, work: Workspace, k: int, decisions: Decisions) -> PlanArray:
         """The blocks of step k, and what was decided about them."""
         first, blocks = range(self._criterion.always), len(work.current)
-        np.copyto(work.stream, work.fresh)
+        np.copyto(work.hidden, work.fresh)
         _run(work, k, first)
         feature = work.current[: len(first)].sum(0) if first else work.fresh
         row = decisions.decide(k, np.moveaxis(feature, self._axis, 0))
@@ -95,7 +95,7 @@ class Deciding:
             np.moveaxis(work.current, 1 + self._axis, 0)[reused] = np.moveaxis(kept, 1 + self._axis, 0)[reused]
         if reused.any():
             total = work.fresh + work.current.sum(0)
-            np.moveaxis(work.stream, self._axis, 0)[reused] = np.moveaxis(total, self._axis, 0)[reused]
+            np.moveaxis(work.hidden, self._axis, 0)[reused] = np.moveaxis(total, self._axis, 0)[reused]
         return row
 
 
@@ -103,4 +103,4 @@ def _run(work: Workspace, k: int, blocks: Sequence[int]) -> None:
     """Compute these blocks, one after the other, for all streams."""
     for b in blocks:
         work.run(k, b)
-        np.add(work.stream, work.current[b], out=work.stream)
+        np.add(work.hidden, work.current[b], out=work.hidden)

@@ -23,7 +23,7 @@ def some_calls(task: Task, count: int) -> Calls:
 
 @torch.no_grad()
 def dense_steps(runner: Runner, calls: Calls) -> Iterator[tuple[Tensor, list[Tensor]]]:
-    """Step by step, the stream after the stem of dense calls, and what each block adds to it."""
+    """Step by step, the residual stream after the stem of dense calls, and what each block adds to it."""
     plan = dense_plan(runner.model.steps, runner.model.blocks)[None]
     caches, stems = StreamCaches(), list[Tensor]()
 

@@ -5,7 +5,7 @@ two parts of the blocks; the runtimes execute one plan that it has decided, and 
 
     stem -> blocks 0..always-1, computed -> decide(k, feature) -> the other blocks, all computed or all reused -> tail
 
-The feature is what the first ``always`` blocks add together, or the stream after the stem if there are none. What is
+The feature is what the first ``always`` blocks add together, or the stem's residual stream if there are none. What is
 reused is the block's own last residual, so a decided plan is an ordinary plan of COMPUTE and TIMESTEP: it can be
 reported, counted and replayed.
 

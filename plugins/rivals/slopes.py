@@ -42,7 +42,7 @@ def sensitivity(
     streams = runner.select(calls, np.arange(calls.count))
     cache: dict[int, Tensor] = {}
     computed: list[Tensor] = []
-    passed: list[Tensor] = []  # the stream after additions: its gradient is that of what was added just before
+    passed: list[Tensor] = []  # the residual stream after additions: its gradient is that of what was added just before
     position: list[int] = []
 
     def blocks(k: int, stream: Tensor) -> Tensor:

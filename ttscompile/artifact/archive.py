@@ -28,7 +28,7 @@ _AGAIN = "Zip the artifact's directory again, or give the directory itself."
 
 
 class Unpacked:
-    """A temporary folder that goes when this object does, but for a copy of this object in a forked process.
+    """A temporary folder that goes at ``remove()`` or when this object does, but for its copy in a forked process.
 
     Raises:
         OSError: there is no place for temporary files.
@@ -36,11 +36,7 @@ class Unpacked:
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="ttscompile-"))
-        self._finalizer = weakref.finalize(self, _remove, self.path, Process())
-
-    def remove(self) -> None:
-        """Remove the folder now."""
-        self._finalizer()
+        self.remove = weakref.finalize(self, _remove, self.path, Process())
 
 
 def _remove(folder: Path, process: Process) -> None:
@@ -49,16 +45,10 @@ def _remove(folder: Path, process: Process) -> None:
 
 
 def unpack(path: Path) -> Unpacked:
-    """Unpack a zipped artifact into a temporary folder.
+    """Unpack a zipped artifact into a temporary folder: the files that the manifest declares, and no others.
 
-    The files may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them.
-
-    Returns:
-        The folder, with the files that the manifest declares and no others.
-
-    Raises:
-        ArtifactError: no zip file, no artifact in it, an entry with a name or of a kind that an artifact cannot have,
-            or sizes that contradict the manifest or are out of proportion.
+    They may stand at the top of the archive or all in one folder, as ``zip -r a.zip compiled/`` puts them. Names and
+    kinds of entries that no artifact has are refused, and sizes that are out of proportion.
     """
     try:
         unpacked = Unpacked()

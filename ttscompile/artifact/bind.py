@@ -31,13 +31,7 @@ REPORT = "This is an error in ttscompile; please report it."
 
 @dataclass(frozen=True)
 class Place:
-    """Where the value of a constant lies.
-
-    Attributes:
-        file: name of the safetensors file, in the folder of the model.
-        offset: of its first byte.
-        length: in bytes.
-    """
+    """The value of a constant, and where it lies: file in the model's folder, first byte, and length in bytes."""
 
     value: npt.NDArray[Any]
     file: str
@@ -49,9 +43,7 @@ class Place:
 class LoweredPieces:
     """What ``lower_precision`` made of blocks and prologue.
 
-    Attributes:
-        models: by piece, those that hold all blocks among them.
-        weights: the constants that these models have and the program has not.
+    Models by piece, those that hold all blocks among them; and the constants that these have and the program has not.
     """
 
     name: str
@@ -67,16 +59,7 @@ def places_of(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, P
 
 
 def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: bool = False) -> bytes:
-    """The bytes of a model whose empty initializers have their values.
-
-    Args:
-        model: from ``lower``; initializers that are constants of the program hold no data.
-        places: by name of the constant.
-        again: the model is bound already; the constants in ``places`` get new values.
-
-    Raises:
-        ArtifactError: an empty initializer that is no constant of the program, or is one of another type.
-    """
+    """The bytes of a model whose empty initializers, or ``again`` all of ``places``, have their values."""
     from onnx import ModelProto
 
     bound = ModelProto()
@@ -115,8 +98,7 @@ def store_pieces(
 ) -> PrecisionRecord:
     """Write pieces beside those in fp32, which the reference runtime computes with, into the folder of a new artifact.
 
-    Args:
-        places: of the program's constants, which these models read too.
+    ``places`` are of the program's constants, which these models read too.
     """
     where = f"precision {lowered.name!r}"
     if taken := sorted(set(lowered.weights) & set(places)):

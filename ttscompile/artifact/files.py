@@ -46,11 +46,7 @@ _AGAIN = "Copy the artifact again, or convert the checkpoint again."
 
 @contextmanager
 def opened(path: Path) -> Iterator[BufferedReader]:
-    """A file to read from. Anything else is refused unread: a pipe or a device may never end.
-
-    Raises:
-        ArtifactError: missing, something else than a file, or it cannot be read, now or within the block.
-    """
+    """A file to read from, now and within the block. Anything else is refused unread: a pipe may never end."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else a pipe waits for somebody who writes into it
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -198,11 +194,7 @@ def lock_folder(path: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
-
-    Raises:
-        ArtifactError: somebody else is at it; or it cannot be locked.
-    """
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too."""
     with ExitStack() as held:
         try:
             held.enter_context(lock_folder(directory))

@@ -267,10 +267,9 @@ def probe_stream(block: int, kind: TensorType, streams: int, scale: float) -> Fl
 
 
 def project(array: Array, axis: int | None) -> FloatArray:
-    """Random projections of each stream, float32 ``[B, DIGITS]``, whose norm is about the stream's.
+    """Random projections of each stream, float32 ``[B, DIGITS]``, whose norm is about that stream's.
 
-    Args:
-        axis: of the streams; None for a layer, as one stream, in which infinite numbers, of a mask, count as zeros.
+    A layer has no axis of streams, and is one; infinite numbers in it, of a mask, count as zeros.
     """
     rows = np.where(np.isinf(array), 0, array)[None] if axis is None else np.moveaxis(array, axis, 0)
     rows = rows.reshape(len(rows), -1).astype(np.float64)

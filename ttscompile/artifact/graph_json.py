@@ -40,12 +40,7 @@ def graph_to_json(graph: Graph) -> dict[str, Any]:
 
 
 def graph_from_json(document: Value) -> Graph:
-    """The graph that ``graph_to_json`` wrote; exact but for ``Node.source``, which is empty.
-
-    Raises:
-        ArtifactError: an unknown, missing or ill-typed field, an operation that is not named like an ATen operation,
-            two values of one name, or a value that is read before it is computed. Says where.
-    """
+    """The graph that ``graph_to_json`` wrote; exact but for ``Node.source``, which is empty. Errors say where."""
     members = document.keys("inputs", "constants", "nodes", "outputs")
     results: dict[str, int] = {}
     inputs = _typed_names(members["inputs"], results)

@@ -52,7 +52,7 @@ class BlockRecord:
 
     Attributes:
         kind: ``self_attention``, ``cross_attention``, ``feed_forward`` or a structural signature.
-        type: of the residual, and of the stream that it is added to.
+        type: of the residual, and of the residual stream that it is added to.
         group: number of its FORWARD group.
         flops: of one evaluation for one stream.
         reason: why it is coarse; empty for a plain residual.
@@ -87,7 +87,7 @@ class PieceRecord:
 
 @dataclass(frozen=True)
 class ContextRecord:
-    """A value that the loop reads beside the stream: when it is known, and what it is for one step."""
+    """A value that the loop reads beside the residual stream: when it is known, and what it is for one step."""
 
     binding: OfContext
     type: TensorType
@@ -114,13 +114,7 @@ class FlopsRecord:
     blocks: tuple[int, ...]
 
     def call(self, plan: PlanArray, pruned: bool, correction: Correction | None = None) -> float:
-        """FLOPs of one call of one stream.
-
-        Args:
-            plan: int8 ``[K, blocks]``.
-            pruned: whether the pruner ran to make it.
-            correction: of the plan; its jumps are counted.
-        """
+        """FLOPs of a call of one stream: plan, int8 ``[K, blocks]``, pruner if it ran, jumps of a correction."""
         fixed = 0 if correction is None else correction.flops_of_jumps
         fixed += self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
         return fixed + plan_flops(plan, self.blocks)
@@ -133,12 +127,7 @@ class FlopsRecord:
 
 @dataclass(frozen=True)
 class StartRecord:
-    """A loop that is the last steps of another, and begins with the chunk of the call before (``core.start``).
-
-    Attributes:
-        loop: name of the other, which begins with noise.
-        steps: how many of its steps are left.
-    """
+    """A loop that is the last ``steps`` of another, and begins with the chunk of the call before (``core.start``)."""
 
     loop: str
     steps: Positive

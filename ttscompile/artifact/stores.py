@@ -22,11 +22,7 @@ from .manifest import FileRecord, Manifest, WeightsRecord
 
 @dataclass(frozen=True)
 class BlockWeights:
-    """Constants of residual blocks that a plan has in place of the original's.
-
-    Attributes:
-        precision: what the artifact's other precision makes of them, by name; empty where it has none.
-    """
+    """Constants of blocks that a plan has in place of the original's, and what the other precision makes of them."""
 
     weights: Mapping[str, npt.NDArray[Any]]
     precision: Mapping[str, npt.NDArray[Any]]

@@ -14,12 +14,7 @@ REMEDY = "The file was changed or damaged; copy the artifact again, or convert t
 
 
 class Value(NamedTuple):
-    """A value of a parsed document together with where it stands.
-
-    Attributes:
-        data: what ``json.loads`` gave.
-        path: for messages, ``manifest.json: spec.sampler.clip``.
-    """
+    """What ``json.loads`` gave, and where it stands, for messages: ``manifest.json: spec.sampler.clip``."""
 
     data: Any
     path: str

@@ -50,12 +50,7 @@ _WIDEST_FIRST = ("I64", "F64", "F32", "I32", "F16", "I16", "I8", "U8", "BOOL")
 
 @dataclass(frozen=True)
 class Entry:
-    """Where one tensor lies.
-
-    Attributes:
-        offset: of its first byte, from the start of the file.
-        length: in bytes.
-    """
+    """Where one tensor lies: its first byte from the start of the file, and how many there are."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
@@ -112,7 +107,7 @@ def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
 
 
 def offsets(path: Path) -> dict[str, tuple[int, int]]:
-    """Byte offset in the file, and length in bytes, of each tensor. Raises ArtifactError: see ``read_header``."""
+    """Byte offset in the file, and length in bytes, of each tensor."""
     with opened(path) as file:
         return {name: (entry.offset, entry.length) for name, entry in _header(file, path).items()}
 

@@ -62,11 +62,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(kind: type[Record], value: Value) -> Record:
-    """Inverse of ``to_json`` for a frozen dataclass. Integers are not negative where no rule says otherwise.
-
-    Raises:
-        ArtifactError: not such a record; says where, what was expected, and what was found.
-    """
+    """Inverse of ``to_json`` for a frozen dataclass. Integers are not negative where no rule says otherwise."""
     return cast(Record, read_as(kind, value))
 
 

@@ -12,17 +12,11 @@ _DISTILLED, _WARM = "distilled", "warm"
 
 
 def upgraded(document: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """What a manifest of schema 10 says, in schema 11.
+    """What a manifest of schema 10, without its checksum, says in schema 11; its identities stay those of before.
 
     There an artifact had one loop, which may be another than the policy was trained to run in; all plans had the
     artifact's precision, and reused tokens in one way; and beside them stood how many steps a warm start takes, and
     what the precision does to actions.
-
-    Args:
-        document: the manifest of schema 10, without its checksum, which was right.
-
-    Returns:
-        A manifest of schema 11, whose identities are those of before, and not those of what it describes.
     """
     try:
         return _upgraded(document)

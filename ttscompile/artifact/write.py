@@ -217,12 +217,7 @@ def choose_default(
     precision: Mapping[str, str] | None,
     seen: Artifact,
 ) -> Manifest:
-    """Make a plan that is there the default.
-
-    Args:
-        precision: that the plan has from now on; None leaves it.
-        seen: the artifact as it was looked at; another one that has taken its place is refused.
-    """
+    """Make a plan of the artifact as it was ``seen`` the default, with another precision if one is given."""
     directory = require_unzipped(path)
     with locked(directory):
         manifest = read_manifest(directory)

@@ -195,13 +195,9 @@ class ChunkSpec:
         return samples[..., self.start : self.stop, : self.action_dim]
 
     def reference(self, obs: Mapping[str, Array]) -> FloatArray | None:
-        """What the actions of a call with these observations, as they are given, are relative to; None for nothing.
+        """What actions of a call with these observations, as given, are relative to, ``[B, 1, Da]``; None for nothing.
 
-        Returns:
-            ``[B, 1, Da]``, with zeros where actions are not relative.
-
-        Raises:
-            ObservationError: a measured pose has no rotation.
+        There are zeros where actions are not relative. Raises ObservationError: a measured pose has no rotation.
         """
         if self.relative is None:
             return None
@@ -242,8 +238,7 @@ class ChunkSpec:
     ) -> FloatArray:
         """Denoised samples ``[B, T, D]`` so many steps later; the last step is repeated where none is left.
 
-        Args:
-            change: what their actions are relative to, and what they will be: the actions stay the same. None for none.
+        ``change`` is what their actions are relative to, and what they will be: the actions stay the same.
         """
         steps = np.minimum(np.arange(sample.shape[1]) + executed, sample.shape[1] - 1)
         later, normalizer = sample[:, steps], self.normalizer

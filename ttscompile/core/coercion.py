@@ -26,9 +26,6 @@ def integer(value: Any, what: str, error: Errors, least: int = 0, most: int | No
         least: the smallest that is taken.
         most: the largest; None for no limit.
         more: what else is taken, for the message.
-
-    Raises:
-        TtscompileError: of the class ``error``: not a whole number, or outside the limits.
     """
     try:
         boolean = isinstance(value, bool) or str(getattr(value, "dtype", "")).endswith("bool")
@@ -50,13 +47,7 @@ def is_tensor(value: object) -> bool:
 def plain(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array:
     """The numpy array of an array or a tensor, of numpy's own class; no copy if it can be helped.
 
-    Args:
-        what: for the message, ``observation 'obs'``.
-        dtype: that is expected in the end, for the message; it is not checked.
-
-    Raises:
-        TtscompileError: of the class ``error``: neither an array nor a tensor; a masked array, or one that computes in
-            its own way; or a tensor whose numbers numpy cannot have.
+    For the message, ``what`` is ``observation 'obs'``, and ``dtype`` what is expected in the end; it is not checked.
     """
     if type(value) is np.ndarray:
         return value
@@ -85,11 +76,7 @@ def listed(value: Any, what: str, error: Errors, dtype: str) -> Array:
 
 
 def numbers(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array:
-    """The same as numbers of a dtype; what that cannot hold becomes infinite.
-
-    Raises:
-        TtscompileError: of the class ``error``: no array, or not of numbers.
-    """
+    """The same as numbers of a dtype; what that cannot hold becomes infinite."""
     array = listed(value, what, error, dtype)
     if array.dtype.kind not in "biuf":
         raise error(f"{what} has dtype {array.dtype!s:.80}; expected numbers, {dtype}.")

@@ -17,11 +17,7 @@ class Level(enum.Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
-
-    Attributes:
-        remedy: what to do; every warning and problem has one.
-    """
+    """One thing that was looked at; every warning and problem has a remedy."""
 
     part: str
     what: str

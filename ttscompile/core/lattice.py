@@ -51,11 +51,7 @@ class Origins:
 
 
 def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> PlanArray:
-    """A plan ``[K, blocks]`` or ``[B, K, blocks]`` of any integer dtype as int8 ``[B, K, blocks]``, contiguous.
-
-    Raises:
-        IllegalPlanError: wrong dtype, shape or values.
-    """
+    """A plan ``[K, blocks]`` or ``[B, K, blocks]`` of any integer dtype as int8 ``[B, K, blocks]``; or refused."""
     array = given = _sources(plan)
     if array.ndim == 2:
         array = np.broadcast_to(array, (streams, *array.shape))
@@ -117,13 +113,7 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
-    """Raise IllegalPlanError if any stream's plan is illegal.
-
-    Args:
-        plans: int8 ``[B, K, blocks]``.
-        groups: FORWARD group of each block.
-        written: bool ``[B, K, blocks]``.
-    """
+    """Raise IllegalPlanError if any stream's plan ``[B, K, blocks]`` is illegal; ``written`` is of its shape."""
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
         if len(bad):

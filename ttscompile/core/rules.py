@@ -11,12 +11,7 @@ from typing import Annotated, Any
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule.
-
-    Attributes:
-        expected: in words, after "expected".
-        holds: of a value of the field's type; true or a match where it is met.
-    """
+    """What is expected, in words that follow that one, and whether a value of the field's type is that."""
 
     expected: str
     holds: Callable[[Any], object]

@@ -82,15 +82,11 @@ class SamplerTable:
         object.__setattr__(self, "memory_to_next", memory_to_next)
         object.__setattr__(self, "to_memory", to_memory)
 
-    def with_skip(self) -> SamplerTable:
-        """The table for a network that predicts ``out - x``: it adds the sample itself, wherever ``out`` is read."""
-        return self._moved(1)
+    def with_skip(self, times: int = 1) -> SamplerTable:
+        """The table for a network that predicts ``out - x``: it adds the sample itself, wherever ``out`` is read.
 
-    def without_skip(self) -> SamplerTable:
-        """The table of which ``with_skip`` makes this one."""
-        return self._moved(-1)
-
-    def _moved(self, times: int) -> SamplerTable:
+        With -1 it is the table of which ``with_skip`` makes this one.
+        """
         to_memory = self.to_memory.copy()
         to_memory[..., 1] += times * to_memory[..., 2]
         return replace(

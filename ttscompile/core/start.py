@@ -17,12 +17,9 @@ TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Start:
-    """What the rest of a longer loop begins with.
+    """What the rest of a longer loop begins with: shares of the action, normalised, and of noise.
 
-    Attributes:
-        skipped: steps of the longer loop that come before it.
-        action: share of the action, normalised, in the sample that it begins with.
-        noise: share of noise.
+    ``skipped`` steps of the longer loop come before it.
     """
 
     skipped: int

@@ -108,15 +108,7 @@ class Instruction:
 
 
 class Tokenizer:
-    """What ``tokenizer.json`` describes, or CLIP's tokenizer of ``vocab.json`` and ``merges.txt``.
-
-    Args:
-        path: of ``tokenizer.json``, of CLIP's ``vocab.json``, or of the folder that has one of them.
-        error: class of the errors.
-
-    Raises:
-        TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
-    """
+    """What ``tokenizer.json`` describes, or CLIP's tokenizer of ``vocab.json`` and ``merges.txt``; in a folder, too."""
 
     def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
         own = Path(path)
@@ -168,13 +160,10 @@ class Tokenizer:
             raise self._error(f"{self._path}: {text!r:.100} has no tokens: {refused!s:.200}.") from refused
 
     def of_task(self, text: str, told: Instruction, length: int, state: str = "") -> list[int]:
-        """The tokens that a policy observes of a task.
+        """The tokens that a policy observes of a task, with the words of the state where the instruction has them.
 
         Too many are refused where words after the text would be cut; of pi0.5, whose state is after it, they are cut,
         as LeRobot cuts them in training.
-
-        Args:
-            state: its words, of a policy that has them in its instruction.
         """
         if held := [word for word in told.never if word in text]:
             raise self._error(f"the task {text!r:.100} holds {held[0]}, no text to this policy. Leave it out.")

@@ -42,11 +42,7 @@ def check_values(array: Array, spec: ObservationSpec, what: str, error: Errors) 
 def check_numbers(
     array: Array, normalizer: Affine | None, what: str, remedy: str, error: Errors
 ) -> tuple[float, float]:
-    """Raise unless numbers are finite, and normalised not above ``LARGEST``, either way.
-
-    Returns:
-        The least and the largest of them, as they are; zeros if there are none.
-    """
+    """The least and the largest number, zeros for none. Raise unless finite, and normalised within ``LARGEST``."""
     if not array.size:
         return 0.0, 0.0
     least, most = float(array.min()), float(array.max())
@@ -74,9 +70,6 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
         array: ``[..., C, h, w]``.
         spec: of the observation, of a window or of a frame.
         what: for the message, ``observation 'obs'``.
-
-    Raises:
-        TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.
     """
     if spec.fit is None or array.dtype != np.float32 or array.ndim < 3 or not array.size:
         return array

@@ -36,22 +36,13 @@ def load_checkpoint_policy(
         The denoiser in eval mode, which takes the sample ``[B, T, D]``, the timestep ``[B]`` and the observations,
         normalised as the second result says, and everything else about the policy. What the original evaluates once a
         call is the ``encoder`` of an ``EncodedDenoiser``.
-
-    Raises:
-        CheckpointError: unreadable, unsafe, not a supported policy, or given an option of another family.
-        SpecError: the sampler asked for is not possible.
     """
     require_free_or_path(path, CheckpointError, "Give a file or a directory that was trained.")
     return find_family(Path(path), format).load(Path(path), options)
 
 
 def recordings_of(path: str | os.PathLike[str], format: str = "auto") -> str:
-    """Where the recorded episodes are that a policy was trained on, as ``load_trajectories`` takes it.
-
-    Raises:
-        CheckpointError: the checkpoint does not say, or names what is not here.
-        HubError: the checkpoint is on the hub, and cannot be had.
-    """
+    """Where the recorded episodes are that a policy was trained on, as ``load_trajectories`` takes it."""
     here = fetch_checkpoint(str(path)).path if on_hub(path) else Path(path)
     find = find_family(here, format).function("recordings")
     found: str | None = None if find is None else find(here)
@@ -67,9 +58,6 @@ def tokenizer_of(
     """The ``tokenizer.json`` that makes an instruction a policy's tokens; and which that is, or why there is none.
 
     One that belongs to another language model is none: it knows more tokens than the policy does.
-
-    Args:
-        encoders: see ``LoadOptions``.
     """
     if spec.instruction is None:
         return None, "no text alone gives what this policy observes"
@@ -90,10 +78,7 @@ def tokenizer_of(
 def files_beside(path: str | os.PathLike[str], spec: PolicySpec, text: bool) -> dict[str, bytes] | None:
     """Files by which the program that trained a policy takes the compiled one in its place.
 
-    None where it never can; empty where it cannot take this one.
-
-    Args:
-        text: whether the compiled one makes tokens of its task itself.
+    None where it never can; empty where it cannot take this one. ``text``: the compiled one makes tokens of its task.
     """
     own = function_of(spec, "files_beside")
     return None if own is None else own(Path(path), spec, text)

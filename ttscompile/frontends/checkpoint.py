@@ -74,9 +74,6 @@ def read_checkpoint(path: str | os.PathLike[str], mapped: bool = False) -> dict[
 
     Entries that are pickles of their own (``pickles``) stay the bytes they are. Tensors that are ``mapped`` stay in the
     file until they are used, as those of safetensors do.
-
-    Raises:
-        CheckpointError: missing, truncated, not a torch zip, or naming a global that is not known to be harmless.
     """
     path = Path(path)
     if not path.is_file():
@@ -158,11 +155,7 @@ def _unreadable(path: Path, error: Exception) -> CheckpointError:
 
 
 def plain_config(value: Any, where: str = "cfg", depth: int = 0, values: Iterator[int] | None = None) -> Any:
-    """Turn inert configuration objects into dictionaries, lists and scalars.
-
-    Returns:
-        dict, list, str, int, float, bool or None, nested.
-    """
+    """Turn inert configuration objects into dictionaries, lists, strings, numbers, booleans and None."""
     values = itertools.count() if values is None else values
     if depth > _DEEPEST:
         raise CheckpointError(f"{where}: the configuration is nested deeper than {_DEEPEST} levels; it is malformed.")

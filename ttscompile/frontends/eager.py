@@ -18,10 +18,8 @@ EagerPolicy = Callable[[Mapping[str, torch.Tensor], Noise], torch.Tensor]
 def eager_policy(module: nn.Module, spec: PolicySpec) -> EagerPolicy:
     """The loop as the original runs it: the whole network once a step, an observation encoder before it once a call.
 
-    Returns:
-        A function of the normalised observations ``{key: [B, ...]}`` and the noise of one call, that gives the
-        denoised sample ``[B, T, D]``, on the CPU. Runs where the module is. Raises ObservationError if a stochastic
-        sampler is given no ``noise.steps``.
+    It takes normalised observations ``{key: [B, ...]}`` and the noise of a call, and gives the denoised sample
+    ``[B, T, D]`` on the CPU. Runs where the module is. Raises ObservationError: a stochastic sampler has no noise.
     """
     device = next((weight.device for weight in module.parameters()), None)
     table = spec.sampler

@@ -22,13 +22,10 @@ class Loops:
 
 
 def loops_of(make: Make, options: LoadOptions, own: str) -> Loops:
-    """The checkpoint's own loop, and beside it the one that is asked for, if that is another.
+    """The checkpoint's own loop, and beside it the one that the caller's options ask for, if that is another.
 
     Some checkpoints name a scheduler of which there is no table, of another class, say. What is asked for then is the
     original, and the source says in place of what. Of ``options.loops`` those follow that the policy can have.
-
-    Args:
-        options: of the caller; without sampler, steps and spacing nothing is asked for.
     """
     if options.sampler is None and options.steps is None and options.spacing is None:
         original = make(AS_SAVED)

@@ -142,9 +142,7 @@ def disk_room() -> tuple[str, int]:
 def filled(make: Callable[[], Network], weights: Mapping[str, torch.Tensor], source: str, where: Path) -> Network:
     """A network with these weights, which are compared before anything of the configured sizes takes memory.
 
-    Args:
-        source: of the sizes; see ``require_weights``.
-        where: begins the message of an error.
+    ``where`` begins the message of an error; see ``require_weights``.
     """
     try:
         with torch.device("meta"):

@@ -30,9 +30,7 @@ def read_json(path: Path) -> dict[str, Any]:
 class Settings:
     """Entries by name; every method raises CheckpointError, which says what was found and what was expected.
 
-    Attributes:
-        where: they stand; begins every message, ``cfg.policy.`` or ``config.json: ``.
-        remedy: a sentence that ends every message.
+    ``where`` begins every message, ``cfg.policy.`` or ``config.json: ``, and ``remedy``, a sentence, ends it.
     """
 
     values: Mapping[str, Any]

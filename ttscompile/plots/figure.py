@@ -26,15 +26,9 @@ _CHARACTER = 0.012  # share of the axes' width, about, that a character of a poi
 
 
 def new_figure(width: float, height: float, told: str = "the figures") -> Figure:
-    """An empty figure, without pyplot, which keeps every figure in a global list and would choose a window system.
+    """An empty figure of so many inches, without pyplot, which has a global list and would choose a window system.
 
-    Args:
-        width: in inches.
-        height: in inches.
-        told: what it will show, and ``--json`` says too; for the error.
-
-    Raises:
-        RuntimeUnavailableError: matplotlib is not installed.
+    ``told`` is what it will show, and ``--json`` says too; for the error.
     """
     with needing(f"a picture of {told}", "compile", f", or read {told} with --json"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -96,14 +90,7 @@ def encoded(figure: Figure, suffix: str = ".png") -> bytes:
 
 
 def write_picture(figure: Figure, path: str | Path) -> None:
-    """Write a picture, see ``encoded``.
-
-    Args:
-        path: of the picture; its suffix (``.png``, ``.svg``, ``.pdf``) is the format.
-
-    Raises:
-        OutputError: it cannot be written; a file that was there is as it was.
-    """
+    """Write a picture in the format of its suffix (``.png``, ``.svg``, ``.pdf``), whole or not at all."""
     place = Path(path)
     require_picture_name(place)
     content = encoded(figure, place.suffix.lower())

@@ -31,11 +31,9 @@ _TITLE_WIDTH = 105  # characters
 
 
 def plot_frontier(points: Sequence[Point], efficient: Sequence[Point], title: str) -> Figure:
-    """The points, and a line along those that no other beats.
+    """The points of all series, and a line along ``efficient``, those that no other beats, the fastest first.
 
-    Args:
-        points: of all series; those at no distance but rounding (the dense policy) are told in the title.
-        efficient: points that no other beats, fastest first.
+    Those at no distance but rounding (the dense policy) are told in the title.
     """
     figure = new_figure(7.5, 5.5)
     axes = figure.add_subplot()

@@ -25,15 +25,9 @@ _ABBREVIATIONS = {"self_attention": "SA", "cross_attention": "CA", "feed_forward
 
 
 def plot_plan(plan: PlanArray, kinds: Sequence[str], title: str = "") -> Figure:
-    """One plan.
+    """One plan, int8 ``[K, blocks]``, with the kind of each block, under a title to which the sparsity is added.
 
-    Args:
-        plan: int8 ``[K, blocks]`` of ``Source``.
-        kinds: kind of each block, in order of execution.
-        title: over the picture; the sparsity is added to it.
-
-    Raises:
-        IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
+    Raises IllegalPlanError: the plan is not a matrix of sources, or does not have a column for each kind.
     """
     if plan.ndim != 2 or plan.shape[1] != len(kinds) or not np.isin(plan, list(Source)).all():
         raise IllegalPlanError(
@@ -67,14 +61,9 @@ def plot_errors(
     title: str = "",
     cells: npt.NDArray[np.bool_] | None = None,
 ) -> Figure:
-    """Relative errors of residuals.
+    """Relative errors of residuals ``[A, blocks]`` at these A steps; those above the tolerance are framed.
 
-    Args:
-        errors: ``[A, blocks]``.
-        steps: number of each of the A steps.
-        kinds: kind of each block, in order of execution.
-        tolerance: errors above it are framed.
-        cells: bool ``[K, blocks]``, cells of a plan that are marked; None for none.
+    ``cells``, bool ``[K, blocks]``, are those of a plan that are marked; None for none.
     """
     count, blocks = errors.shape
     figure, axes = _map(6.5 + 0.03 * count, 2.2 + 0.17 * blocks, kinds, "the errors")

@@ -21,11 +21,8 @@ from .flow import deterministic_table
 class EDMDenoiser(nn.Module):
     """F as ``compile_denoiser`` takes it: ``forward(sample, timestep, **observations)``, the timestep being sigma.
 
-    The sample of the table is the noise at the first step, and ``c_in x`` at the others.
-
-    Args:
-        network: F as k-diffusion's ``Denoiser`` calls it: ``network(scaled, sigma, **observations)`` with ``scaled
-            [B, T, D]`` = ``c_in x`` and ``sigma [B]``.
+    The sample of the table is the noise at the first step, and ``c_in x`` at the others. F is called as k-diffusion's
+    ``Denoiser`` calls it: ``network(scaled, sigma, **observations)``, ``scaled [B, T, D]`` = ``c_in x``, ``sigma [B]``.
     """
 
     def __init__(self, network: nn.Module, sigmas: Sequence[float], sigma_data: float) -> None:

@@ -74,14 +74,11 @@ def flow_matching_table(
 
 
 def remixed_table(steps: int) -> SamplerTable:
-    """The denoising loop of X-VLA, whose network predicts the actions themselves, at times from 1 to 0.
+    """The denoising loop of X-VLA, whose network predicts the actions themselves, at times from 1 to 0 in equal steps.
 
     Each sample is the last prediction mixed with the noise that the call began with, which is the memory::
 
         next = (1 - later) out + later noise
-
-    Args:
-        steps: K, of equal length.
     """
     count = integer(steps, "steps", SpecError, 1)
     times, first = np.arange(count, -1, -1) / count, np.arange(count) == 0

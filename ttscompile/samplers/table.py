@@ -58,9 +58,7 @@ class _Rows:
 class _Chains:
     """Drives a scheduler through all its K steps on given inputs; ``step_arguments`` go to every ``step``.
 
-    Attributes:
-        multistep: whether its outputs are remembered.
-        noise_to_next: what its steps add of their noise, ``[K]``.
+    It tells whether its outputs are remembered, and what its steps add of their noise, ``[K]``.
     """
 
     def __init__(self, scheduler: Any, steps: int, step_arguments: Mapping[str, Any]) -> None:

@@ -21,11 +21,7 @@ _READABLE = f"compressed by one of {', '.join(sorted(CODECS))}. Write it again w
 
 
 def zarr_recording(path: Path) -> Recording:
-    """Open a replay buffer, a directory or zipped.
-
-    Raises:
-        TrajectoryError: not one, damaged, or in an encoding that is not read.
-    """
+    """Open a replay buffer, a directory or zipped."""
     import zarr
 
     require_files(path)
@@ -80,7 +76,7 @@ FILTERS = frozenset({"gzip", "lzf", "shuffle", "fletcher32"})
 
 
 def hdf5_recording(path: Path) -> Recording:
-    """Open a data set. Raises TrajectoryError: not one, damaged, or with data outside of the file."""
+    """Open a data set, of which nothing may be outside of the file."""
     import h5py
 
     require_files(path)

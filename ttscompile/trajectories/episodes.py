@@ -79,9 +79,6 @@ def load_trajectories(
     Returns:
         The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning; so
         is an episode that equals one before it.
-
-    Raises:
-        TrajectoryError: names the file, what was expected, what it holds, and what to do.
     """
     action_steps = integer(action_steps, "action_steps", TrajectoryError, 1)
     if isinstance(paths, str | os.PathLike) or not isinstance(paths, Iterable):
@@ -228,11 +225,7 @@ _SAVEZ = "Use np.savez with plain arrays"
 
 
 def read_npz(path: Path, only: str = "") -> dict[str, Array]:
-    """All arrays of an ``.npz``, or the one of a name if it is there, without unpickling anything.
-
-    Raises:
-        TrajectoryError: it is missing, truncated, of another format, or holds Python objects.
-    """
+    """All arrays of an ``.npz``, or the one of a name if it is there, without unpickling anything."""
     require_path(path, TrajectoryError, "Give the .npz file of a recording.")
     if not path.is_file():
         raise TrajectoryError(

@@ -27,14 +27,7 @@ ROWS, IMAGES = 4096, 8
 
 
 def lerobot_recording(path: Path, most: int | None = None) -> Recording:
-    """Open a data set.
-
-    Args:
-        most: how many of its first episodes are read, and of these only those whose videos are there; None for all.
-
-    Raises:
-        TrajectoryError: not one, or damaged.
-    """
+    """Open a data set; of its first ``most`` episodes, if that is given, those whose videos are there."""
     require_files(path / "data")
     require_files(path / "meta")
     files = sorted((path / "data").rglob("*.parquet"))
@@ -204,12 +197,8 @@ def video_frames(
         info: ``meta/info.json``.
         episodes: ``[F]`` the episode of each row.
         times: ``[F]`` seconds since its episode began, of each row.
-
-    Raises:
-        ModuleNotFoundError: PyAV is not installed.
-        TrajectoryError: a video is missing or damaged, of another codec, or lacks a frame; a time is not finite.
     """
-    import av  # noqa: F401
+    import av  # noqa: F401  # told before anything is looked for
 
     fps: Any = info.get("fps")
     if type(fps) not in (int, float) or not 0 < fps < 1e6:

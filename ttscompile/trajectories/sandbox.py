@@ -61,7 +61,7 @@ def sandboxed_frames(path: Path, kind: str, wanted: Sequence[str], **how: int) -
 
 @contextmanager
 def reader(request: Mapping[str, Any]) -> Iterator[IO[bytes]]:
-    """The stream of a process that answers a request."""
+    """The output of a process that answers a request."""
     told = {**request, "sys_path": [each for each in sys.path if isinstance(each, str)]}
     command = [sys.executable, "-I", "-c", _CODE]
     env = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}  # the other one takes a gigabyte when it begins
@@ -111,11 +111,7 @@ def _array(stream: IO[bytes], line: Mapping[str, Any]) -> Array:
 
 
 def _line(stream: IO[bytes]) -> dict[str, Any]:
-    """The next line of an answer.
-
-    Raises:
-        EOFError: the stream ends before the answer does.
-    """
+    """The next line of an answer. Raises EOFError: it ends too early."""
     line = stream.readline()
     if not line.endswith(b"\n"):
         raise EOFError

@@ -46,10 +46,7 @@ def computed(artifact: Artifact, loop: str = ORIGINAL, precision: Mapping[str, s
 
 
 def check_dense(policy: CompiledPolicy, artifact: Artifact, golden: Golden) -> Rung:
-    """A dense call in every loop against the original network in eager PyTorch with the same noise.
-
-    This is the error of the export.
-    """
+    """A dense call in every loop against the original in eager PyTorch with the same noise: the error of the export."""
     spec, worst, found, step = artifact.manifest.spec, 0.0, dict[str, float](), None
     for loop in spec.all_loops:
         own = golden.in_loop(loop)
@@ -117,8 +114,7 @@ def check_plans(
 ) -> tuple[Rung, dict[str, npt.NDArray[np.bool_]]]:
     """Episodes of two sparse calls with each plan, in fp32, against what calibration stored.
 
-    Returns:
-        The rung; and by plan the cells ``[K, blocks]`` that differ, where some do.
+    Also, by plan, the cells ``[K, blocks]`` that differ, where some do.
     """
     plans = artifact.manifest.plans
     if not any(map(is_sparse, plans.values())):

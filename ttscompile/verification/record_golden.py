@@ -42,19 +42,14 @@ ROOM = 1 << 20
 """Bytes of noise of one stream above which there is one stream."""
 
 PROBE = "probe."
-"""Before the number of a block: the input that takes the place of the stream before it."""
+"""Before the number of a block: the input that takes the place of the residual stream before it."""
 
 
 def record_original(module: nn.Module, program: Program) -> Golden:
     """Run the original module, a whole call and single evaluations, and the captured graph block by block; every loop.
 
-    On one thread: the record does not depend on how many there are, nor on what else the machine does.
-
-    Args:
-        program: what became of it. Its ``denoiser`` is the graph as captured; its pieces are not used.
-
-    Raises:
-        CaptureError: the module gives values that are not finite.
+    On one thread: the record does not depend on how many there are, nor on what else the machine does. Of what became
+    of the module, the pieces are not used.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -208,17 +203,16 @@ class _Inside:
         self._condition, self._loop = _split(self._open, [program.spec.sample_argument, program.spec.timestep_argument])
 
     def scales(self, sample: FloatArray, timestep: np.generic) -> FloatArray:
-        """Standard deviation of the stream before each block, in the evaluation of this sample at this timestep."""
+        """Standard deviation of the residual stream before each block, for this sample at this timestep."""
         inputs = {self._spec.sample_argument: torch.from_numpy(sample), **self._at(timestep)}
         with torch.inference_mode():
             streams = evaluator(self._closed, self._weights)(inputs)
         return np.array([max(float(stream.std()), 1e-3) for stream in streams], np.float32)
 
     def alone(self, timesteps: npt.NDArray[Any], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Projections of what each block, and each layer, gives on ``probe_stream`` at these A timesteps.
+        """What each block, and each layer, gives on ``probe_stream`` at these A timesteps.
 
-        Returns:
-            Of residuals ``[A, blocks, B, DIGITS]``, and of layers ``[A, L, DIGITS]``.
+        Projections of residuals ``[A, blocks, B, DIGITS]``, and of layers ``[A, L, DIGITS]``.
         """
         probes = [
             torch.from_numpy(probe_stream(block.index, block.type, self._streams, float(scale)))
@@ -248,9 +242,9 @@ class _Inside:
 
 
 def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
-    """The graph with the stream before each block given as an input, and with the residuals as outputs.
+    """The graph with the residual stream before each block given as an input, and with the residuals as outputs.
 
-    Nothing but block b reads the stream before it (``find_residual_blocks`` sees to that), so that what it reads can be
+    Nothing but block b reads the residual stream before it (``find_residual_blocks`` sees to that), so that it can be
     replaced wherever it is read.
     """
     places = {block.stream: f"{PROBE}{block.index}" for block in blocks}
@@ -261,7 +255,7 @@ def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
     like, inner = blocks[0].type, types[blocks[0].stream]
     if like == inner:
         return Graph({**graph.inputs, **probes}, graph.constants, nodes, outputs)
-    # A doubled batch: between blocks the stream has an axis of streams, inside the graph it does not (``ir.rows``).
+    # A doubled batch: the residual stream has an axis of streams between blocks, not inside the graph (``ir.rows``).
     into = [Rows(name, inner, f"{name}.rows", like) for name in probes]
     out = [Rows(name, inner, f"{name}.rows", like) for name in outputs]
     return Graph(

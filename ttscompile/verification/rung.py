@@ -111,7 +111,10 @@ class Verification:
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        failure = self.first_failure
+        failure, map_ = self.first_failure, None
+        if self.map is not None:
+            errors = [[finite(error) for error in row] for row in self.map.errors.tolist()]
+            map_ = {"steps": self.map.steps.tolist(), "errors": errors, "tolerance": self.map.tolerance}
         return {
             "path": self.path,
             "identity": self.identity,
@@ -120,13 +123,7 @@ class Verification:
             "first_failure": None if failure is None else failure.name,
             "seconds": round(self.seconds, 3),
             "rungs": [{**asdict(rung), "blocks": list(rung.blocks)} for rung in self.rungs],
-            "map": None
-            if self.map is None
-            else {
-                "steps": self.map.steps.tolist(),
-                "errors": [[finite(error) for error in row] for row in self.map.errors.tolist()],
-                "tolerance": self.map.tolerance,
-            },
+            "map": map_,
         }
 
 

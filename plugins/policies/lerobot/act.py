@@ -43,7 +43,7 @@ class ACTConfig:
     Attributes:
         vectors: what is observed beside images: width of the state of the ``robot``, and of the environment, ``env``.
         vision_backbone: name of the ResNet; None without cameras.
-        pre_norm: whether a block's input is normalised, rather than the stream after it.
+        pre_norm: whether a block's input is normalised, rather than the residual stream after it.
     """
 
     chunk_size: int
@@ -85,7 +85,7 @@ class _Layer(nn.Module):
         return self._added(x, last, lambda read: self.linear2(self.activation(self.linear1(read))))
 
     def _added(self, x: Tensor, norm: nn.Module, block: Callable[[Tensor], Tensor]) -> Tensor:
-        """The stream after a block, normalised before the block, or after the addition."""
+        """The residual stream after a block, normalised before the block, or after the addition."""
         return x + block(norm(x)) if self.pre_norm else norm(x + block(x))
 
 
