@@ -63,9 +63,9 @@ def main(directory: Path, checkpoint: Path, calls: int, as_json: bool) -> None:
     with torch.inference_mode():
         entered = contestants_of(artifact, checkpoint)
         measured = measure(entered, calls, seed=0)
-    does = artifact.default.in_words()
+    named = artifact.manifest.default_plan
     own = [one.label for one in entered if one.policy is None]
-    words = [*own, "compiled, all computed, fp32", f"{does} (in fp32)", does]
+    words = [*own, "compiled, all computed, fp32", *(artifact.plan(one).in_words() for one in (f"{named}@fp32", named))]
     found = rows(measured, words)
     if as_json:
         print_json({"machine": one_line(fingerprint()), "rows": found})

@@ -87,6 +87,9 @@ def test_what_is_chosen(monkeypatch: pytest.MonkeyPatch, artifact: Path, recordi
         chosen(monkeypatch, trials, figures, bound=0.25, deadline_ms=1.5)
     with pytest.raises(CalibrationFailedError, match="'c', is 0.15 away, and 0.2 at worst; 0.1 and 0.125 are"):
         chosen(monkeypatch, trials, figures, bound=0.1)
+    # With a deadline, too, more time and episodes may help: that nothing is near enough need not come of it.
+    with pytest.raises(CalibrationFailedError, match="What may help: more time, more episodes, more than 1 thread"):
+        chosen(monkeypatch, trials, figures, bound=0.1, deadline_ms=50.0)
 
 
 def test_what_may_cost_success_is_no_default_where_something_nearer_is_there(

@@ -36,7 +36,7 @@ def test_the_original_torch_compile_and_the_plans_take_turns(whole_layer_checkpo
     names = [one["what"] for one in told["rows"]]
     assert names[0] == "eager PyTorch" and names[-3:] == [
         "compiled, all computed, fp32",
-        "2 of 100 steps of original, int8 in blocks (in fp32)",
+        "2 of 100 steps of original",
         "2 of 100 steps of original, int8 in blocks",
     ]
     assert all(one["ms"] > 0 for one in told["rows"])

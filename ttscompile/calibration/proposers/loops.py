@@ -12,7 +12,7 @@ less than the bound does. Loops that are further come last. They may only give `
 that is too far even for that is left out, and so is one whose cheapest call takes longer than the best plan so far.
 """
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -296,14 +296,14 @@ def too_far(trials: Trials, request: Request, name: str, score: Score) -> str:
     return (
         f"no plan is near enough to the original: the nearest, {name!r}, is {score.distance:.3g} away, and"
         f" {score.interval[1]:.3g} at worst; {bound:g} and {SURE * bound:g} are allowed."
-        f" {more if request.deadline_ms is None else would_help(trials, request)}"
+        f" {more if request.deadline_ms is None else would_help(trials, request, also=('more time', 'more episodes'))}"
     )
 
 
-def would_help(trials: Trials, request: Request, within: float | None = None) -> str:
+def would_help(trials: Trials, request: Request, within: float | None = None, also: Sequence[str] = ()) -> str:
     """What a user is told whose deadline no plan keeps that is near enough; one that is ``within`` does, if given."""
     spec = trials.artifact.manifest.spec
-    told = [f"more than {request.threads} thread{'s' * (request.threads > 1)} (--threads)"]
+    told = [*also, f"more than {request.threads} thread{'s' * (request.threads > 1)} (--threads)"]
     told += ["a camera less (--without-camera)"] * (sum(one.image for one in spec.observations.values()) > 1)
     told += ["one instruction compiled in (--task)"] * (spec.instruction is not None)
     told += ["a larger --error" if within is None else f"--error {rounded_up(within)}"]
