@@ -129,6 +129,12 @@ def test_nothing_that_may_cost_success_is_the_default_unasked(
     assert chosen(monkeypatch, trials, near_but_slow, deadline_ms=120.0, **bounds)["kept"] == "b"
     with pytest.raises(CalibrationFailedError, match="fastest, 'c' .* takes 4e.03 ms, .*, --error 0.16, or a slower"):
         chosen(monkeypatch, trials, near_but_slow, deadline_ms=3.0, **bounds)
+    # Where what keeps it is not near enough, and nothing else is, it is not time that they lack.
+    told = "no plan that keeps 3 ms is surely within 0.1 .*: the nearest, 'b' .* is 0.12 away, and 0.2 at worst. What"
+    with pytest.raises(
+        CalibrationFailedError, match=told + " may help: more time, more episodes, .*, --error 0.16, or a"
+    ):
+        chosen(monkeypatch, trials, figures, deadline_ms=3.0, **bounds)
 
 
 @pytest.mark.slow

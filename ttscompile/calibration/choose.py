@@ -116,14 +116,7 @@ class _Entrants:
         deadline, bound = self._request.deadline_ms, self._request.bound
         keeping = [name for name in allowed if deadline is None or self.times[name].longest <= deadline]
         if deadline is not None and self.best([DENSE]) is None:
-            name = min(close or allowed, key=lambda n: self.times[n].longest)
-            median, longest = self.times[name].median, self.times[name].longest
-            larger = min((self.within[n] for n in keeping), default=None)
-            raise CalibrationFailedError(
-                f"no plan that is surely within {bound:g} of the original keeps {deadline:.3g} ms: the fastest,"
-                f" {name!r} ({self.plans[name].in_words()}), takes {median:.3g} ms, and {longest:.3g} at worst,"
-                f" {longest / deadline:.3g} times as long. {would_help(self._trials, self._request, larger)}"
-            )
+            raise CalibrationFailedError(self._too_late(deadline, keeping, close, allowed))
         in_time = "" if deadline is None else f" that keeps {deadline:.3g} ms"
         self._trials.bar.warn(
             f"no plan{in_time} is surely within {bound:g} of the original, so {DENSE!r} stays the default. What came"
@@ -131,6 +124,23 @@ class _Entrants:
             " were driven."
         )
         return min(keeping or allowed, key=self._nearness)
+
+    def _too_late(self, deadline: float, keeping: Sequence[str], close: Sequence[str], allowed: Sequence[str]) -> str:
+        """What is said where neither ``dense`` nor any plan that is near enough keeps the deadline."""
+        near, in_time = f"surely within {self._request.bound:g} of the original", f"keeps {deadline:.3g} ms"
+        larger = min((self.within[name] for name in keeping), default=None)
+        if keeping and not close:  # it is not time that they lack
+            name = min(keeping, key=self._nearness)
+            first = f"no plan that {in_time} is {near}: the nearest"
+            how = f"is {self.distances[name]:.3g} away, and {self.scores[name].interval[1]:.3g} at worst"
+            told = would_help(self._trials, self._request, larger, also=("more time", "more episodes"))
+        else:
+            name = min(close or allowed, key=lambda n: self.times[n].longest)
+            median, longest = self.times[name].median, self.times[name].longest
+            first = f"no plan that is {near} {in_time}: the fastest"
+            how = f"takes {median:.3g} ms, and {longest:.3g} at worst, {longest / deadline:.3g} times as long"
+            told = would_help(self._trials, self._request, larger)
+        return f"{first}, {name!r} ({self.plans[name].in_words()}), {how}. {told}"
 
     def _nearness(self, name: str) -> tuple[float, float]:
         return round(self.distances[name], 3), self.times[name].median
