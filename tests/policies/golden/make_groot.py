@@ -26,28 +26,12 @@ from gr00t.model.gr00t_n1d7.gr00t_n1d7 import Gr00tN1d7
 from gr00t.model.gr00t_n1d7.processing_gr00t_n1d7 import Gr00tN1d7Processor
 from gr00t.policy import gr00t_policy
 from safetensors import safe_open
-from tokenizers import Tokenizer, models, pre_tokenizers
-from transformers import (
-    PreTrainedTokenizerFast,
-    Qwen2VLImageProcessorFast,
-    Qwen3VLConfig,
-    Qwen3VLForConditionalGeneration,
-    Qwen3VLVideoProcessor,
-)
+from transformers import Qwen2VLImageProcessorFast, Qwen3VLConfig, Qwen3VLForConditionalGeneration
 
 from .. import isaac_groots as own
 from ..vlas import SHAPES, Array
+from . import tiny_qwen3_vl as tiny
 
-TEMPLATE = """{%- for message in messages -%}
-{{- '<|im_start|>' + message.role + '\\n' -}}
-{%- for content in message.content -%}
-{%- if content.type == 'image' -%}{{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
-{%- elif 'text' in content -%}{{- content.text -}}{%- endif -%}
-{%- endfor -%}
-{{- '<|im_end|>\\n' -}}
-{%- endfor -%}"""
-SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"]
-SPECIAL += ["<|video_pad|>"]
 NAME = f"nvidia/{own.BACKBONE}"
 DIT: dict[str, Any] = {
     "positional_embeddings": None,
@@ -144,46 +128,12 @@ def main() -> None:
 
 def backbone() -> None:
     """The files of a tiny Qwen3-VL; of its tokenizer every byte is a token."""
-    vocabulary = {letter: i for i, letter in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
-    made = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    made.add_special_tokens(SPECIAL)
-    tokenizer = PreTrainedTokenizerFast(tokenizer_object=made, pad_token=SPECIAL[0], chat_template=TEMPLATE)
-    tokenizer.save_pretrained(NAME)
-    size = {"shortest_edge": 64, "longest_edge": 4096}
-    half = [0.5] * 3
-    settings: dict[str, Any] = {"patch_size": 4, "merge_size": 2, "image_mean": half, "image_std": half, "size": size}
-    Qwen2VLImageProcessorFast(**settings).save_pretrained(NAME)
-    shutil.copy(Path(NAME, "preprocessor_config.json"), "own.json")
-    Qwen3VLVideoProcessor(**settings).save_pretrained(NAME)
-    Path("own.json").rename(Path(NAME, "preprocessor_config.json"))
-    ids = made.get_vocab()
+    ids = tiny.save_processor(Path(NAME), Qwen2VLImageProcessorFast)
+    turned = {"rope_type": "default", "mrope_section": [2, 2, 2], "mrope_interleaved": True}
     Qwen3VLConfig(
-        vision_config={
-            "hidden_size": 16,
-            "intermediate_size": 24,
-            "num_heads": 2,
-            "depth": 3,
-            "patch_size": 4,
-            "out_hidden_size": 24,
-            "num_position_embeddings": 25,
-            "deepstack_visual_indexes": [0, 2],
-        },
-        text_config={
-            "hidden_size": 24,
-            "intermediate_size": 40,
-            "num_hidden_layers": 4,
-            "num_attention_heads": 4,
-            "num_key_value_heads": 2,
-            "head_dim": 12,
-            "vocab_size": len(tokenizer),
-            "rope_theta": 5e6,
-            "rope_scaling": {"rope_type": "default", "mrope_section": [2, 2, 2], "mrope_interleaved": True},
-        },
-        image_token_id=ids["<|image_pad|>"],
-        video_token_id=ids["<|video_pad|>"],
-        vision_start_token_id=ids["<|vision_start|>"],
-        vision_end_token_id=ids["<|vision_end|>"],
+        vision_config=tiny.VISION | {"deepstack_visual_indexes": [0, 2]},
+        text_config=tiny.TEXT | {"vocab_size": len(ids), "rope_theta": 5e6, "rope_scaling": turned},
+        **tiny.tokens_of(ids),
         tie_word_embeddings=True,
     ).save_pretrained(NAME)
 

@@ -31,7 +31,7 @@ from transformers import (
 
 from .. import eo1s, groots
 from ..vlas import CAMERAS, STATE
-from .make_lerobot_groot import SPECIAL, TEMPLATE, of_bytes
+from .tiny_qwen3_vl import SPECIAL, TEMPLATE, of_bytes
 
 ADDED = 7
 """Tokens that lerobot adds, which have to have rows in the embedding."""

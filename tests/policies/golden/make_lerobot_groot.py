@@ -20,43 +20,15 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.groot import GrootConfig, GrootPolicy, make_groot_pre_post_processors
 from lerobot.policies.groot.groot_n1_7 import GR00TN17, GR00TN17Config
 from safetensors.torch import load_file
-from tokenizers import Tokenizer, models, pre_tokenizers
-from transformers import PreTrainedTokenizerFast, Qwen2VLImageProcessor, Qwen3VLConfig, Qwen3VLVideoProcessor
+from transformers import Qwen2VLImageProcessor, Qwen3VLConfig
 
 from .. import groots
 from ..vlas import CAMERAS, STATE, Array
+from . import tiny_qwen3_vl as tiny
 
-TEMPLATE = """{%- for message in messages -%}
-{{- '<|im_start|>' + message.role + '\\n' -}}
-{%- for content in message.content -%}
-{%- if content.type == 'image' -%}{{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
-{%- elif 'text' in content -%}{{- content.text -}}{%- endif -%}
-{%- endfor -%}
-{{- '<|im_end|>\\n' -}}
-{%- endfor -%}"""
-"""What Qwen3-VL's says of a message of a user, and Qwen2.5-VL's of messages of which the first is the system's."""
 BACKBONE = f"./nvidia/{groots.BACKBONE}"
 """Where lerobot looks for a tokenizer, whatever the base model says."""
 RESIZE = "torchvision.transforms.v2.functional._geometry._do_native_uint8_resize_on_cpu"
-SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"]
-SPECIAL += ["<|video_pad|>"]
-VISION: dict[str, Any] = {
-    "hidden_size": 16,
-    "intermediate_size": 24,
-    "num_heads": 2,
-    "depth": 3,
-    "patch_size": 4,
-    "out_hidden_size": 24,
-    "num_position_embeddings": 25,
-}
-TEXT: dict[str, Any] = {
-    "hidden_size": 24,
-    "intermediate_size": 40,
-    "num_hidden_layers": 4,
-    "num_attention_heads": 4,
-    "num_key_value_heads": 2,
-    "head_dim": 12,
-}
 BACKBONES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "words": (
         {"deepstack_visual_indexes": [0, 2]},
@@ -165,37 +137,13 @@ def main() -> None:
     print(path, path.stat().st_size, "bytes")
 
 
-def of_bytes() -> Tokenizer:
-    """A tokenizer of which every byte is a token."""
-    vocabulary = {letter: i for i, letter in enumerate(sorted(pre_tokenizers.ByteLevel.alphabet()))}
-    made = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    made.add_special_tokens(SPECIAL)
-    return made
-
-
 def backbone(kind: str) -> None:
     """The files of a tiny Qwen3-VL; of its tokenizer every byte is a token."""
-    made = of_bytes()
-    tokenizer = PreTrainedTokenizerFast(tokenizer_object=made, pad_token=SPECIAL[0], chat_template=TEMPLATE)
-    folder = Path(BACKBONE)
-    tokenizer.save_pretrained(folder)
-    half = [0.5] * 3
-    size = {"shortest_edge": 64, "longest_edge": 4096}
-    settings: dict[str, Any] = {"patch_size": 4, "merge_size": 2, "image_mean": half, "image_std": half, "size": size}
-    Qwen2VLImageProcessor(**settings).save_pretrained(folder)
-    shutil.copy(folder / "preprocessor_config.json", folder / "own.json")
-    Qwen3VLVideoProcessor(**settings).save_pretrained(folder)
-    (folder / "own.json").rename(folder / "preprocessor_config.json")
-    vision, text = BACKBONES[kind]
-    ids = made.get_vocab()
+    ids, (vision, text) = tiny.save_processor(Path(BACKBONE), Qwen2VLImageProcessor), BACKBONES[kind]
     config = Qwen3VLConfig(
-        vision_config=VISION | vision,
-        text_config=TEXT | text | {"vocab_size": len(tokenizer), "pad_token_id": None},
-        image_token_id=ids["<|image_pad|>"],
-        video_token_id=ids["<|video_pad|>"],
-        vision_start_token_id=ids["<|vision_start|>"],
-        vision_end_token_id=ids["<|vision_end|>"],
+        vision_config=tiny.VISION | vision,
+        text_config=tiny.TEXT | text | {"vocab_size": len(ids), "pad_token_id": None},
+        **tiny.tokens_of(ids),
         tie_word_embeddings=True,
     )
     config.save_pretrained(BACKBONE)

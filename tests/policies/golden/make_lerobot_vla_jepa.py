@@ -36,7 +36,7 @@ from transformers import (
 
 from .. import groots, vla_jepas
 from ..vlas import CAMERAS, STATE
-from .make_lerobot_groot import SPECIAL, TEMPLATE, TEXT, VISION, of_bytes
+from .tiny_qwen3_vl import SPECIAL, TEMPLATE, TEXT, VISION, of_bytes
 
 VIDEO = "vjepa2-tiny"
 TEMPLATE += "{%- if add_generation_prompt -%}{{- '<|im_start|>assistant\\n' -}}{%- endif -%}"

@@ -32,7 +32,8 @@ from transformers import PreTrainedTokenizerFast, Qwen2_5_VLProcessor, Qwen2VLIm
 
 from .. import groots, wall_xs
 from ..vlas import STATE
-from .make_lerobot_groot import RESIZE, SPECIAL, of_bytes
+from .make_lerobot_groot import RESIZE
+from .tiny_qwen3_vl import SPECIAL, of_bytes
 
 INTERPOLATE = "torchvision.transforms.v2.functional._geometry.interpolate"
 OWN = ["<|propri|>", "<|action|>", "<|action_fast|>"]
