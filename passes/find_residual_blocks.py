@@ -22,7 +22,12 @@ _LEAST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class BlockTable:
-    """The blocks of a denoiser, in the order of execution; and values that are none, with the reason."""
+    """The residual stream of a denoiser.
+
+    Attributes:
+        blocks: in the order of execution.
+        declined: additions and other values that were looked at and are no block of their own, each with its reason.
+    """
 
     blocks: tuple[Block, ...]
     declined: tuple[str, ...]

@@ -115,6 +115,9 @@ def check_noise(noise: Noise, streams: int, spec: PolicySpec) -> Noise:
         noise: the caller's; where the policy predicts fewer steps than the original, with as many as either. If the
             sampler draws no noise in its steps, ``noise.steps`` is not looked at; of those of a longer loop the first
             K are taken.
+
+    Raises:
+        ObservationError: missing, of the wrong shape or dtype, or not finite.
     """
     if not isinstance(noise, Noise):
         raise ObservationError(f"noise is a {type(noise).__name__}; expected ttscompile.Noise(initial, steps).")

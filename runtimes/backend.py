@@ -93,7 +93,11 @@ class Backend(Protocol[Lowered]):
 
 @contextmanager
 def fitting(view: View) -> Iterator[None]:
-    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit."""
+    """Within the block whatever fails is an error of the artifact: its hashes are right, and its parts do not fit.
+
+    Raises:
+        ArtifactError: in place of any exception that is not the package's own, but for a package that is missing.
+    """
     try:
         yield
     except (TtscompileError, ModuleNotFoundError):
@@ -104,7 +108,12 @@ def fitting(view: View) -> Iterator[None]:
 
 
 def stream_type(manifest: Manifest, streams: int) -> TensorType:
-    """The type of the residual stream, which is float32, and the same for all blocks."""
+    """The type of the residual stream, which is float32, and the same for all blocks.
+
+    Raises:
+        ArtifactError: it is not.
+        ObservationError: it has no axis for the streams, of which there are several.
+    """
     kind = manifest.blocks[0].type
     if any(block.type != kind for block in manifest.blocks) or kind.dtype != "float32":
         types = sorted({str(block.type) for block in manifest.blocks})

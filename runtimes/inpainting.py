@@ -127,6 +127,9 @@ def check_prefix(
     """A prefix as a float32 array ``[B, N, Da]`` that fits the policy, normalised: a copy of the caller's.
 
     ``reference`` is what the actions of the call are relative to, ``ChunkSpec.reference``.
+
+    Raises:
+        ObservationError: of another kind, dtype or shape, too long, not finite or too large; or the policy takes none.
     """
     array = plain(prefix, "prefix", ObservationError)
     room = spec.sample[0] - spec.chunk.start

@@ -28,7 +28,11 @@ class Instruct:
         return self._read(ObservationError)
 
     def __call__(self, obs: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The observation with tokens and mask of its ``task``, a text or one a stream; as it is if it has them."""
+        """The observation with tokens and mask of its ``task``, a text or one a stream; as it is if it has them.
+
+        Raises:
+            ObservationError: it has neither, or the task is no text, or one without the state that it is told with.
+        """
         if not isinstance(obs, Mapping) or self._told.tokens in obs:
             return obs
         if TASK not in obs:
@@ -82,6 +86,9 @@ def instruct_of(artifact: Artifact, tokenizer: str | os.PathLike[str] | None = N
 
     A tokenizer that is given is read at once, the artifact's own when the first text comes: whoever gives tokens needs
     neither it nor the package that reads it.
+
+    Raises:
+        ObservationError: the policy is not told its task in words alone, or there is no such tokenizer.
     """
     spec = artifact.manifest.spec
     if tokenizer is not None:

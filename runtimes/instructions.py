@@ -69,7 +69,11 @@ class Instructions:
 
 
 def instructions_of(plan: PlanArray, groups: Sequence[int]) -> Instructions:
-    """What executes the plan of one stream, int8 ``[K, blocks]``, with the FORWARD group of each block."""
+    """What executes the plan of one stream, int8 ``[K, blocks]``, with the FORWARD group of each block.
+
+    Raises:
+        IllegalPlanError: it reads a residual that was never computed; ROLLOUT reads are taken to be written.
+    """
     steps, blocks = plan.shape
     resolved = origins(plan, groups)
     computed = plan == Source.COMPUTE.value

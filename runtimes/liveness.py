@@ -16,9 +16,13 @@ HEAD = ("pruner.base", "pruner.mask", "pruner.step", "pruner.block")
 
 @dataclass(frozen=True)
 class RolloutNeeds:
-    """The rollout cache of one stream: entries that schedules and pruner of its plans can read, and their bytes.
+    """The rollout cache of one stream.
 
-    Beside them what a plan that the caller gives can read, K * blocks, and the bytes of that.
+    Attributes:
+        read: entries that schedules and pruner of its plans can read.
+        bytes_read: what these take.
+        cells: K * blocks, what a plan that the caller gives can read.
+        bytes_most: what these take.
     """
 
     read: int

@@ -76,7 +76,13 @@ RUNTIMES = {
 
 
 def require_able(runtime: str, artifact: Artifact, plan: Plan) -> None:
-    """Raise unless a runtime can compute what a plan asks for."""
+    """Raise unless a runtime can compute what a plan asks for.
+
+    Raises:
+        RuntimeUnavailableError: it has no such precision, or cannot reuse tokens.
+        ArtifactError: it could, and the artifact holds no such models.
+        IllegalPlanError: the artifact has no such part.
+    """
     kind, remedy = kind_of(runtime), "Take plan='dense', or a plan in fp32: plan='NAME@fp32', which is plan.exact"
     parts = parts_of(artifact.manifest.pieces)
     for part, precision in plan.precision.items():
@@ -111,7 +117,14 @@ def open_runtime(
     device: str | None = None,
     plan: Plan | None = None,
 ) -> Runtime:
-    """Make a runtime for an artifact."""
+    """Make a runtime for an artifact.
+
+    Raises:
+        RuntimeUnavailableError: no runtime of this name, its packages are missing, or threads, device or what the plan
+            asks for cannot be had.
+        ArtifactError: the parts of the artifact do not fit each other.
+        IllegalPlanError: the plan names what the artifact lacks.
+    """
     threads = integer(threads, "threads", RuntimeUnavailableError, 1, MOST_THREADS)
     kind = kind_of(runtime)
     if device is not None and not isinstance(device, str):

@@ -19,6 +19,9 @@ def repair_plan(plan: npt.ArrayLike, written: BoolArray) -> tuple[PlanArray, tup
     Args:
         plan: ``[K, blocks]`` or ``[B, K, blocks]``.
         written: bool ``[B, K, blocks]``; rollout entries that exist.
+
+    Raises:
+        IllegalPlanError: wrong dtype, shape or values.
     """
     streams, steps, blocks = written.shape
     plans = check_plan(plan, steps, blocks, streams)

@@ -47,6 +47,9 @@ class CompiledPolicy:
         plan: see ``load``.
         origin: ``hf://org/name@commit`` of an artifact from the hub; None for another.
         instruct: puts tokens in the place of a task's text; None for none.
+
+    Raises:
+        IllegalPlanError: the artifact has no plan of this name.
     """
 
     def __init__(

@@ -175,6 +175,12 @@ class Runtime:
 
         Returns:
             The denoised sample, float32 ``[B, T, D]``, and the report.
+
+        Raises:
+            IllegalPlanError: the plan names what the artifact lacks, its cells have the wrong shape, or are illegal and
+                not to be repaired.
+            ObservationError: the number of streams differs from the episode's, or ``noise`` does not fit.
+            RuntimeUnavailableError: this runtime cannot do what the plan asks for.
         """
         streams = len(next(iter(obs.values())))
         self.require_streams(streams)

@@ -150,6 +150,9 @@ class TokenTower:
         """What the tower gives for a new frame, a row ``[1, ...]`` by the input of the frame piece, and what was done.
 
         What is kept of the lane is gone if this fails.
+
+        Raises:
+            ArtifactError: the manifest cuts the picture into other patches than there are tokens.
         """
         kept = self._lanes.pop(lane, None)
         (pixels,) = self._run(self._pixels, row)

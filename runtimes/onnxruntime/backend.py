@@ -35,6 +35,10 @@ class OnnxBackend:
         frames: what depends on one frame alone.
         sessions: by piece; those of single blocks only once a plan needs them.
         workspace: of the batch size under way; None after one that found no memory.
+
+    Raises:
+        RuntimeUnavailableError: onnxruntime is missing, or other code has made its global thread pool.
+        ArtifactError: onnxruntime refuses a graph.
     """
 
     def __init__(self, view: View, sessions: Sessions, known: dict[object, FramePieces]) -> None:

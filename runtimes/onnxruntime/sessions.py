@@ -72,7 +72,13 @@ class Sessions:
         self._careful: dict[str, bool] = {}
 
     def of(self, view: View, blocks: bool = True) -> dict[str, Any]:
-        """What runs each ONNX piece, by name, an ``InferenceSession`` or a ``JointBlock``; of ``blocks`` if asked."""
+        """What runs each ONNX piece, by name, an ``InferenceSession`` or a ``JointBlock``; of ``blocks`` if asked.
+
+        Raises:
+            RuntimeUnavailableError: onnxruntime is missing, other code has made its global thread pool, or the
+                environment has it ignore options.
+            ArtifactError: onnxruntime refuses a graph.
+        """
         manifest = view.manifest
         single = {kinds.block_name(b) for b in range(len(manifest.blocks))}
         # A tower that reuses tokens computes all of them with the same session, so that its weights are there once.
@@ -86,7 +92,11 @@ class Sessions:
         return sessions | self._of_blocks(view, contents) if blocks else sessions
 
     def of_blocks(self, view: View) -> dict[str, Any]:
-        """What runs single blocks, by name, some time after the artifact was loaded."""
+        """What runs single blocks, by name, some time after the artifact was loaded.
+
+        Raises:
+            ArtifactError: the artifact on disk is no longer the one that was loaded, or onnxruntime refuses a graph.
+        """
         with view.artifact.reading():
             return self._of_blocks(view, _contents(view))
 
@@ -299,6 +309,9 @@ def renew_piece(
     """Run a piece for some tokens: what is kept gets its new rows where it is. Its other outputs, in order.
 
     A ScatterND whose output is bound to the memory that it reads writes the new rows and nothing else.
+
+    Raises:
+        ArtifactError: the graph does not do what the manifest says. What is kept may have some of the new rows.
     """
     into = {kinds.renewed_name(key): array for key, array in kept.items()}
     given, made = {**inputs, **kept}, [output for output in pieces[name].outputs if output not in into]

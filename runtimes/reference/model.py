@@ -218,6 +218,9 @@ class ReferenceModel:
         """One call: K steps from noise to sample. A block is evaluated for the streams that compute it, and no others.
 
         The plan is int8 ``[K, blocks]`` or ``[B, K, blocks]``; ``cache`` is what the previous call of the episode left.
+
+        Raises:
+            IllegalPlanError: a plan of the wrong shape, or that reads what was never computed.
         """
         cache = cache if cache is not None else self.empty_cache(contexts.streams)
         plans = check_plan(plan, self.steps, self.blocks, contexts.streams)

@@ -17,7 +17,9 @@ from ttscompile.ir.graph import TensorType
 class RolloutCache:
     """``rollout[k, b]`` of every stream: what a call leaves for the next one of the episode.
 
-    Residuals are by ``(k, b)``, each of its type, detached, and rubbish for streams that never computed.
+    Attributes:
+        residuals: by ``(k, b)``, each of the residual's type, detached; holds rubbish for streams that never computed.
+        written: bool ``[B, K, blocks]``; which entries a call of the episode has computed.
     """
 
     residuals: Mapping[tuple[int, int], Tensor]
@@ -26,9 +28,12 @@ class RolloutCache:
 
 @dataclass
 class Caches:
-    """The three caches during a call, for all streams at once.
+    """The three caches during a call, for all streams at once; when it starts there is what earlier calls left.
 
-    Of earlier calls there is ``rollout``, by step and block; the others, by FORWARD group and by block, begin empty.
+    Attributes:
+        rollout: by step and block.
+        forward: by group; empty when the call starts.
+        timestep: by block; empty when the call starts.
     """
 
     rollout: dict[tuple[int, int], Tensor]

@@ -45,6 +45,9 @@ class TorchBackend:
     Attributes:
         keeps: entries of the rollout cache that some plan of the view can read.
         workspace: of the batch size under way.
+
+    Raises:
+        RuntimeUnavailableError: the device does not have the precision.
     """
 
     def __init__(self, view: View, placed: Placed, threads: int = 1, capture: Capture | None = None) -> None:

@@ -28,7 +28,11 @@ Own = TypeVar("Own", bound="OnTensors")
 
 
 def device_of(name: str) -> torch.device:
-    """The device of this name, with its number where such devices have one, once it was found to work."""
+    """The device of this name, with its number where such devices have one, once it was found to work.
+
+    Raises:
+        RuntimeUnavailableError: torch knows no such device, or cannot compute there.
+    """
     try:
         found: torch.device = torch.zeros(1, device=torch.device(name)).add_(1).device
     except Exception as error:  # AssertionError of a build without CUDA, RuntimeError, AcceleratorError, TypeError

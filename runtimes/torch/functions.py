@@ -42,6 +42,9 @@ def write_function(
     """A graph as a function of inputs with the shapes and device of these examples, in order.
 
     ``narrow`` is the type to keep the constants of products in; the caller then runs the function under autocast.
+
+    Raises:
+        CaptureError: an operation that ``resolve_op`` refuses, or a constant that is missing.
     """
     device = next((value.device for value in (*examples, *weights.values())), torch.device("cpu"))
     users = graph.users()

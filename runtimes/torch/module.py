@@ -86,7 +86,17 @@ def to_module(path: str | Path, plan: str | Plan | None = None) -> SparseCall | 
 
 
 class SparseCall(CallModule):
-    """One call of a policy with one schedule, int8 ``[K, blocks]``; ``name`` is for messages."""
+    """One call of a policy with one schedule.
+
+    Args:
+        view: of an artifact, for the plan.
+        name: of the plan, for messages.
+        plan: int8 ``[K, blocks]``.
+        correction: of the sampler's steps, which belongs to the plan; None for none.
+
+    Raises:
+        IllegalPlanError: the plan is illegal, or reads the rollout cache.
+    """
 
     def __init__(self, view: View, name: str, plan: PlanArray, correction: Correction | None) -> None:
         manifest = view.manifest

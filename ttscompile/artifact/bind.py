@@ -43,7 +43,9 @@ class Place:
 class LoweredPieces:
     """What ``lower_precision`` made of blocks and prologue.
 
-    Models by piece, those that hold all blocks among them; and the constants that these have and the program has not.
+    Attributes:
+        models: by piece, those that hold all blocks among them.
+        weights: the constants that these models have and the program has not.
     """
 
     name: str
@@ -59,7 +61,16 @@ def places_of(path: Path, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, P
 
 
 def bind(model: ModelProto, places: Mapping[str, Place], piece: str, *, again: bool = False) -> bytes:
-    """The bytes of a model whose empty initializers, or ``again`` all of ``places``, have their values."""
+    """The bytes of a model whose empty initializers have their values.
+
+    Args:
+        model: from ``lower``; initializers that are constants of the program hold no data.
+        places: by name of the constant.
+        again: the model is bound already; the constants in ``places`` get new values.
+
+    Raises:
+        ArtifactError: an empty initializer that is no constant of the program, or is one of another type.
+    """
     from onnx import ModelProto
 
     bound = ModelProto()

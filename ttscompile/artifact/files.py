@@ -194,7 +194,11 @@ def lock_folder(path: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too."""
+    """Keep all others from calibrating, converting to, or updating an artifact; a kill ends this, too.
+
+    Raises:
+        ArtifactError: somebody else is at it; or it cannot be locked.
+    """
     with ExitStack() as held:
         try:
             held.enter_context(lock_folder(directory))

@@ -114,7 +114,13 @@ class FlopsRecord:
     blocks: tuple[int, ...]
 
     def call(self, plan: PlanArray, pruned: bool, correction: Correction | None = None) -> float:
-        """FLOPs of a call of one stream: plan, int8 ``[K, blocks]``, pruner if it ran, jumps of a correction."""
+        """FLOPs of one call of one stream.
+
+        Args:
+            plan: int8 ``[K, blocks]``.
+            pruned: whether the pruner ran to make it.
+            correction: of the plan; its jumps are counted.
+        """
         fixed = 0 if correction is None else correction.flops_of_jumps
         fixed += self.prologue + (self.pruner if pruned else 0) + len(plan) * (self.stem + self.tail)
         return fixed + plan_flops(plan, self.blocks)
@@ -127,7 +133,12 @@ class FlopsRecord:
 
 @dataclass(frozen=True)
 class StartRecord:
-    """A loop that is the last ``steps`` of another, and begins with the chunk of the call before (``core.start``)."""
+    """A loop that is the last steps of another, and begins with the chunk of the call before (``core.start``).
+
+    Attributes:
+        loop: name of the other, which begins with noise.
+        steps: how many of its steps are left.
+    """
 
     loop: str
     steps: Positive

@@ -89,7 +89,13 @@ def context_records(program: Program) -> dict[str, ContextRecord]:
 def piece_records(
     program: Program, models: Mapping[str, ModelProto], files: Mapping[str, str]
 ) -> dict[str, PieceRecord]:
-    """One record an ONNX model, of ``lower_program``, in this file."""
+    """One record an ONNX model.
+
+    Args:
+        models: from ``lower_program``: of the same names, but ``advance`` in place of ``tail``, ``blocks``,
+            ``dense_step``, and perhaps ``idle`` and ``layers``.
+        files: file name of each model.
+    """
     optional = {names.IDLE, *(names.of_loop(names.ADVANCE, loop) for loop in program.spec.loops)}
     expected = {name: one for name, one in _interfaces(program).items() if name not in optional or name in models}
     if set(models) != set(expected):

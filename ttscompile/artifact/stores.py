@@ -22,7 +22,11 @@ from .manifest import FileRecord, Manifest, WeightsRecord
 
 @dataclass(frozen=True)
 class BlockWeights:
-    """Constants of blocks that a plan has in place of the original's, and what the other precision makes of them."""
+    """Constants of residual blocks that a plan has in place of the original's.
+
+    Attributes:
+        precision: what the artifact's other precision makes of them, by name; empty where it has none.
+    """
 
     weights: Mapping[str, npt.NDArray[Any]]
     precision: Mapping[str, npt.NDArray[Any]]

@@ -35,7 +35,12 @@ calibration judges on episodes that it saw nothing of."""
 
 @dataclass(frozen=True)
 class Split:
-    """Numbers of the episodes that plans are learned from, and of others that they are judged on."""
+    """Calls by episode: what plans are learned from, and what they are judged on.
+
+    Attributes:
+        calibration: numbers of the episodes to learn from.
+        validation: numbers of the episodes to judge on; none of them is in ``calibration``.
+    """
 
     calibration: tuple[int, ...]
     validation: tuple[int, ...]
@@ -55,7 +60,11 @@ def load_episodes(
     observation: Mapping[str, Sequence[str]] | None,
     tokenizer: ReadTokenizer | None = None,
 ) -> list[Episode]:
-    """The recorded episodes, as the policy observes them; see ``load_trajectories``."""
+    """The recorded episodes, as the policy observes them; see ``load_trajectories``.
+
+    Raises:
+        TrajectoryError: the recordings do not fit the policy.
+    """
     episodes = episodes_of(spec, trajectories, observation, tokenizer)
     if len(episodes) < 2:
         raise CalibrationError(

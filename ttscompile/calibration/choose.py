@@ -29,7 +29,7 @@ class Frontier:
         tried: all plans, fastest first, the original among them; JSON. ``name`` is that in the artifact, or what it was
             called while it was tried; ``told`` what it does, in words; ``distance`` and ``interval`` how far it is from
             the original on held-out episodes, with 95 % limits (``judge``), and ``within`` the least bound that allows
-            that; ``milliseconds`` and ``worst`` the median and ``Times.longest`` of its ``calls`` on this machine, in
+            that; ``milliseconds`` and ``worst`` the median and ``Times.worst`` of its ``calls`` on this machine, in
             milliseconds; ``weights`` the bytes of those that its models read; ``near`` whether it is within
             ``Request.farthest``; ``kept`` whether the artifact gets it.
         plans: that the artifact gets, by name.
@@ -114,14 +114,14 @@ class _Entrants:
     def nearest(self, allowed: Sequence[str], close: Sequence[str]) -> str:
         """What is nearest of the plans that are not near enough; with a warning, since ``dense`` is the default."""
         deadline, bound = self._request.deadline_ms, self._request.bound
-        keeping = [name for name in allowed if deadline is None or self.times[name].longest <= deadline]
+        keeping = [name for name in allowed if deadline is None or self.times[name].worst <= deadline]
         if deadline is not None and self.best([DENSE]) is None:
             raise CalibrationFailedError(self._too_late(deadline, keeping, close, allowed))
         in_time = "" if deadline is None else f" that keeps {deadline:.3g} ms"
         self._trials.bar.warn(
             f"no plan{in_time} is surely within {bound:g} of the original, so {DENSE!r} stays the default. What came"
-            f" nearest is kept as {SCHEDULE!r}, to be asked for: such plans lost several points of success where they"
-            " were driven."
+            f" nearest is kept as {SCHEDULE!r}, to be asked for: where such plans were driven, some lost several points"
+            " of success."
         )
         return min(keeping or allowed, key=self._nearness)
 
@@ -135,10 +135,10 @@ class _Entrants:
             how = f"is {self.distances[name]:.3g} away, and {self.scores[name].interval[1]:.3g} at worst"
             told = would_help(self._trials, self._request, larger, also=("more time", "more episodes"))
         else:
-            name = min(close or allowed, key=lambda n: self.times[n].longest)
-            median, longest = self.times[name].median, self.times[name].longest
+            name = min(close or allowed, key=lambda n: self.times[n].worst)
+            median, worst = self.times[name].median, self.times[name].worst
             first = f"no plan that is {near} {in_time}: the fastest"
-            how = f"takes {median:.3g} ms, and {longest:.3g} at worst, {longest / deadline:.3g} times as long"
+            how = f"takes {median:.3g} ms, and {worst:.3g} at worst, {worst / deadline:.3g} times as long"
             told = would_help(self._trials, self._request, larger)
         return f"{first}, {name!r} ({self.plans[name].in_words()}), {how}. {told}"
 
@@ -155,7 +155,7 @@ class _Entrants:
                 "interval": list(self.scores[name].interval),
                 "within": self.within.get(name, 0.0),
                 "milliseconds": times.median,
-                "worst": times.longest,
+                "worst": times.worst,
                 "calls": len(times.ms),
                 "weights": weights_read(self._trials.artifact, self.plans[name]),
                 "near": name == DENSE or name in allowed,

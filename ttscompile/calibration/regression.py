@@ -85,7 +85,13 @@ def envelope_of(condition: Tensor, episodes: IntArray, most: int) -> Envelope | 
 
 
 class Solved(NamedTuple):
-    """The correction of one step: weight ``[G, 6 T, T]``, bias ``[D, 1, T]``, and of components ``[F, D, T]``."""
+    """The correction of one step.
+
+    Attributes:
+        weight: ``[G, 6 T, T]``.
+        bias: ``[D, 1, T]``.
+        observed: of components, ``[F, D, T]``.
+    """
 
     weight: Tensor
     bias: Tensor

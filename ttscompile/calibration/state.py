@@ -45,7 +45,11 @@ class StateFile:
         self.progress: dict[str, Any] = {}
 
     def load(self) -> bool:
-        """Read what an earlier run left; whether there was anything. That of a run with other settings is refused."""
+        """Read what an earlier run left; whether there was anything. That of a run with other settings is refused.
+
+        Raises:
+            CalibrationError: it is damaged, or belongs to a run with other settings.
+        """
         if self._path is None or not self._path.exists():
             return False
         try:

@@ -44,7 +44,11 @@ class Strategy:
         return found
 
     def require_reach(self, steps: int, blocks: int, budget: int) -> None:
-        """Refuse a budget of computed cells, step 0 included, that the strategy cannot keep."""
+        """Refuse a budget of computed cells, step 0 included, that the strategy cannot keep.
+
+        Raises:
+            CalibrationError: it computes more; says how much sparsity it can reach.
+        """
         least, cells = self.least(steps, blocks), steps * blocks
         if budget < least:
             raise CalibrationError(

@@ -21,7 +21,11 @@ REMEDY = " Every stream of a batch must be computed alike, whatever their number
 
 
 def with_batch(graph: Graph, batch: int) -> Graph:
-    """The graph for every batch size, of one captured with this one, of which no other number may be a multiple."""
+    """The graph for every batch size, of one captured with this one, of which no other number may be a multiple.
+
+    Raises:
+        CaptureError: a size is no multiple of it, or a multiple of it may be something else; names the first such node.
+    """
 
     def size(number: Size) -> Size:
         assert isinstance(number, int)

@@ -47,6 +47,10 @@ def capture(module: nn.Module, spec: PolicySpec) -> tuple[Graph, Weights]:
 
     Returns:
         The graph, whose inputs are sample, timestep and the observations in this order, and the value of each constant.
+
+    Raises:
+        CaptureError: torch.export failed; the graph uses what the compiler cannot express, of which it names the node;
+            or what the module computes for a stream depends on the others, or on how many there are.
     """
     module, (first, second) = sharing_copy(module), BATCHES
     _require_arguments(module, spec)

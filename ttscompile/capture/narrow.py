@@ -31,6 +31,10 @@ def narrow(module: nn.Module, spec: PolicySpec, prediction_horizon: int) -> tupl
     Returns:
         The specification; and the largest difference between predictions with and without the last steps, over the
         standard deviation of the prediction, on random inputs at the first, the middle and the last timestep.
+
+    Raises:
+        SpecError: fewer steps than are executed or more than there are; the module takes no shorter sample; or what is
+            kept depends on what would be left out.
     """
     horizon, channels = spec.sample
     if not spec.chunk.stop <= prediction_horizon <= horizon:

@@ -65,6 +65,11 @@ def contestants(artifacts: Mapping[str, Artifact], plans: Sequence[str], ways: S
     Args:
         plans: of the first artifact, and of the others where they have one of this name; all where none is named.
             ``NAME@PRECISION`` is one in another precision.
+
+    Raises:
+        ArtifactError: one cannot be run, or has no models of a plan's precision.
+        IllegalPlanError: the first has no plan of this name.
+        RuntimeUnavailableError: a runtime or device cannot be had, or cannot do what a plan asks for.
     """
     made: list[Contestant] = []
 
@@ -108,6 +113,10 @@ def originals(
         checkpoint: see ``original_policy``, as for ``encoders``.
         threads: of PyTorch.
         device: where PyTorch computes, None for the CPU. Its settings are torch's own: convolutions may use TF32.
+
+    Raises:
+        RuntimeUnavailableError: there is no torch, or no such device.
+        SpecError: the checkpoint is of another policy.
     """
     with needing("the original network", "compile", ", or leave --checkpoint out"):
         import torch

@@ -129,6 +129,10 @@ def observed(
     """The observation as ``predict_action`` takes it, one stream; and the keys of which one frame fills the window.
 
     Pictures are by the key of a camera, or the end of it; the archive is an ``.npz`` with arrays by key.
+
+    Raises:
+        ObservationError: a name or a picture that does not fit, or a key twice.
+        TrajectoryError: the archive cannot be read.
     """
     given = {} if archive is None else read_npz(archive)
     more = [(_camera(name, specs), name, path) for name, path in pictures.items()]

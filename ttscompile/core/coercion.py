@@ -48,6 +48,10 @@ def plain(value: Any, what: str, error: Errors, dtype: str = "float32") -> Array
     """The numpy array of an array or a tensor, of numpy's own class; no copy if it can be helped.
 
     For the message, ``what`` is ``observation 'obs'``, and ``dtype`` what is expected in the end; it is not checked.
+
+    Raises:
+        TtscompileError: of the class ``error``: neither an array nor a tensor; a masked array, or one that computes in
+            its own way; or a tensor whose numbers numpy cannot have.
     """
     if type(value) is np.ndarray:
         return value

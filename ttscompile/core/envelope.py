@@ -29,9 +29,14 @@ ENVELOPE, CENTER, PLAIN = "envelope", "envelope_center", "plain_plan"
 
 @dataclass(frozen=True, eq=False)
 class Envelope:
-    """Of what a calibration was given: from the condition's N numbers to E components, and their mean, float32 each.
+    """Of what a calibration was given.
 
-    Raises IllegalPlanError: other shapes or dtypes than ``[N, E]`` and ``[E]``, or numbers that are not finite.
+    Attributes:
+        reading: float32 ``[N, E]``, from the condition's N numbers to E components.
+        center: float32 ``[E]``, their mean.
+
+    Raises:
+        IllegalPlanError: other shapes or dtypes, or numbers that are not finite.
     """
 
     reading: npt.NDArray[np.float32]

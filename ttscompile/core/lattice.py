@@ -113,7 +113,10 @@ def illegal_cells(plan: PlanArray, groups: Sequence[int], written: BoolArray) ->
 
 
 def require_legal(plans: PlanArray, groups: Sequence[int], written: BoolArray) -> None:
-    """Raise IllegalPlanError if any stream's plan ``[B, K, blocks]`` is illegal; ``written`` is of its shape."""
+    """Raise IllegalPlanError if any stream's plan, of int8 ``[B, K, blocks]``, is illegal.
+
+    ``groups`` has the FORWARD group of each block; ``written``, bool of the plans' shape, which rollout entries exist.
+    """
     for stream, (plan, cells) in enumerate(zip(plans, written, strict=True)):
         bad = np.argwhere(illegal_cells(plan, groups, cells))
         if len(bad):

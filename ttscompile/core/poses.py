@@ -22,7 +22,12 @@ LEAST = 1e-3
 
 @dataclass(frozen=True)
 class Pose:
-    """A pose in the actions that is relative to a measured one: which number of either is its first."""
+    """A pose in the actions that is relative to a measured one.
+
+    Attributes:
+        action: which number of the actions is its first.
+        measured: which number of the observation is the measured one's first.
+    """
 
     action: int
     measured: int

@@ -11,7 +11,12 @@ from typing import Annotated, Any
 
 @dataclass(frozen=True)
 class Rule:
-    """What is expected, in words that follow that one, and whether a value of the field's type is that."""
+    """One rule.
+
+    Attributes:
+        expected: in words, after "expected".
+        holds: of a value of the field's type; true or a match where it is met.
+    """
 
     expected: str
     holds: Callable[[Any], object]

@@ -108,7 +108,11 @@ class Instruction:
 
 
 class Tokenizer:
-    """What ``tokenizer.json`` describes, or CLIP's tokenizer of ``vocab.json`` and ``merges.txt``; in a folder, too."""
+    """What ``tokenizer.json`` describes, or CLIP's tokenizer of ``vocab.json`` and ``merges.txt``; in a folder, too.
+
+    Raises:
+        TtscompileError: of the class ``error``: no such file, one that is too large or damaged, or no ``tokenizers``.
+    """
 
     def __init__(self, path: str | os.PathLike[str], error: Errors) -> None:
         own = Path(path)

@@ -70,6 +70,9 @@ def fitted(array: Array, spec: ObservationSpec, what: str = "an image", error: E
         array: ``[..., C, h, w]``.
         spec: of the observation, of a window or of a frame.
         what: for the message, ``observation 'obs'``.
+
+    Raises:
+        TtscompileError: of the class ``error``: what would be resized is not finite, or outside of its bounds.
     """
     if spec.fit is None or array.dtype != np.float32 or array.ndim < 3 or not array.size:
         return array

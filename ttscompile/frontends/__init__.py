@@ -36,13 +36,22 @@ def load_checkpoint_policy(
         The denoiser in eval mode, which takes the sample ``[B, T, D]``, the timestep ``[B]`` and the observations,
         normalised as the second result says, and everything else about the policy. What the original evaluates once a
         call is the ``encoder`` of an ``EncodedDenoiser``.
+
+    Raises:
+        CheckpointError: unreadable, unsafe, not a supported policy, or given an option of another family.
+        SpecError: the sampler asked for is not possible.
     """
     require_free_or_path(path, CheckpointError, "Give a file or a directory that was trained.")
     return find_family(Path(path), format).load(Path(path), options)
 
 
 def recordings_of(path: str | os.PathLike[str], format: str = "auto") -> str:
-    """Where the recorded episodes are that a policy was trained on, as ``load_trajectories`` takes it."""
+    """Where the recorded episodes are that a policy was trained on, as ``load_trajectories`` takes it.
+
+    Raises:
+        CheckpointError: the checkpoint does not say, or names what is not here.
+        HubError: the checkpoint is on the hub, and cannot be had.
+    """
     here = fetch_checkpoint(str(path)).path if on_hub(path) else Path(path)
     find = find_family(here, format).function("recordings")
     found: str | None = None if find is None else find(here)

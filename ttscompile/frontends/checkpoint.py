@@ -74,6 +74,9 @@ def read_checkpoint(path: str | os.PathLike[str], mapped: bool = False) -> dict[
 
     Entries that are pickles of their own (``pickles``) stay the bytes they are. Tensors that are ``mapped`` stay in the
     file until they are used, as those of safetensors do.
+
+    Raises:
+        CheckpointError: missing, truncated, not a torch zip, or naming a global that is not known to be harmless.
     """
     path = Path(path)
     if not path.is_file():

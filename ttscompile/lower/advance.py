@@ -51,6 +51,9 @@ def fuse_advance(tail: names.LoopPiece, stem: names.LoopPiece, spec: PolicySpec)
         memories ``memory`` ``[D, B, S T]``, the tail's contexts as ``tail.NAME`` (of this step) and the stem's as
         ``stem.NAME`` (of the next); outputs ``sample_next``, ``stream_next``, ``prediction`` and with memories
         ``memory_next``. Samples and prediction are ``[D, B, T]``.
+
+    Raises:
+        LoweringError: a constant of the program has the name of one of these inputs.
     """
     inputs = {names.STREAM: tail.type, **_update_types(spec)}
     for name, piece in ((names.TAIL, tail), (names.STEM, stem)):

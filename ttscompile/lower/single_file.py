@@ -38,7 +38,13 @@ LARGEST = 2**31 - 1
 def lower_single_file(
     program: Program, models: Mapping[str, ModelProto], weights: Weights, loop: str = ORIGINAL
 ) -> ModelProto:
-    """The model of the whole call in one of the program's loops, with its weights inside; blocks may be in int8."""
+    """The model of the whole call in one of the program's loops, with its weights inside; blocks may be in int8.
+
+    Raises:
+        SpecError: there is no such loop.
+        LoweringError: an observation has the name of another input or output; the residual stream changes its type; a
+            context cannot be repeated for a batch; or the file would have 2 GB.
+    """
     weights = {**weights, **program.loop_weights.get(loop, {})}
     own = {piece: models.get(of_loop(piece, loop)) for piece in (ADVANCE, PRUNER)}
     models = {**models, **{piece: model for piece, model in own.items() if model is not None}}

@@ -153,13 +153,13 @@ def fastest(times_ms: Mapping[str, float], distances: Mapping[str, float]) -> st
 def best_plan(times: Mapping[str, Times], distances: Mapping[str, float], deadline_ms: float | None) -> str | None:
     """The name of the plan, of those that may be the default, that is it.
 
-    Without a deadline, in milliseconds, it is the ``fastest``. With one it is the nearest of those whose longest call
+    Without a deadline, in milliseconds, it is the ``fastest``. With one it is the nearest of those whose worst call
     keeps it; None if none does. The faster of two is the nearest where three decimals do not tell their distances
     apart.
     """
     if deadline_ms is None:
         return fastest({name: one.median for name, one in times.items()}, distances) if times else None
-    in_time = [name for name, one in times.items() if one.longest <= deadline_ms]
+    in_time = [name for name, one in times.items() if one.worst <= deadline_ms]
     return min(in_time, key=lambda name: (round(distances[name], 3), times[name].median), default=None)
 
 

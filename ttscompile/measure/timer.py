@@ -28,7 +28,7 @@ class Times:
         return float(median(self.ms))
 
     @property
-    def longest(self) -> float:
+    def worst(self) -> float:
         """What 99 of 100 calls take at most, in milliseconds; of fewer than ``MANY`` calls all."""
         return max(self.ms) if len(self.ms) < MANY else quantiles(self.ms, n=100, method="inclusive")[98]
 

@@ -79,6 +79,9 @@ def load_trajectories(
     Returns:
         The episodes in the order of the files. Rows after the last end of an episode are left out, with a warning; so
         is an episode that equals one before it.
+
+    Raises:
+        TrajectoryError: names the file, what was expected, what it holds, and what to do.
     """
     action_steps = integer(action_steps, "action_steps", TrajectoryError, 1)
     if isinstance(paths, str | os.PathLike) or not isinstance(paths, Iterable):

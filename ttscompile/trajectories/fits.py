@@ -102,7 +102,11 @@ def judged(one: Placed) -> Finding:
 
 
 def check_ranges(episodes: Sequence[Episode], spec: PolicySpec) -> None:
-    """Warn of recorded numbers outside of what the normaliser maps to -1..1; refuse most, and permuted columns."""
+    """Warn of recorded numbers outside of what the normaliser maps to -1..1; refuse most, and permuted columns.
+
+    Raises:
+        TrajectoryError: most are outside, or columns are permuted; says how many there are, and in which columns.
+    """
     for one in placed(episodes, spec):
         found = judged(one)
         if found.level is Level.PROBLEM:

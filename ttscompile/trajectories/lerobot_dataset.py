@@ -197,6 +197,10 @@ def video_frames(
         info: ``meta/info.json``.
         episodes: ``[F]`` the episode of each row.
         times: ``[F]`` seconds since its episode began, of each row.
+
+    Raises:
+        ModuleNotFoundError: PyAV is not installed.
+        TrajectoryError: a video is missing or damaged, of another codec, or lacks a frame; a time is not finite.
     """
     import av  # noqa: F401  # told before anything is looked for
 

@@ -17,6 +17,10 @@ def recorded_rate(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str
     """Rate in Hz of the frames and actions of recordings; None where none says it, or where they say different ones.
 
     A LeRobot data set has it as ``fps``; an ``.npz`` may have ``{"policy_hz": 10}`` in its ``meta``.
+
+    Raises:
+        TrajectoryError: what a recording says is no rate.
+        HubError: a data set is on the hub, and cannot be had.
     """
     paths = [paths] if isinstance(paths, str | os.PathLike) else paths
     rates = {rate for path in paths if (rate := rate_of(local_path(path))) is not None}

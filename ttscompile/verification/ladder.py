@@ -77,7 +77,11 @@ def verify(
 
 
 def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
-    """Hash every file, and open the artifact: None if that fails. ArtifactError is for what cannot be an artifact."""
+    """Hash every file, and open the artifact: None if that fails. ArtifactError is for what cannot be an artifact.
+
+    Raises:
+        ArtifactError: there is nothing at this path that could be an artifact.
+    """
     require_artifact_path(path)
     if (path.is_dir() and not (path / MANIFEST).is_file()) or is_checkpoint(path):
         load_artifact(path)  # says what is wrong

@@ -50,6 +50,9 @@ def record_original(module: nn.Module, program: Program) -> Golden:
 
     On one thread: the record does not depend on how many there are, nor on what else the machine does. Of what became
     of the module, the pieces are not used.
+
+    Raises:
+        CaptureError: the module gives values that are not finite.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
