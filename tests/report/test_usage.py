@@ -57,7 +57,8 @@ def test_what_schedules_use(own: Artifact) -> None:
     single = dense_plan(5, 5)
     single[3, 1], single[4, 2] = 1, 3
     schedules = {"evenly": uniform_plan(5, 5, 2), "single": single}
-    corrections = {"evenly": random_correction(own, np.random.default_rng(0))}
+    rng = np.random.default_rng(0)
+    corrections = {"evenly": replace(random_correction(own, rng), late=random_correction(own, rng))}
     store_schedules(own.path, None, schedules, "evenly", {}, corrections=corrections)
     artifact = load_artifact(own.path)
     found = plans_of(artifact)
@@ -68,6 +69,7 @@ def test_what_schedules_use(own: Artifact) -> None:
     assert timesteps == [("evenly",), ("evenly",), ("evenly", "single"), ("evenly",), ("evenly",)]
     assert found[BRANCH, "steps without a computed block", None] == ("evenly",)
     assert found[TABLE, "correction of evenly", None] == found[TABLE, "jumps of evenly", None] == ("evenly",)
+    assert found[TABLE, "correction with a prefix of evenly", None] == ("evenly",)
     assert found[HEAD, "the pruner", None] == ()
     rows = [row for row in usage_table(artifact).rows if "FORWARD" in row[0] or "TIMESTEP" in row[0]]
     assert rows == [

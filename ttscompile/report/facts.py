@@ -22,17 +22,7 @@ from ..measure.units import flops, ms, plain, rounded_up, share
 from ..runtimes.liveness import rollout_needs
 from .page import Section, Table
 
-_NOT_TOLD = (
-    "plans",
-    "precision",
-    "sparsity",
-    "flops_sparsity",
-    "skipped",
-    "other_noise",
-    "told",
-    "frontier",
-    "timed_on",
-)
+_NOT_TOLD = "plans precision sparsity flops_sparsity skipped other_noise told frontier timed_on".split()
 
 
 def provenance(artifact: Artifact) -> Section:

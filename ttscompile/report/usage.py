@@ -69,11 +69,10 @@ def uses(artifact: Artifact) -> tuple[Use, ...]:
     tables = (name for name, context in manifest.contexts.items() if context.binding is Binding.TABLE)
     found += [Use(TABLE, CONTEXTS, tuple(sources) if name in read else (), name) for name in tables]
     for name, plan in artifact.plans.items():
-        if (correction := plan.correction) is None:
+        if (own := plan.correction) is None:
             continue
-        found += [
-            Use(TABLE, f"{what} of {name}", (name,)) for what in ("correction", "jumps")[: 1 + bool(correction.jumps)]
-        ]
+        kinds = ["correction", *["jumps"] * bool(own.jumps), *["correction with a prefix"] * (own.late is not None)]
+        found += [Use(TABLE, f"{kind} of {name}", (name,)) for kind in kinds]
     return tuple(found)
 
 
