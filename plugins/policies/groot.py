@@ -229,14 +229,15 @@ def _groups(own: Settings, robot: _Robot) -> list[_Group]:
     ends = ("q01", "q99") if own.flag("use_percentiles", False) else ("min", "max")
     for name in _names(state):
         part = robot.statistics.part("state").part(name)
-        first, second = (_vector(part, each) for each in (("mean", "std") if name in averaged else ends))
+        first, second = (vector(part, each) for each in (("mean", "std") if name in averaged else ends))
         if len(first) != len(second):
             raise part.error(f"its statistics have {len(first)} and {len(second)} numbers; expected as many")
         found.append(_Group(name in waves, name in averaged, first, second))
     return found
 
 
-def _vector(own: Settings, name: str) -> Tensor:
+def vector(own: Settings, name: str) -> Tensor:
+    """Numbers of an entry, float64 ``[n]``."""
     value: Any = own.values.get(name)
     if isinstance(value, list) and 0 < len(value) <= MOST and all(type(one) in (int, float) for one in value):
         found = torch.tensor(value, dtype=torch.float64, device="cpu")
@@ -310,7 +311,7 @@ def _actions(directory: Path, own: Settings, robot: _Robot) -> Actions:
 def _listed(robot: _Robot, part: str) -> str:
     """The groups of a state or an action and how many numbers each has, in their order."""
     own = robot.statistics.part(part)
-    return ", ".join(f"{name} {len(_vector(own.part(name), 'mean'))}" for name in _names(robot.modality.part(part)))
+    return ", ".join(f"{name} {len(vector(own.part(name), 'mean'))}" for name in _names(robot.modality.part(part)))
 
 
 def _weights(directory: Path) -> dict[str, Tensor]:

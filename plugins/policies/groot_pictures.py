@@ -102,7 +102,7 @@ def read_pictures(base: Settings, own: Settings, cameras: Sequence[str], last: R
         raise own.refusal("image_crop_size", f"height and width, {target} at most")
     way = _Way(opencv, own.flag("letter_box_transform", False), edge, target or (_EDGE, _EDGE), kept)
     side = edge or way.target[0]
-    given = _sizes(base, cameras, (side, side))
+    given = read_sizes(base, cameras, (side, side))
     large = {key: way.zoomed(_squared(size, way.padded)) for key, size in given.items()}
     shown = {key: way.zoomed(way.cropped(size)[1]) for key, size in large.items()}
     if max(max(size) for size in (*large.values(), *shown.values())) > MOST_PIXELS:
@@ -112,7 +112,7 @@ def read_pictures(base: Settings, own: Settings, cameras: Sequence[str], last: R
     return Pictures(given, {key: last(*size) for key, size in shown.items()}, way)
 
 
-def _sizes(base: Settings, cameras: Sequence[str], default: Size) -> dict[str, Size]:
+def read_sizes(base: Settings, cameras: Sequence[str], default: Size) -> dict[str, Size]:
     """Height and width of each camera's pictures, which the original does not save."""
     found = base.values.get(SIZE, list(default))
     by_name = found if isinstance(found, dict) else dict.fromkeys(cameras, found)
@@ -156,9 +156,12 @@ class _Seen(nn.Module):
 
     def forward(self, images: list[Tensor]) -> list[Tensor]:
         cameras = chain.from_iterable([self.cameras] * self.frames)
-        return [
-            camera(((image + 1) * 127.5).round().clamp(0, 255)) for camera, image in zip(cameras, images, strict=True)
-        ]
+        return [camera(as_bytes(image)) for camera, image in zip(cameras, images, strict=True)]
+
+
+def as_bytes(image: Tensor) -> Tensor:
+    """Pixels in -1..1 as whole numbers in 0..255."""
+    return ((image + 1) * 127.5).round().clamp(0, 255)
 
 
 def _resized(before: Size, after: Size, opencv: bool) -> nn.Module:

@@ -154,7 +154,6 @@ DIRECTORY_FILES: list[tuple[list[str], str]] = [
     (["9/params/_METADATA", "9/_CHECKPOINT_METADATA"], r"around checkpoints of openpi .told by 9/params/_METADATA"),
     (["config.json=model_type=eo1", "model.safetensors"], "an EO-1 .*No tool makes LeRobot's eo1"),
     (["config.json=dof_config=7", "model.safetensors"], "a Wall-X .*No tool makes LeRobot's wall_x"),
-    (["config.json=vlm_name=InternVL3", "mp_rank_00_model_states.pt"], "an Evo-1 .*No tool makes LeRobot's evo1"),
     (["checkpoint-1000/config.json", "checkpoint-1000/model.safetensors"], "around checkpoints .*Give one of those in"),
     (["step_final/config.json", "step_final/checkpoint.pt"], "around checkpoints .*Give one of those in it"),
     (["pytorch_model.bin"], "a directory of weights"),

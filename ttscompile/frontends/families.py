@@ -140,6 +140,13 @@ FAMILIES = (
         options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
     ),
     Family(
+        name="evo1",
+        title="Evo-1",
+        reads="a directory that Evo-1's training saved, with config.json, norm_stats.json and its weights",
+        detect=lambda path: "vlm_name" in _config(path),
+        options=DIFFUSION_OPTIONS | {"task", "encoders", "without_cameras"},
+    ),
+    Family(
         name="scaledp",
         title="DexVLA",
         reads="a directory that DexVLA's training saved, with config.json and safetensors",

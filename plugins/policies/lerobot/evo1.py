@@ -5,7 +5,7 @@ folder, which lerobot needs, too. Source: ``Evo1Policy.predict_action_chunk`` of
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ttscompile.core.spec import LARGEST, Affine, ChunkSpec, Instruction, PolicySpec, Switch
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.saved_weights import filled, renamed
+from ttscompile.frontends.saved_weights import filled, renamed, separated
 from ttscompile.frontends.settings import Settings, read_json
 
 from ..instruction import encoder_folders, language_model_folder, task_tokens, told_after
@@ -31,9 +31,11 @@ from .processors import Processors
 
 _MODEL = "OpenGVLab/InternVL3-1B-hf"
 _MOST_VIEWS, _MOST_KINDS = 64, 4096
+Rule = tuple[str, str]
+"""A pattern in the name of a weight, and what it becomes."""
 _IMAGE = "Image-{}: <img><IMG_CONTEXT></img>"
 """The line of one image in the prompt; of its tokens one stands for all, since none is joined to a word beside it."""
-_RENAMED = (
+_EMBEDDER = (
     (r"^model\.", ""),
     (r"^embedder\.model\.", "embedder."),
     (r"\.patch_embeddings\.projection\.", ".projection."),
@@ -42,6 +44,8 @@ _RENAMED = (
     (r"\.attention\.", ".self_attn."),
     (r"\.layernorm_before\.", ".layer_norm1."),
     (r"\.layernorm_after\.", ".layer_norm2."),
+)
+_HEAD = (
     (r"\.action_encoder\.W1\.", ".action_encoder.first."),
     (r"\.action_encoder\.W2\.", ".action_encoder.second."),
     (r"\.action_encoder\.W3\.", ".action_encoder.third."),
@@ -64,19 +68,13 @@ def load(directory: Path, entries: Mapping[str, Any], options: LoadOptions) -> t
     folder = language_model_folder(name, encoder_folders(options.encoders, directory), "internvl")
     model = Settings(read_json(folder / CONFIG), f"{folder / CONFIG}: ")
     config = read_config(shared, model)
-    vocabulary, views = config.language.vocabulary, _views(settings)
-    told = Instruction(TOKENS, MASK, False, tuple(_IMAGE.format(i + 1) for i in range(views)))
+    views = _views(settings)
     image = model.number("image_token_id", 151667, MOST_VOCABULARY)
-    between, told = told_after(told, name, folder, vocabulary, image, views)
-    images = told.skipped + views * (config.language.image_tokens - 1)
-    length = settings.number("max_text_length", 1024, MOST) - images
-    if length < 1:
-        raise settings.refusal("max_text_length", f"more than the {images} tokens of {views} images", 1024)
-    sizes, task = {"actions": config.max_action_dim, "tokens": length, "vocabulary": vocabulary}, None
-    if options.task is not None:
-        tokens = task_tokens(told.line(options.task), name, folder, told.skipped + length, vocabulary, "")
-        task = torch.tensor([tokens[told.skipped :]])
-    weights, prompt = _weights(shared, options, config, model), Prompt(between, len(shared.cameras))
+    between, told, length, task = spoken(settings, config, name, folder, image, views, options.task)
+    sizes = {"actions": config.max_action_dim, "tokens": length, "vocabulary": config.language.vocabulary}
+    saved = read_weights(shared, options, *unread(config))
+    weights = as_named(saved, settings, config, model, _EMBEDDER)
+    prompt = Prompt(between, len(shared.cameras))
     network = filled(lambda: Evo1(config, prompt), weights, "config.json, or the language model's,", directory)
     encoder = vla.Gathered(shared, processors, Prefix(network), config.max_state_dim, task)
     side, table = config.language.vision.image_size, partial(vla.in_buckets, settings, 32, TIMES - 1, False)
@@ -204,22 +202,55 @@ def _chunk(settings: Settings, chunk: ChunkSpec) -> ChunkSpec:
     return replace(chunk, action_dim=kept, normalizer=own)
 
 
-def _weights(shared: LeRobotConfig, options: LoadOptions, config: Evo1Config, model: Settings) -> Mapping[str, Tensor]:
-    """The weights under the names of ``Evo1``; of those that each embodiment has, those of its own."""
-    settings = shared.settings
+def spoken(
+    settings: Settings, config: Evo1Config, name: str, folder: Path, image: int, views: int, task: str | None
+) -> tuple[tuple[tuple[int, ...], ...], Instruction, int, Tensor | None]:
+    """The tokens of the prompt before each image, how a task is told, its tokens at most, and those of this one.
+
+    Args:
+        name: of the language model.
+        folder: that has its tokenizer.
+        image: the token that stands for an image.
+        views: images of the prompt.
+    """
+    told = Instruction(TOKENS, MASK, False, tuple(_IMAGE.format(i + 1) for i in range(views)))
+    vocabulary = config.language.vocabulary
+    between, told = told_after(told, name, folder, vocabulary, image, views)
+    images = told.skipped + views * (config.language.image_tokens - 1)
+    length = settings.number("max_text_length", 1024, MOST) - images
+    if length < 1:
+        raise settings.refusal("max_text_length", f"more than the {images} tokens of {views} images", 1024)
+    if task is None:
+        return between, told, length, None
+    tokens = task_tokens(told.line(task), name, folder, told.skipped + length, vocabulary, "")
+    return between, told, length, torch.tensor([tokens[told.skipped :]])
+
+
+def unread(config: Evo1Config) -> tuple[str, ...]:
+    """Names of weights that nothing reads."""
+    return (".embeddings.mask_token", *((".seq_pool_proj.weight", ".seq_pool_proj.bias") * (config.chunk_size == 1)))
+
+
+def as_named(
+    saved: Mapping[str, Tensor], settings: Settings, config: Evo1Config, model: Settings, rules: Sequence[Rule]
+) -> Mapping[str, Tensor]:
+    """The weights under the names of ``Evo1``; of those that each embodiment has, those of its own.
+
+    Args:
+        rules: by which those of the backbone are renamed.
+    """
     kinds, own = settings.number("num_categories", 1, _MOST_KINDS), settings.values.get("default_embodiment_id", 0)
     if type(own) is not int or not 0 <= own < kinds:
         raise settings.refusal("default_embodiment_id", f"a number of the {kinds} embodiments (num_categories)", 0)
     if kinds > 1 and settings.values.get("embodiment_id_field") is not None:
         expected = f"null: the robot is embodiment {own}, default_embodiment_id, at every call"
         raise settings.refusal("embodiment_id_field", expected)
-    unread = (".embeddings.mask_token", *((".seq_pool_proj.weight", ".seq_pool_proj.bias") * (config.chunk_size == 1)))
     found = dict[str, Tensor]()
-    for saved, value in read_weights(shared, options, *unread).items():
-        name = renamed(saved, (_SHARED, *_RENAMED) if kinds == 1 else _RENAMED)
+    for before, value in saved.items():
+        name = renamed(before, (*rules, *_HEAD, *((_SHARED,) * (kinds == 1))))
         if kinds > 1 and _BY_KIND.search(name) and len(value) == kinds:
             value = value[own].T.contiguous() if value.ndim == 3 else value[own].clone()
-        found[name] = value
+        found |= separated(name, value) if ".qkv." in name else {name: value}
     if not vla.part_of(model, "vision_config").flag("attention_bias", False):
         width = config.language.vision.hidden_size
         for layer in range(config.language.vision.num_hidden_layers):

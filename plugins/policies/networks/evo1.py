@@ -2,7 +2,8 @@
 
 An attribute's name is that of lerobot's weights, but for those that ``lerobot.evo1`` renames.
 
-Sources: Lin et al., Evo-1 (arXiv 2511.04555); ``lerobot.policies.evo1`` of huggingface/lerobot 0.6.
+Sources: Lin et al., Evo-1 (arXiv 2511.04555); ``lerobot.policies.evo1`` of huggingface/lerobot 0.6; and
+``Evo_1/model`` of MINT-SJTU/Evo-1 at 1bf31c4.
 """
 
 from dataclasses import dataclass
@@ -139,6 +140,39 @@ class Prefix(nn.Module):
             return torch.cat([features, own], 1), added(functional.pad(valid, (0, 1), value=True))
         last = (valid.sum(-1) - 1)[:, None, None].expand(-1, 1, features.shape[2])
         return (torch.cat([torch.gather(features, 1, last), own], 1),)
+
+
+class PaddedPrefix(nn.Module):
+    """The same as its authors' code has it, whose head looks at what the language model does not attend to, too.
+
+    All padding has one feature: it stands there once, and the logarithm of how often is added to its scores.
+
+    Args:
+        pictures: what makes of the robot's pictures those that the network sees.
+        left_out: ``[n, width]``, the feature of the padding, and then those of a black picture.
+        padding: tokens of padding that the instruction is without.
+        black: so many pictures are black.
+    """
+
+    left_out: Tensor
+    repeated: Tensor
+
+    def __init__(self, network: Evo1, pictures: nn.Module, left_out: Tensor, padding: int, black: int) -> None:
+        super().__init__()
+        self.embedder, self.state_encoder = network.embedder, network.action_head.state_encoder
+        self.pictures, self.padding = pictures, padding
+        self.register_buffer("left_out", left_out, persistent=False)
+        repeated = torch.full((len(left_out) - 1,), float(max(black, 1)), device="cpu").log()
+        self.register_buffer("repeated", functional.pad(repeated, (0, 1)), persistent=False)  # the state stands last
+
+    def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor) -> tuple[Tensor, ...]:
+        """See ``Prefix``."""
+        features, valid = self.embedder(self.pictures(images), tokens, mask)
+        own, many = self.state_encoder(state)[:, None], len(features)
+        count = self.padding + mask.logical_not().sum(1, keepdim=True)
+        padded = count.clamp(min=1).to(torch.float32).log() + added(count > 0)
+        context = torch.cat([features, self.left_out.expand(many, -1, -1), own], 1)
+        return context, torch.cat([added(valid), padded, self.repeated.expand(many, -1)], 1)
 
 
 class Denoiser(nn.Module):

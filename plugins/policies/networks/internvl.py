@@ -6,7 +6,7 @@ Source: Zhu et al., InternVL3 (arXiv 2504.10479).
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -192,3 +192,19 @@ class InternVL(nn.Module):
         for layer in language.layers:
             x = layer(x, turns, hidden)[0]
         return language.norm(x), valid
+
+    def left_out(self, token: int, image: Tensor | None) -> Tensor:
+        """Features of what FlashAttention leaves out: nothing attends to it, and it attends to nothing, ``[n, width]``.
+
+        Args:
+            token: of the padding, whose feature is the first one.
+            image: ``[3, H, W]``, in -1..1, whose features are the others; None for none.
+        """
+        language = self.language_model
+        x = language.embed_tokens.weight[token][None]
+        if image is not None:
+            x = torch.cat([x, self.multi_modal_projector(self.vision_tower(image[None]))[0]])
+        layer: Any
+        for layer in language.layers:
+            x = x + layer.mlp(layer.post_attention_layernorm(x))
+        return language.norm(x)  # type: ignore[no-any-return]
