@@ -177,8 +177,8 @@ def test_an_environment_without_its_package_names_the_extra(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("pusht:edgy", "disturbance of the environment 'pusht': expected one of edge, long, noisy; found 'edgy'."),
-        ("metaworld:dark", "disturbance of the environment 'metaworld': it has none; found 'dark'."),
+        ("pusht:e", "disturbance of the environment 'pusht': expected one of edge, long, moved, noisy; found 'e'."),
+        ("fetch:dark", "disturbance of the environment 'fetch': it has none; found 'dark'."),
     ],
 )
 def test_a_disturbance_that_is_none_is_named(name: str, told: str) -> None:

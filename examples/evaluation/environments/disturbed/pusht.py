@@ -1,4 +1,4 @@
-"""Push-T from where no recording begins, with a sensor that errs, and five times as long."""
+"""Push-T from where no recording begins, with a sensor that errs, five times as long, and with the block moved."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ NOISE = 4.0
 """Pixels, standard deviation of what every number of a frame is off by; the demonstrations have none."""
 GOALS = 5
 """One after the other, in a long episode."""
+WHEN, FURTHER, TURNED, ROOM = (30, 90), 80.0, 0.6, 40.0
+"""Actions after which somebody moves the block, from and below; pixels by which, radians at most, and pixels from all
+keypoints to the agent."""
 
 
 class PushTEdge(PushT):
@@ -104,4 +107,58 @@ class PushTLong(PushT):
             super().reset(int(self._places.integers(2**31)), [*self.state[:2].tolist(), *block.tolist(), float(angle)])
 
 
-DISTURBED = {"edge": PushTEdge, "long": PushTLong, "noisy": PushTNoisy}
+class PushTMoved(PushT):
+    """See ``PushT``. Somebody moves the block while the agent is away from it; the score is what is covered afterwards.
+
+    Attributes:
+        moves: whether it is moved; a class in which it is not has the same episodes without that.
+    """
+
+    title = "Push-T, the block is moved"
+    moves = True
+
+    def reset(self, seed: int, state: Sequence[float] | None = None) -> None:
+        """Start the episode of this seed, which decides when and where to the block is moved, too."""
+        super().reset(seed, state)
+        self._random, self._taken, self.moved_at = np.random.default_rng((seed, 2)), 0, -1
+        self._due = int(self._random.integers(*WHEN))
+
+    @property
+    def score(self) -> float:
+        """See ``PushT``; 0 before the block is moved, unless the goal is reached before."""
+        return super().score if self.moved_at >= 0 or self.success else 0.0
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """After how many actions it was moved; -1 for not yet."""
+        return {"moved at": float(self.moved_at)}
+
+    def step(self, action: npt.ArrayLike) -> None:
+        """See ``PushT``."""
+        super().step(action)
+        self._taken += 1
+        if self.moved_at < 0 and self._taken >= self._due and not self.done:
+            self._move()
+
+    def _move(self) -> None:
+        agent, block, angle = self.state[:2], self.state[2:4], float(self.state[4])
+        for _ in range(100):
+            way = self._random.uniform(-np.pi, np.pi)
+            to, turned = block + FURTHER * np.array([np.cos(way), np.sin(way)]), self._random.uniform(-TURNED, TURNED)
+            points = np.concatenate([keypoints(block, angle), keypoints(to, angle + turned)])
+            inside = points[9:].min() > NEAREST and points[9:].max() < 512 - NEAREST
+            if inside and np.linalg.norm(points - agent, axis=1).min() > ROOM:
+                break
+        else:
+            return  # there is no room; perhaps after the next action
+        self.moved_at, self.coverage = self._taken, 0.0
+        if self.moves:
+            world = self._gym.unwrapped
+            self.state = np.array([*agent, *to, angle + turned])
+            world.block.angle = float(self.state[4])
+            world.block.position = (float(to[0]), float(to[1]))
+            world.block.velocity, world.block.angular_velocity = (0.0, 0.0), 0.0
+            world.space.reindex_shapes_for_body(world.block)
+
+
+DISTURBED = {"edge": PushTEdge, "long": PushTLong, "moved": PushTMoved, "noisy": PushTNoisy}
