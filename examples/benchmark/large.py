@@ -4,6 +4,7 @@
     python examples/benchmark/large.py --unet 512,1024,2048 --horizon 64        # LeRobot's U-Net
     python examples/benchmark/large.py --unet 256,512,1024 --horizon 16         # Diffusion Policy's
     python examples/benchmark/large.py --smolvla                                # LeRobot's SmolVLA, whole
+    python examples/benchmark/large.py --smolvla --threads 1,2                  # in one table
     python examples/benchmark/large.py --smolvla --precision int4 --only convert --output DIR     # what it is made of
     python examples/benchmark/large.py --pi0 --precision int4                   # LeRobot's pi0, whole; or --pi05
     python examples/benchmark/large.py --groot --precision int4                 # LeRobot's GR00T N1.7, whole
@@ -18,7 +19,8 @@
 
 The transformer is an ordinary DiT with adaLN-Zero. Both have 14 actions and an observation vector of 64 numbers, and
 four steps. Converting and running are two processes, so that each has its own peak of resident memory; of eo1, wall_x
-and pi05, whose originals are timed before, they are three.
+and pi05, whose originals are timed before, they are three. Where there is no memory for all at once, ``--only eager``
+and ``--only fp32`` time a part of any whole policy in ``--output``, and what they timed is not timed again.
 """
 
 from __future__ import annotations
@@ -39,12 +41,9 @@ from typing import TYPE_CHECKING
 from memory import watched
 
 if TYPE_CHECKING:
-    import numpy as np
+    import large_threads
+    from rate import Clock
     from torch import nn
-
-    from ttscompile import PolicySpec
-
-    Eager = Callable[[], tuple[np.ndarray, list[float]]]
 
 STEPS = 4
 
@@ -199,40 +198,42 @@ def convert_clip(folder: Path) -> None:
         stages.end()
 
 
-def run_whole(folder: Path, rounds: int, name: str) -> None:
+def run_whole(folder: Path, rounds: int, threads: tuple[int, ...], name: str) -> None:
     """See ``large_calls``; two steps are computed. No tokens can be reused of the encoders of xvla, Octo and RDT."""
     import large_calls
-
-    original, spec = _timed(folder) if name in ALONE else _original(folder, name)
-    first = "words" if name == "octo" else "vision"
-    large_calls.compare(folder, f"{first}, prefix, loop", original, spec, 2, rounds, name not in ALONE)
-    if name not in ("xvla", "rdt", "octo"):
-        large_calls.reusing(folder, spec, 2, rounds + 2)
-
-
-def time_original(folder: Path, rounds: int, name: str) -> None:
-    """Calls of the original alone, after one that does not count; ``run_whole`` reads what they took."""
-    import numpy as np
-    import torch
-
-    torch.set_num_threads(1)
-    original, _ = _original(folder, name)
-    calls = [original() for _ in range(rounds + 1)]
-    seconds = [statistics.median(part) for part in zip(*(split for _, split in calls[1:]), strict=True)]
-    np.savez(folder / "eager.npz", actions=calls[0][0], seconds=seconds)
-
-
-def _timed(folder: Path) -> tuple[Eager, PolicySpec]:
-    """A call that ``time_original`` made."""
-    import numpy as np
+    import large_threads
 
     from ttscompile.artifact.load import load_artifact
 
-    kept = dict(np.load(folder / "eager.npz"))
-    return lambda: (kept["actions"], kept["seconds"].tolist()), load_artifact(folder / "compiled").manifest.spec
+    clock, before = large_threads.clock_of(threads), large_threads.known(folder, large_threads.EAGER)
+    original = before or _original(folder, name, clock)
+    spec = load_artifact(folder / "compiled").manifest.spec
+    parts = f"{'words' if name == 'octo' else 'vision'}, prefix, loop"
+    if len(threads) > 1:
+        large_threads.compare(folder, parts, original, spec, 2, threads, rounds)
+        return
+    large_calls.compare(folder, parts, original, spec, 2, rounds, before is None, threads[0], clock)
+    if name not in ("xvla", "rdt", "octo"):
+        large_calls.reusing(folder, spec, 2, rounds + 2, threads[0], clock)
 
 
-def _original(folder: Path, name: str) -> tuple[Eager, PolicySpec]:
+def time_alone(folder: Path, rounds: int, threads: tuple[int, ...], name: str, what: str) -> None:
+    """Calls of the original alone, or of ours in fp32; ``run_whole`` reads what they took."""
+    import large_threads
+
+    clock = large_threads.clock_of(threads)
+    if what == large_threads.EXACT:
+        calls = large_threads.exact_calls(folder, clock)
+    else:
+        original = _original(folder, name, clock)
+
+        def calls(_: int) -> large_threads.Call:
+            return original
+
+    large_threads.alone(folder, what, calls, threads, rounds)
+
+
+def _original(folder: Path, name: str, clock: Clock) -> large_threads.Call:
     import large_smolvla
 
     from ttscompile.frontends import load_checkpoint_policy
@@ -240,7 +241,7 @@ def _original(folder: Path, name: str) -> tuple[Eager, PolicySpec]:
 
     directory, task = saved(folder, name)
     module, spec = load_checkpoint_policy(directory, options=LoadOptions(task=task))
-    return large_smolvla.eager(module, _vision(module), spec), spec
+    return large_smolvla.eager(module, _vision(module), spec, clock)
 
 
 def _vision(module: nn.Module) -> nn.Module:
@@ -249,14 +250,20 @@ def _vision(module: nn.Module) -> nn.Module:
     return next(one for name, one in module.named_modules() if name.endswith(names))
 
 
-def run_clip(folder: Path, rounds: int) -> None:
+def run_clip(folder: Path, rounds: int, threads: tuple[int, ...]) -> None:
     """See ``large_calls``; five of a hundred steps are computed."""
     import large_calls
     import large_clip
+    import large_threads
 
     module, spec = large_clip.policy()
-    large_calls.compare(folder, "encoder, loop", large_clip.eager(module, spec), spec, 5, rounds)
-    large_calls.reusing(folder, spec, 5, rounds + 2)
+    clock = large_threads.clock_of(threads)
+    original = large_clip.eager(module, spec, clock)
+    if len(threads) > 1:
+        large_threads.compare(folder, "encoder, loop", original, spec, 5, threads, rounds)
+        return
+    large_calls.compare(folder, "encoder, loop", original, spec, 5, rounds, True, threads[0], clock)
+    large_calls.reusing(folder, spec, 5, rounds + 2, threads[0], clock)
 
 
 def run(folder: Path) -> None:
@@ -289,6 +296,11 @@ def seconds(call: Callable[[], object]) -> float:
     return statistics.median(timeit.repeat(call, timer=time.process_time, number=1, repeat=6)[1:])
 
 
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """``1,2`` of an option."""
+    return tuple(map(int, text.split(",")))
+
+
 def peak() -> float:
     """Largest resident memory of this process so far, GiB."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
@@ -307,18 +319,21 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="calls of each contestant that are counted")
     parser.add_argument("--output", type=Path, help="a folder to keep the artifact in; a temporary one otherwise")
     parser.add_argument("--precision", default="int8", choices=["int8", "int4"], help="of a whole policy")
-    parser.add_argument("--only", choices=["convert", "eager", "run"], help="one of the processes")
+    parser.add_argument("--threads", default="1", type=whole_numbers, help="of a whole policy: 1, or 1,2 for both")
+    parser.add_argument("--only", choices=["convert", "eager", "fp32", "run"], help="one of the processes")
     options = parser.parse_args()
     convert_to = partial(convert_whole, precision=options.precision)
     policies = {name: (partial(convert_to, name=name), partial(run_whole, name=name)) for name in WHOLE}
     policies["clip"] = partial(convert_clip), partial(run_clip)
     name, asked = next(((name, own) for name, own in policies.items() if getattr(options, name)), ("", None))
+    if asked is None and options.threads != (1,):
+        parser.error("--threads is for whole policies; a transformer and a U-Net are timed on one thread.")
     if asked is not None and options.only == "convert":
         asked[0](options.output)
-    elif options.only == "eager" and name in WHOLE:
-        time_original(options.output, options.rounds, name)
+    elif options.only in ("eager", "fp32") and name in WHOLE:
+        time_alone(options.output, options.rounds, options.threads, name, options.only)
     elif asked is not None and options.only == "run":
-        asked[1](options.output, options.rounds)
+        asked[1](options.output, options.rounds, options.threads)
     elif options.only == "convert":
         from large_networks import transformer, unet
 
@@ -335,6 +350,7 @@ def main() -> None:
                 own = [f"--layers={options.layers}", f"--width={options.width}", f"--horizon={options.horizon}"]
                 own += [f"--{name.replace('_', '-')}" for name in policies if getattr(options, name)]
                 own += [f"--rounds={options.rounds}", f"--precision={options.precision}"]
+                own += [f"--threads={','.join(map(str, options.threads))}"]
                 own += [] if options.unet is None else [f"--unet={options.unet}"]
                 subprocess.run([sys.executable, __file__, *own, f"--output={folder}", f"--only={part}"], check=True)
 

@@ -1,23 +1,24 @@
 """Calls of a large policy, timed for ``large.py``: PyTorch and compiled, and with tokens reused where an arm moves.
 
-Seconds are the processor's: all calls are on one thread, and the machine may be busy. Contestants take turns, and with
-them a product that says what the arithmetic of their calls takes alone (``rate.py``): the floor.
+Seconds are the processor's where all calls are on one thread, since the machine may be busy; with several they are the
+clock's. Contestants take turns, and with them a product that says what the arithmetic of their calls takes alone
+(``rate.py``): the floor. ``large_threads`` has several numbers of threads in one table.
 """
 
 from __future__ import annotations
 
 import resource
 import statistics
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import torch
 from large_smolvla import call
 from moving import REUSE, arm, backgrounds
-from rate import rates, run_all
+from rate import Clock, rates, run_all
 
 import ttscompile
 from ttscompile import Noise, Plan, PolicySpec
@@ -29,6 +30,9 @@ from ttscompile.runtimes.load import open_policy
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.runtimes.random_calls import random_calls
 from ttscompile.runtimes.report import CallReport
+
+PARTS = "prologue, loop"
+"""Of a compiled call."""
 
 COMPARED = 3
 """Random observations that precisions are compared on: a dense call of a large policy takes seconds."""
@@ -64,10 +68,17 @@ class _Calls:
 
 
 class Times:
-    """What the calls of all contestants took, in turn with the products of the floor."""
+    """What the calls of all contestants took, in turn with the products of the floor.
 
-    def __init__(self, arithmetic: Arithmetic) -> None:
-        self._arithmetic, self._products = arithmetic, rates()
+    Args:
+        arithmetic: of the artifact.
+        threads: of all calls.
+        clock: by which they are timed.
+    """
+
+    def __init__(self, arithmetic: Arithmetic, threads: int = 1, clock: Clock = process_time) -> None:
+        self._arithmetic, self._products = arithmetic, rates(threads, clock)
+        self.clock = clock
         self._calls: dict[str, _Calls] = {}
 
     def add(self, name: str, precision: str, seconds: list[float], report: CallReport) -> None:
@@ -75,6 +86,15 @@ class Times:
         calls = self._calls.setdefault(name, _Calls(precision))
         calls.seconds.append(seconds)
         calls.flops.append(self._arithmetic.of(report))
+
+    def last(self, name: str) -> list[float]:
+        """The seconds of a contestant's last call, by part."""
+        return self._calls[name].seconds[-1]
+
+    def medians(self, left_out: int) -> dict[str, list[float]]:
+        """Of the seconds of each contestant's parts, in all calls but the first."""
+        seconds = {name: calls.seconds[left_out:] for name, calls in self._calls.items()}
+        return {name: [statistics.median(part) for part in zip(*own, strict=True)] for name, own in seconds.items()}
 
     def next_round(self) -> None:
         """Time the products of the floor."""
@@ -103,12 +123,14 @@ def compare(
     computed: int,
     rounds: int = 5,
     exact: bool = True,
+    threads: int = 1,
+    clock: Clock = process_time,
 ) -> None:
     """One call after the other, in turn: eager, dense and with few computed steps, in fp32 and in fewer bits.
 
-    Where the processor multiplies in bf16, eager is timed under autocast, too. Seconds are the processor's: all calls
-    are on one thread, and the machine may be busy. Then it is told how far dense actions in fewer bits are from
-    those in fp32, with equal noise on some random observations, and how far other noise moves these.
+    Where the processor multiplies in bf16, eager is timed under autocast, too. Then it is told how far dense actions in
+    fewer bits are from those in fp32, with equal noise on some random observations, and how far other noise moves
+    these.
 
     Args:
         folder: with the artifact.
@@ -119,13 +141,15 @@ def compare(
         rounds: that are counted.
         exact: whether there is memory for calls in fp32, too. If not, ``eager`` tells what the original took in another
             process, before, and nothing is told of precisions.
+        threads: of all calls.
+        clock: by which they are timed; ``eager``, too.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     artifact = load_artifact(folder / "compiled")
     precisions = ("fp32", lowered(artifact)) if exact else (lowered(artifact),)
-    policy = open_policy(artifact, plan=artifact.plan(f"dense@{precisions[0]}"))
+    policy = open_policy(artifact, threads=threads, plan=artifact.plan(f"dense@{precisions[0]}"))
     obs, noise = call(spec)
-    times = Times(Arithmetic(artifact))
+    times = Times(Arithmetic(artifact), threads, clock)
     halves = exact and not {"amx_bf16", "avx512_bf16"}.isdisjoint(cpuinfo().get("flags", "").split())
     for _ in range(rounds + 1):  # the first does not count
         times.next_round()
@@ -202,17 +226,19 @@ def timed(
     name: str,
 ) -> np.ndarray:
     """The actions of a call; its seconds before the loop and in it go to ``times``."""
-    start = time.process_time()
+    start = times.clock()
     found = policy.predict_action(obs, noise=noise, plan=plan)["action"]
-    took = time.process_time() - start
+    took = times.clock() - start
     assert policy.last_report is not None
     timings = policy.last_report.timings
     before = took * timings.prologue / timings.total
-    times.add(f"{name}: prologue, loop", precision, [before, took - before], policy.last_report)
+    times.add(f"{name}: {PARTS}", precision, [before, took - before], policy.last_report)
     return np.asarray(found)
 
 
-def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> None:
+def reusing(
+    folder: Path, spec: PolicySpec, computed: int, rounds: int = 7, threads: int = 1, clock: Clock = process_time
+) -> None:
     """Calls in fewer bits with new frames, in which only an arm moves: all tokens, and those that changed.
 
     Args:
@@ -220,12 +246,14 @@ def reusing(folder: Path, spec: PolicySpec, computed: int, rounds: int = 7) -> N
         spec: of the policy.
         computed: how many steps the sparse plan computes.
         rounds: that are counted, of a frame for each plan.
+        threads: of all calls.
+        clock: by which they are timed.
     """
     artifact = load_artifact(folder / "compiled")
     bits = lowered(artifact)
     plans, reused = plans_of(artifact, bits, computed), plans_of(artifact, bits, computed, REUSE)
-    whole, some = (open_policy(artifact, seed=0, plan=each["dense"]) for each in (plans, reused))
-    times, rng = Times(Arithmetic(artifact)), np.random.default_rng(1)
+    whole, some = (open_policy(artifact, threads=threads, seed=0, plan=each["dense"]) for each in (plans, reused))
+    times, rng = Times(Arithmetic(artifact), threads, clock), np.random.default_rng(1)
     obs, noise = call(spec)
     other = Noise(rng.standard_normal(noise.initial.shape, dtype=np.float32))
     still = backgrounds(obs, rng)

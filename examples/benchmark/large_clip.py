@@ -62,19 +62,21 @@ def policy() -> tuple[EncodedDenoiser, PolicySpec]:
     return EncodedDenoiser(encoder, denoiser).eval(), spec
 
 
-def eager(module: EncodedDenoiser, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
-    """A call in eager PyTorch: the actions; and the seconds, of the processor, of encoder and loop."""
+def eager(
+    module: EncodedDenoiser, spec: PolicySpec, clock: Callable[[], float] = process_time
+) -> Callable[[], tuple[np.ndarray, list[float]]]:
+    """A call in eager PyTorch: the actions; and the seconds, by ``clock``, of encoder and loop."""
     obs, noise = call(spec)
     given = {key: torch.from_numpy(value) for key, value in obs.items()}
 
     @torch.inference_mode()
     def run() -> tuple[np.ndarray, list[float]]:
-        start = process_time()
+        start = clock()
         encoded = module.encoder(given)
-        between = process_time()
+        between = clock()
         x = torch.from_numpy(noise.initial)
         for t in spec.sampler.timesteps:
             x = x + module.denoiser(x, torch.full((1,), float(t)), encoded) / STEPS
-        return x.numpy()[:, :8], [between - start, process_time() - between]
+        return x.numpy()[:, :8], [between - start, clock() - between]
 
     return run

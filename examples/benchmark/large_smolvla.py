@@ -120,21 +120,23 @@ def call(spec: PolicySpec) -> tuple[dict[str, np.ndarray], Noise]:
     return random_calls(spec, 1, seed=0)[0]
 
 
-def eager(module: nn.Module, vision: nn.Module, spec: PolicySpec) -> Callable[[], tuple[np.ndarray, list[float]]]:
-    """A call in eager PyTorch: the actions; and the seconds, of the processor, of image encoder, prefix and loop."""
+def eager(
+    module: nn.Module, vision: nn.Module, spec: PolicySpec, clock: Callable[[], float] = process_time
+) -> Callable[[], tuple[np.ndarray, list[float]]]:
+    """A call in eager PyTorch: the actions; and the seconds, by ``clock``, of image encoder, prefix and loop."""
     obs, noise = call(spec)
     given = {key: torch.from_numpy(value) for key, value in obs.items()}
     whole: Any = module
     run, took = eager_policy(module, spec), dict[nn.Module, float]()
     for part in (vision, whole.encoder):
-        part.register_forward_pre_hook(lambda one, _: took.update({one: took.get(one, 0.0) - process_time()}))
-        part.register_forward_hook(lambda one, _, __: took.update({one: took[one] + process_time()}))
+        part.register_forward_pre_hook(lambda one, _: took.update({one: took.get(one, 0.0) - clock()}))
+        part.register_forward_hook(lambda one, _, __: took.update({one: took[one] + clock()}))
 
     def timed() -> tuple[np.ndarray, list[float]]:
         took.clear()
-        start = process_time()
+        start = clock()
         sample = run(given, noise).numpy()
-        whole_call, seen, prefix = process_time() - start, took[vision], took[whole.encoder]
+        whole_call, seen, prefix = clock() - start, took[vision], took[whole.encoder]
         actions = spec.chunk.unnormalized(sample)[:, spec.chunk.start : spec.chunk.stop]
         return actions, [seen, prefix - seen, whole_call - prefix]
 

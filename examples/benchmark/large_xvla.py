@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, random_weight, write_json
-from safetensors.torch import save_file
+from large_smolvla import ACTION, CAMERAS, FEATURES, STATE, save_drawn, write_json
 
 from ttscompile.frontends.settings import Settings
 from ttscompile.policies.lerobot.florence import read_florence
@@ -59,9 +58,5 @@ def save(directory: Path) -> None:
     florence = read_florence(Settings(FLORENCE, ""), (_SIDE, _SIDE), (True,) * _VIEWS)
     numbers = {"state": 32, "time": 32, "prompts": 32, "positions": 512, "views": _VIEWS, "padding": 1}
     with torch.device("meta"):
-        shapes = XVLA(XVLAConfig(florence, layers, _CHUNK, _ACTIONS, (9, 19), **numbers)).state_dict()
-    draw = torch.Generator().manual_seed(0)
-    save_file(
-        {f"model.{name}": random_weight(name, value.shape, draw) for name, value in shapes.items()},
-        directory / "model.safetensors",
-    )
+        weights = XVLA(XVLAConfig(florence, layers, _CHUNK, _ACTIONS, (9, 19), **numbers)).state_dict()
+    save_drawn(directory / "model.safetensors", {f"model.{name}": value.shape for name, value in weights.items()})

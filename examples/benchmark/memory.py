@@ -1,6 +1,7 @@
-"""Convert a policy and print the most anonymous memory that it took, in bytes.
+"""Convert a policy, or load an artifact and answer a call: print the most anonymous memory that it took, in bytes.
 
     python examples/benchmark/memory.py POLICY OUT [PRECISION]
+    python examples/benchmark/memory.py ARTIFACT
 
 Pages of mapped files are not counted: the system takes them back when others need the room.
 """
@@ -41,16 +42,36 @@ def watched() -> Iterator[list[int]]:
         watcher.join()
 
 
-def main() -> None:
-    """Print the bytes above those before the conversion."""
+def convert(policy: str, out: str, precision: str = "fp32") -> int:
+    """The bytes above those before the conversion."""
     import onnxruntime  # noqa: F401 - what is imported on the way is no part of the conversion
     import torch  # noqa: F401
 
     import ttscompile.driver
 
     with watched() as most:
-        ttscompile.driver.convert(*sys.argv[1:3], precision=(sys.argv[3:] or ["fp32"])[0])
-    print(most[0])
+        ttscompile.driver.convert(policy, out, precision=precision)
+    return most[0]
+
+
+def answer(artifact: str) -> int:
+    """The bytes above those before it was loaded, after two calls with its default plan."""
+    import onnxruntime  # noqa: F401
+
+    import ttscompile
+    from ttscompile.artifact.load import load_artifact
+    from ttscompile.runtimes.random_calls import random_calls
+
+    with watched() as most:
+        policy = ttscompile.load(artifact)
+        for obs, noise in random_calls(load_artifact(artifact).manifest.spec, 2, seed=0):
+            policy.predict_action(obs, noise=noise)
+    return most[0]
+
+
+def main() -> None:
+    """Print the bytes."""
+    print(answer(sys.argv[1]) if len(sys.argv) == 2 else convert(*sys.argv[1:]))
 
 
 if __name__ == "__main__":

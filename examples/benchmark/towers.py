@@ -13,9 +13,10 @@ import json
 import statistics
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from time import process_time
+from typing import Any
 
 import numpy as np
 import onnx
@@ -114,7 +115,13 @@ def profile(model: ModelProto, weights: dict[str, np.ndarray], given: dict[str, 
         one = session(model, weights, Path(folder) / "profile")
         for _ in range(rounds):
             one.run(None, {value.name: given[value.name] for value in one.get_inputs()})
-        events = json.loads(Path(one.end_profiling()).read_bytes())
+        took = by_operation(json.loads(Path(one.end_profiling()).read_bytes()))
+    shares = [(operation, each / took.total()) for operation, each in took.most_common()]
+    return "".join(f"\n  {share:6.1%}  {operation}" for operation, share in shares if share >= 0.01)
+
+
+def by_operation(events: Iterable[Mapping[str, Any]]) -> Counter[str]:
+    """Microseconds of the operations of a profile; what runs inside of attention is a part of its ``Scan``."""
     nodes = [each for each in events if each["name"].endswith("_kernel_time")]
     attending = [(each["ts"], each["ts"] + each["dur"]) for each in nodes if each["args"]["op_name"] == HEADS]
     took: Counter[str] = Counter()
@@ -122,8 +129,7 @@ def profile(model: ModelProto, weights: dict[str, np.ndarray], given: dict[str, 
         operation = each["args"]["op_name"]
         if operation == HEADS or not any(start <= each["ts"] < end for start, end in attending):
             took[operation] += each["dur"]
-    shares = [(operation, each / took.total()) for operation, each in took.most_common()]
-    return "".join(f"\n  {share:6.1%}  {operation}" for operation, share in shares if share >= 0.01)
+    return took
 
 
 def main() -> None:
