@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from equal_time import Pace, largest
+
 from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.budget import cells_of, goal_of
 from ttscompile.calibration.calls import Calls, digest_of
@@ -19,6 +21,7 @@ from ttscompile.calibration.runner import Runner
 from ttscompile.calibration.schedule import open_search, search_plan
 from ttscompile.calibration.state import StateFile
 from ttscompile.calibration.strategies import strategy_of
+from ttscompile.calibration.strategy import Strategy
 from ttscompile.calibration.targets import runner_arguments, runner_elsewhere
 from ttscompile.calibration.task import Found, Task
 from ttscompile.calibration.trials import HELD_OUT, Trials
@@ -68,6 +71,9 @@ class ComparisonState(StateFile):
 class Searches:
     """What is known before a search begins, and what it finds.
 
+    Attributes:
+        shares: of a pace that plans take, by pace, series and cells.
+
     Args:
         state: of the comparison.
         shape: K and number of blocks.
@@ -82,6 +88,7 @@ class Searches:
             self._told: dict[str, Any] = state.progress.setdefault("searches", {})
             if not isinstance(self._told, dict) or not all(isinstance(each, dict) for each in self._told.values()):
                 raise ValueError("expected searches by name")
+            self.shares: dict[str, float] = state.progress.setdefault("shares", {})
 
     def known(self, strategy: str, cells: int) -> Outcome | None:
         """What a search found before; None if it was not done."""
@@ -103,6 +110,10 @@ class Searches:
                 )
         return outcome
 
+    def known_of(self, wish: Wish) -> Outcome:
+        """The same, of a search that was done."""
+        return self.known(*wish) or {}
+
     def keep(self, strategy: str, cells: int, outcome: Outcome) -> None:
         """Keep what a search found."""
         key, told = f"{strategy} {cells}", dict[str, Any]()
@@ -115,6 +126,10 @@ class Searches:
             correction = {} if found.correction is None else {name: getattr(found.correction, name) for name in _FIELDS}
             self._state.put(f"{key}/{series}", {"schedule": found.schedule, **correction})
         self._told[key] = told
+        self.save()
+
+    def save(self) -> None:
+        """Keep all of it."""
         self._state.save()
 
 
@@ -132,6 +147,7 @@ class Searching:
         intervals: of a search, at most; None for the strategy's own number.
         max_minutes: of a search, about: what it has found by then takes part, and a warning says so. A strategy that
             has no plan within the budget by then is left out.
+        paces: in place of sparsities: of each strategy the largest budget takes part whose plan keeps the pace.
         correct: let the plans of strategies that fit no correction take part a second time, with one that is fitted to
             them, where that is better. Their series are called ``STRATEGY, corrected``.
         ray: address of a Ray cluster that answers the dense calls and does the searches, or ``local``, see
@@ -149,12 +165,15 @@ class Searching:
         learned: int = LEARNED,
         intervals: int | None = None,
         max_minutes: float = 3.0,
+        paces: Callable[[Trials], Sequence[Pace]] | None = None,
         correct: bool = False,
         ray: str | None = None,
         resume: bool = False,
     ) -> None:
         self._path, self._ray, self._resume = path, ray, resume
         self._strategies, self._sparsities = [strategy_of(name) for name in strategies], sparsities
+        self._paces = paces or (lambda trials: ())
+        self._timed = paces is not None
         self._learned, self._minutes, self._how = learned, max_minutes, (intervals, 60 * max_minutes, correct)
         self._state: ComparisonState | None = None
         self.plans: dict[str, Plan] = {}
@@ -189,41 +208,51 @@ class Searching:
             if not (self._resume and state.load()):
                 state.remove()
             searches = Searches(state, (manifest.steps, len(manifest.blocks)))
-            wished = [(one.name, sparsity) for one in self._strategies for sparsity in budgets]
-            names = {(strategy, budgets[sparsity]): f"{strategy} {sparsity:g}" for strategy, sparsity in wished}
-            missing = [wish for wish in names if searches.known(*wish) is None]
-            if missing:
-                progress("dense calls to learn from", 0, 1)
-                task = _of_schedules(trials.runner, trials.calls, trials.seed)
-                given = *runner_arguments(trials.runner), trials.calls, trials.seed, self._how
-                outcomes = pool.map(Work(partial(_searched, task, self._how), _searched_elsewhere, given), missing)
-                for number, wish in enumerate(missing, len(names) - len(missing)):
-                    progress(f"search: {names[wish]}", number, len(names))
-                    searches.keep(*wish, next(outcomes))
-                progress("search", len(names), len(names))
+            search = partial(self._search, trials, searches, progress)
+            wished = [
+                ((one.name, cells), f"{sparsity:g}") for one in self._strategies for sparsity, cells in budgets.items()
+            ]
+            search(dict(wished))
             trials.sample(HELD_OUT)  # answered by the pool, and kept
+            found = [(series, name, one) for wish, name in wished for series, one in searches.known_of(wish).items()]
+            for pace in self._paces(trials):
+                for strategy in self._strategies:
+                    found += _at_pace(pace, strategy, searches, search)
         entrants, skipped, cut = list[Entrant](), dict[str, str](), list[str]()
-        for strategy, sparsity in wished:
-            for series, found in (searches.known(strategy, budgets[sparsity]) or {}).items():
-                if isinstance(found, str):
-                    skipped[f"{series} {sparsity:g}"] = found
-                    continue
-                plan, short = found
-                made = replace(trials.base, cells=plan.schedule, correction=plan.correction)
-                entrants.append(Entrant(series, f"{sparsity:g}", trials, made))
-                self.plans[f"{series.replace(', ', '-')}-{sparsity:g}"] = made
-                cut += [f"{series} {sparsity:g}"] * short
-        warnings = [f"nothing was kept for --resume: {state.warning}."] if missing and state.warning else []
+        for series, name, one in found:
+            if isinstance(one, str):
+                skipped[f"{series} {name}"] = one
+                continue
+            plan, short = one
+            made = replace(trials.base, cells=plan.schedule, correction=plan.correction)
+            entrants.append(Entrant(series, name, trials, made))
+            self.plans[f"{series.replace(', ', '-')}-{name}"] = made
+            cut += [f"{series} {name}"] * short
+        warnings = [f"nothing was kept for --resume: {state.warning}."] if found and state.warning else []
         if cut:
             limit = f"the limit of {self._minutes:g} minutes"
             warnings.append(f"{limit} cut the search short of {', '.join(cut)}: see --max-minutes.")
         warnings += self._remarks(manifest.steps, FEATURES * manifest.spec.sample[0])
         return Joining(entrants, skipped, warnings)
 
+    def _search(self, trials: Trials, searches: Searches, progress: Progress, names: Mapping[Wish, str]) -> None:
+        """Have those of these searches done that are not known."""
+        missing = [wish for wish in names if searches.known(*wish) is None]
+        if not missing:
+            return
+        progress("dense calls to learn from", 0, 1)
+        task = _of_schedules(trials.runner, trials.calls, trials.seed)
+        given = *runner_arguments(trials.runner), trials.calls, trials.seed, self._how
+        outcomes = trials.pool.map(Work(partial(_searched, task, self._how), _searched_elsewhere, given), missing)
+        for number, wish in enumerate(missing, len(names) - len(missing)):
+            progress(f"search: {wish[0]} {names[wish]}", number, len(names))
+            searches.keep(*wish, next(outcomes))
+        progress("search", len(names), len(names))
+
     def _remarks(self, steps: int, features: int) -> list[str]:
         """What a reader has to know of the strategies that take part."""
         found = []
-        if self._strategies and not self._sparsities:
+        if self._strategies and not (self._sparsities or self._timed):
             found.append(f"no strategy takes part: no share of the cells was given for K = {steps}.")
         if pruning := [one.name for one in self._strategies if one.uses_pruner]:
             found.append(
@@ -258,6 +287,41 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
     clock = Clock(seconds)
     found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
     return found, stopped == "time limit"
+
+
+def _at_pace(
+    pace: Pace, strategy: Strategy, searches: Searches, search: Callable[[Mapping[Wish, str]], None]
+) -> list[tuple[str, str, tuple[Found, bool] | str]]:
+    """Of each series of a strategy what keeps the pace with the largest budget, or why there is nothing."""
+    model, base = pace.trials.runner.model, pace.trials.base
+    kept: list[tuple[str, str, tuple[Found, bool] | str]] = []
+
+    def found(series: str, cells: int) -> tuple[Found, bool] | str:
+        search({(strategy.name, cells): f"of {cells} cells"})
+        return searches.known_of((strategy.name, cells)).get(series, "it finds nothing with fewer cells.")
+
+    def share(series: str, cells: int) -> float:
+        one, key = found(series, cells), f"{pace.name} {series} {cells}"
+        if isinstance(one, str):
+            return math.inf
+        if key not in searches.shares:
+            plan = replace(base, cells=one[0].schedule, correction=one[0].correction)
+            searches.shares[key] = pace.share(plan)
+            searches.save()
+        return searches.shares[key]
+
+    search({(strategy.name, pace.cells): f"of {pace.cells} cells"})
+    for series, most in searches.known_of((strategy.name, pace.cells)).items():
+        if isinstance(most, str):  # nor is there anything for fewer cells
+            kept.append((series, pace.name, most))
+            continue
+        least = strategy.least(model.steps, model.blocks)
+        near = model.blocks // (1 if strategy.fits_correction else 2)  # it computes whole steps alone
+        budget, tried = largest(partial(share, series), least, pace.cells, near)
+        fewest = min(tried)
+        told = f"with {fewest} cells a call takes {tried[fewest]:.3g} times as long as it may."
+        kept.append((series, pace.name, told if budget is None else found(series, budget)))
+    return kept
 
 
 def _searched(task: Task, how: How, wish: Wish) -> Outcome:

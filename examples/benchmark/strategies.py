@@ -1,6 +1,9 @@
-"""What accuracy costs with published strategies: each finds a plan for each share of reused cells, now.
+"""What accuracy costs with published strategies: each finds a plan for each share of reused cells, or each time, now.
 
     python examples/benchmark/strategies.py compiled/ -t calls.npz --strategies tts,bac,interval --plot frontier.png
+
+With ``--latency-ms`` or ``--even-steps`` each gets the largest budget, in its own cells, whose plan keeps the time
+(``equal_time.py``): plans of as many cells do not take equally long.
 
 Their plans take part beside those of the artifact, and of other artifacts, in what ``ttscompile bench -t`` measures:
 held-out action error and latency. Until the end, what searches found is kept in a file beside the artifact's own, for
@@ -14,11 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import click
+from commands import numbers
+from equal_time import Pace, pace_of
 from searches import LEARNED, Searching
 
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable, update_plans
 from ttscompile.calibration.strategies import NAMES
+from ttscompile.calibration.trials import Trials
 from ttscompile.cli.contestants import compare, draw_comparison, print_comparison
 from ttscompile.cli.options import (
     MOST_SEED,
@@ -46,6 +52,14 @@ def default_sparsities(steps: int) -> tuple[float, ...]:
     return (0.9, 0.95, 0.98) if steps >= 50 else tuple(1 - left / steps for left in (5, 3, 2) if left < steps)
 
 
+def _milliseconds(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...]:
+    try:
+        found = tuple(float(part) for part in (value or "").split(",") if part.strip())
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; expected milliseconds, such as 20,40.") from error
+    return found
+
+
 def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...] | None:
     if value is None:
         return None
@@ -68,6 +82,18 @@ def _sparsities(_: click.Context, __: click.Parameter, value: str | None) -> tup
     callback=_sparsities,
     help="Find a plan for each of these shares of reused cells; 0.9,0.95,0.98 if not given, or, of less than 50 steps,"
     " what leaves five, three and two.",
+)
+@click.option(
+    "--latency-ms",
+    type=TEXT,
+    callback=_milliseconds,
+    help="In place of sparsities: give each strategy the most cells with which its calls take so many milliseconds.",
+)
+@click.option(
+    "--even-steps",
+    type=TEXT,
+    callback=numbers,
+    help="The same, and the time is what so many evenly spaced whole steps take, in turn with each plan.",
 )
 @click.option(
     "--with", "others", multiple=True, type=PATH, metavar="DIR...", help="Let these artifacts take part, too."
@@ -105,6 +131,8 @@ def main(
     sources: Sources,
     strategies: tuple[str, ...],
     sparsities: tuple[float, ...] | None,
+    latency_ms: tuple[float, ...],
+    even_steps: tuple[int, ...] | None,
     others: tuple[Path, ...],
     calls: int,
     learned_calls: int,
@@ -122,8 +150,18 @@ def main(
             raise click.BadParameter(f"{into} takes part. Give another folder for the plans that are found.")
     artifacts = {str(path): load_artifact(path) for path in (directory, *others)}
     of = artifacts[str(directory)].manifest
-    wished = (sparsities or default_sparsities(of.steps)) if strategies else ()
-    joining = Searching(directory, strategies, wished, learned=learned_calls, **search)
+    timed = bool(latency_ms or even_steps)
+    if timed and sparsities:
+        raise click.BadParameter("give either sparsities or a time.")
+    if wrong := [count for count in even_steps or () if count >= of.steps]:
+        raise click.BadParameter(f"{wrong[0]} of {of.steps} steps are all there are.")
+
+    def paces(trials: Trials) -> list[Pace]:
+        given = [pace_of(trials, one, threads) for one in latency_ms]
+        return given + [Pace(trials, count, threads, f"as-{count}") for count in even_steps or ()]
+
+    wished = () if timed or not strategies else sparsities or default_sparsities(of.steps)
+    joining = Searching(directory, strategies, wished, learned=learned_calls, paces=paces if timed else None, **search)
     how: dict[str, Any] = {"observation": sources, "calls": calls, "threads": threads, "seed": seed}
     found = compare(directory, artifacts, others, trajectories, joining=joining, **how)
     if as_json:
