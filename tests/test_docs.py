@@ -67,7 +67,7 @@ def folder(whole_layer_checkpoint: Path, tmp_path_factory: pytest.TempPathFactor
 def ttscompile_prints(words: list[str]) -> str:
     """What the command line prints; it must succeed. A search of a moment finds a doubtful plan, which is told of."""
     result = CliRunner().invoke(main, words, prog_name="ttscompile", catch_exceptions=False)
-    told = {"calibrate": "scores may fall", "verify": "FAILED at sparsity error"}
+    told = {"calibrate": "scores may fall", "verify": "FAILED at distance"}
     doubtful = words[0] in told and told[words[0]] in result.output
     assert result.exit_code == doubtful, f"{' '.join(words)}: {result.output}"
     return result.output
@@ -254,7 +254,7 @@ def test_the_reference_shows_every_public_name() -> None:
     assert [name for name in names if id(getattr(ttscompile, name)) not in shown] == []
 
 
-@pytest.mark.parametrize("name", ["distance", "lattice"])
+@pytest.mark.parametrize("name", ["distance", "equal_time", "lattice"])
 def test_a_picture_is_drawn_by_its_script(tmp_path: Path, name: str) -> None:
     from PIL import Image
 

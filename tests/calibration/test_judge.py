@@ -14,7 +14,7 @@ from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.arguments import CallLimits
 from ttscompile.calibration.calls import load_episodes
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.judge import Gaps, Score, _Answers, further, judge, timed
+from ttscompile.calibration.judge import Score, _Answers, further, judge, timed
 from ttscompile.calibration.kept import holding
 from ttscompile.calibration.proposer import Proposal
 from ttscompile.calibration.state import StateFile
@@ -32,7 +32,7 @@ from ttscompile.calibration.trials import (
 from ttscompile.core.lattice import dense_plan, uniform_plan, whole_steps_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError
-from ttscompile.measure.points import pairs, rooted
+from ttscompile.measure.points import Gaps, pairs, rooted
 from ttscompile.samplers.flow import flow_matching_table
 
 from . import policies

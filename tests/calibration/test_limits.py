@@ -18,7 +18,7 @@ from ttscompile.artifact.view import view_of
 from ttscompile.calibration import arguments, targets
 from ttscompile.calibration.arguments import MOST_CALLS, MOST_LEARNED, calls_to_learn_from
 from ttscompile.calibration.budget import _pruner_ms
-from ttscompile.calibration.calls import LARGEST, Actions, split_episodes
+from ttscompile.calibration.calls import Actions, split_episodes
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.compare import compare
 from ttscompile.calibration.pipeline import calibrate
@@ -33,6 +33,7 @@ from ttscompile.calibration.trials import ANSWERED_BY
 from ttscompile.core.lattice import Source, uniform_plan
 from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.measure.points import LARGEST
 from ttscompile.pool import Here
 from ttscompile.runtimes.reference.model import Contexts, ReferenceModel
 from ttscompile.runtimes.runtime import Runtime

@@ -18,6 +18,7 @@ from ttscompile.cli.bench import NONE_KEEPS, choosable, choose_again
 from ttscompile.core.lattice import uniform_plan
 from ttscompile.errors import ArtifactError
 from ttscompile.measure.points import fastest
+from ttscompile.report import facts
 from ttscompile.report.timing import Measurement
 
 PLANS = {"schedule": 0.08, "safe": 0.03, "fast": 0.2, "uniform": 0.01, "far": 0.4}
@@ -68,8 +69,35 @@ def test_another_machine_has_another_default(built: Path) -> None:
     record = after.manifest.calibration
     assert record is not None
     assert record["default_plan"] == "safe"
-    assert record["chosen_on"].endswith("1 thread: schedule 4 ms, safe 2 ms, fast 1 ms")
-    assert record["chosen_on"].startswith(record["timed_on"])
+    assert record["chosen_by"] == "schedule 4 ms, safe 2 ms, fast 1 ms"
+    assert record["timed_on"].endswith(", 1 thread")
+
+
+def test_spare_plans_are_chosen_among_and_told_of_once(toy_compiled: Path, tmp_path: Path) -> None:
+    """What a build keeps for other machines is in no table, until it is the default."""
+    scores = {name: score(PLANS[name]) for name in ("schedule", "fast")} | {"original.3": score(0.02)}
+    tried = {
+        "told": "3 of 5",
+        "distance": 0.02,
+        "interval": [0.0, 0.02],
+        "milliseconds": 1.0,
+        "worst": 2.0,
+        "near": True,
+    }
+    rows = [{**tried, "name": name, "near": True, "spare": name == "original.3"} for name in scores]
+    directory = made(toy_compiled, tmp_path, scores, frontier=rows)
+
+    def tables() -> tuple[set[str], str]:
+        artifact = load_artifact(directory)
+        shown = " ".join(facts.told_spare(artifact.manifest))
+        return {row[0] for row in facts.plan_table(artifact).rows}, shown
+
+    assert tables()[0] == {"dense", "schedule (default)", "fast"} and "it has 'original.3': " in tables()[1]
+    assert "table: correction of original.3" not in done("inspect", directory).stdout
+    told, _ = again(directory, timed(**{"schedule": 4.0, "fast": 3.0, "original.3": 2.0}))
+    assert told is not None and told.startswith("The default was 'schedule', and is 'original.3'.")
+    assert "original.3 (default)" in tables()[0] and tables()[1] == ""
+    assert ttscompile.load(directory).info.default_plan == "original.3"
 
 
 def test_the_same_times_choose_the_same(built: Path) -> None:
@@ -165,7 +193,7 @@ def test_the_command_times_what_can_be_chosen(built: Path) -> None:
     document = as_json("bench", built, "--calls", 2, "--choose")
     assert [one["plan"] for one in document["contestants"]] == ["dense", "schedule", "safe", "fast"]
     assert document["chosen"].split("'")[-2] == load_artifact(built).manifest.default_plan in ("schedule", "safe")
-    assert "chosen on" in done("inspect", built).stdout
+    assert "chosen by" in done("inspect", built).stdout
     assert ttscompile.load(built).info.identity == load_artifact(built).manifest.identity
 
 

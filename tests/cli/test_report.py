@@ -24,7 +24,7 @@ from ttscompile.measure.units import plain
 from ttscompile.report import Extras, build, facts, pictures, render, verified
 from ttscompile.report.page import Table
 from ttscompile.report.timing import Measurement
-from ttscompile.report.usage import Course, run_episode
+from ttscompile.report.usage import run_episode
 from ttscompile.runtimes import open_runtime
 from ttscompile.runtimes.policy import CompiledPolicy
 from ttscompile.trajectories import Episode
@@ -145,14 +145,16 @@ def test_the_page_says_what_was_found(page: str, calibrated: Path) -> None:
         "ms a call",
         "on the frontier",
         "Could not be run",
+        "Plan 'schedule' is",
+        "calls.npz[",
+        "in the middle",
         "K = 5 denoising steps",
         "at most 80.0% of the cells",
         "the first call after reset() falls back",
     ):
         assert expected in text, expected
-    # 2 schedules, the episode's mean and course, latency, frontier, calibration
     drawn = pictures_of(Reader(page))
-    assert len(drawn) == 7
+    assert len(drawn) == 5, "frontier, 2 schedules, furthest calls, latency"
     assert all(len(set(map(tuple, picture[::3, ::3].reshape(-1, 3)))) > 3 for picture in drawn), "a picture is empty"
 
 
@@ -249,19 +251,6 @@ def test_a_bar_is_as_long_as_the_call_that_is_written_beside_it() -> None:
     assert grey / orange == pytest.approx(5 / 4, rel=0.05)
 
 
-def test_names_of_plans_that_are_alike_do_not_cover_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And an axis of blocks has whole numbers, of one block, too."""
-    drawn: list[Any] = []
-    monkeypatch.setattr(pictures, "encoded", drawn.append)
-    pictures.plans_picture({"schedule": SCORE, "fast": {**SCORE, "error": 1.001 * SCORE["error"]}})
-    drawn[0].canvas.draw()
-    first, second = (text.get_window_extent() for text in drawn[0].axes[0].texts)
-    assert not first.overlaps(second)
-    unread: Any = None
-    pictures.shares_picture(Course("episode", np.zeros((2, 5, 1), np.int8), (0, 0), unread, {}))
-    assert [t for t in drawn[1].axes[0].get_yticks() if -0.5 <= t <= 0.5] == [0]
-
-
 def test_an_artifact_that_is_zipped_is_called_by_its_own_name(toy_compiled: Path, tmp_path: Path) -> None:
     path = shutil.make_archive(str(tmp_path / "zipped"), "zip", toy_compiled)
     assert json.loads(run(path, "--json").stdout)["path"] == path
@@ -274,6 +263,7 @@ def test_an_artifact_that_is_not_calibrated(toy_compiled: Path, tmp_path: Path) 
     assert "Not run for this page" in text
     assert "Not calibrated: every call is dense" in text
     assert "calibrate the artifact first" in text
+    assert "in which a plan is furthest from the original: ttscompile inspect DIR -o page.html -t calls.npz" in text
 
 
 def test_a_report_replaces_another_only_when_it_is_whole(
@@ -296,16 +286,10 @@ def test_bad_input_is_one_message(calibrated: Path, tmp_path: Path) -> None:
     assert (result.exit_code, "not an artifact" in result.stderr) == (2, True)
 
 
-def test_shares_of_an_episode_are_counted_by_hand(calibrated: Path) -> None:
+def test_what_an_episode_executed_is_counted_by_hand(calibrated: Path) -> None:
     policy = ttscompile.load(calibrated, seed=0, plan="fast")
     course = run_episode(policy, Episode("one", {"obs": np.zeros((4, 2), np.float32)}))
     assert course.legalised == (20, 20, 20, 20), "nothing was ever computed there, so all fall back to TIMESTEP"
-    read = course.plans.copy()
-    read[1:, 1:] = Source.ROLLOUT
-    shares = replace(course, plans=read).shares()
-    assert shares[Source.COMPUTE, 0].tolist() == [1.0] * 5
-    assert shares[Source.TIMESTEP, 1:].min() == shares[Source.TIMESTEP, 1:].max() == 0.25
-    assert shares[Source.ROLLOUT, 1:].min() == shares[Source.ROLLOUT, 1:].max() == 0.75
     np.testing.assert_allclose(course.sparsity, 0.8)
 
 

@@ -45,6 +45,9 @@ def test_a_camera_without_a_new_picture_has_no_computed_patch(policy: CompiledPo
     # The first window has two pictures of the left camera, of which the newer one differs by a patch.
     counts = [[np.count_nonzero(one.computed) for one in each] for each in course.seen.values()]
     assert counts == [[4, 36], *[[4, 0]] * (SEEN_CALLS - 1)]
+    works = [[one.work for one in each] for each in course.seen.values()]
+    assert (works[0][1].first, works[0][1].changed) == (37, 0), "the first picture of its camera, and a class token"
+    assert all(left.changed > 0 == left.first and left.computed > 4 for left, _ in works[1:]), "and without a patch"
     assert 0 < course.frames.tokens < course.frames.of
     assert course.frames.forward == 0, "nothing else changed"
 
@@ -53,7 +56,7 @@ def test_the_page_shows_it(once: Once, policy: CompiledPolicy) -> None:
     artifact = load_artifact(cameras.compiled_tokens(once) / "artifact")
     page = build(artifact, policy, Extras(episode(), calls=1))
     (section,) = (one for one in page.sections if one.title == "Episode")
-    _, shown = section.pictures
+    (shown,) = section.pictures
     work = run_episode(policy, episode()).frames
     assert shown.caption.startswith(f"{work.tokens} of {work.of} tokens of the image encoders were computed")
     drawn = np.asarray(Image.open(BytesIO(shown.png)).convert("RGB")).astype(int)

@@ -43,7 +43,7 @@ def test_a_broken_one_gives_status_1_and_says_where_and_what_to_do(artifact: Pat
     assert "FAILED at block (step 0, block 3)" in result.stdout
     assert "Convert the checkpoint again" in result.stdout
     assert "What fails above it may only follow from it: evaluation, dense call" in result.stdout
-    assert "warning: sparsity error was skipped: " in result.stderr
+    assert "warning: distance was skipped: " in result.stderr
 
 
 def test_a_damaged_one_gives_status_1(artifact: Path) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..core.spec import PolicySpec
 from ..core.tokenizer import ReadTokenizer
 from ..errors import CalibrationError
+from ..measure.points import LARGEST
 from ..runtimes.inpainting import Known
 from ..runtimes.random_calls import Observation, normalized
 from ..runtimes.reference.model import Contexts, ReferenceModel
@@ -23,10 +24,6 @@ from ..trajectories.fits import check_ranges
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float32]
-
-LARGEST = 1e30
-"""Error of actions that are not numbers, or off by more: finite, so that means and comparisons of plans mean something,
-and a record can hold them."""
 
 FRACTION = 0.25
 """Share of the episodes that plans are judged on where nothing else is asked for: who splits with the seed of a

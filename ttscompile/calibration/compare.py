@@ -17,13 +17,17 @@ from ..artifact.load import Artifact, load_artifact
 from ..core.coercion import integer
 from ..core.plan import DENSE, Plan
 from ..errors import CalibrationError
-from ..measure.points import Comparison, FarCall, MeasuredPoint, pairs, rooted
+from ..measure.points import Comparison, FarCall, JudgedPlan, MeasuredPoint, pairs, rooted, signed_root
 from ..runtimes.open import require_able
+from ..trajectories.episodes import Episode
 from .calls import digest_of, load_episodes
 from .judge import Score, judge, other_noise, timed
-from .progress import Progress
+from .progress import Bar, Progress
 from .state import StateFile
 from .trials import Trials
+
+FURTHEST, LOOKED_AT = 3, 16
+"""Calls of a plan that are shown since they are furthest; and among how many a page looks for them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +131,6 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
             distance=score.distance,
             interval=score.interval,
             error=score.error,
-            error_p90=score.error_p90,
             latency_ms=took.median,
             quartiles_ms=took.quartiles,
             sparsity=score.sparsity,
@@ -140,28 +143,41 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
 
 
 def _details(trials: Trials, score: Score) -> dict[str, Any]:
-    """``by_number``, ``errors`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
-    spec, sample = trials.artifact.manifest.spec, trials.held_out
-    x, y = score.answers, spec.chunk.executed(sample.answers)
+    """``by_number`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
+    chunk = trials.artifact.manifest.spec.chunk
+    x, y = score.answers, chunk.executed(trials.held_out.answers)
     assert x is not None  # ``judge`` made the score
-    each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(spec.chunk.action_dim)]
-    h, far = pairs(*(one.reshape(*one.shape[:2], -1).astype(np.float64) for one in (x, y)))
-    errors = (np.abs(x - y).mean((0, 1)) / spec.chunk.scale).mean(0)
-    furthest = []
-    for n in np.argsort(h)[:-4:-1].tolist():  # three are shown
+    each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(chunk.action_dim)]
+    by_number = tuple(rooted(float(gap.mean()), float(unit.mean())) for gap, unit in each)
+    return {"by_number": by_number, "furthest": _shown(trials, score)[:-1]}
+
+
+def _shown(trials: Trials, score: Score) -> tuple[FarCall, ...]:
+    """The ``FURTHEST`` held-out calls, and last the one in the middle."""
+    spec, sample, made = trials.artifact.manifest.spec, trials.held_out, list[FarCall]()
+    x, y, gaps = score.answers, spec.chunk.executed(sample.answers), score.gaps
+    assert x is not None and gaps is not None
+    order = np.argsort(-gaps.h).tolist()
+    for n in (*order[:FURTHEST], order[len(order) // 2]):
         episode, row = int(sample.episodes[n]), int(sample.calls[n, 1])
         seen = trials.episodes[episode].observations
         cameras = {key: seen[key][row] for key, one in spec.observations.items() if one.image}
         newest = {key: frame.reshape(-1, *frame.shape[-3:])[-1] for key, frame in cameras.items()}
         reference = spec.chunk.reference({key: frames[[row]] for key, frames in seen.items()})
-        both = np.stack([y[n, 0], x[n, 0]]).astype(np.float32)
-        actions = spec.chunk.unnormalized(both, reference, spec.chunk.start)
-        furthest.append(FarCall(episode, row, rooted(float(h[n]), float(far.mean())), newest, actions))
-    return {
-        "by_number": tuple(rooted(float(gap.mean()), float(unit.mean())) for gap, unit in each),
-        "errors": () if score.error is None else tuple(errors.tolist()),
-        "furthest": tuple(furthest),
-    }
+        both = np.concatenate([y[n], x[n]]).astype(np.float32)
+        actions = spec.chunk.unnormalized(both, reference, spec.chunk.start).reshape(2, sample.draws, *both.shape[1:])
+        off = np.argsort(-np.abs(x[n, 0] - y[n, 0]).mean(0)).tolist()
+        name, apart = trials.episodes[episode].name, float(signed_root(gaps.h[n]))
+        made.append(FarCall(episode, name, row, apart, newest, actions, tuple(off)))
+    return tuple(made)
+
+
+def judge_plan(artifact: Artifact, episodes: Sequence[Episode], name: str, bar: Bar, seed: int = 0) -> JudgedPlan:
+    """Judge one plan on held-out calls of at least two episodes, and look at the calls where it is furthest."""
+    trials = Trials.of(artifact, episodes, StateFile(None, {}), seed=seed, observations=LOOKED_AT, bar=bar)
+    score = judge(trials, artifact.plan(name))
+    assert score.gaps is not None
+    return JudgedPlan(name, score.gaps, _shown(trials, score), tuple(_warnings(trials, {})))
 
 
 def _require_same_policy(artifact: Artifact, other: Artifact, name: str) -> None:

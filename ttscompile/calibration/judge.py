@@ -14,7 +14,7 @@ noise changes nothing the unit is another one (``measure.points.pairs``).
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -26,83 +26,18 @@ from ..core.lattice import Source, plan_flops, sparsity
 from ..core.plan import ORIGINAL, Plan
 from ..core.spec import FloatArray, PolicySpec
 from ..errors import CalibrationError
-from ..measure.points import SAME, Numbers, pairs, rooted, signed_root
+from ..measure.points import LARGEST, SAME, Gaps, Numbers, signed_root
 from ..measure.timer import Timer, Times
 from ..runtimes.open import open_runtime
 from ..runtimes.report import CallReport
 from ..runtimes.runtime import Runtime
-from .calls import LARGEST, IntArray
 from .trials import ELSEWHERE, HELD_OUT, Sample, Trials
 
 STREAMS = 32
 """Calls that are computed together, at most."""
 
-RESAMPLED = 1000
-"""Samples of the bootstrap."""
-
-STUDENT = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
-"""How many standard errors 95 % limits are away, for 1, 2, 3... degrees of freedom; ``_wider`` has those after them."""
-
 WARM_UP, TIMED = 2, 16
 """Rounds of timed calls that are not counted, and that are."""
-
-
-@dataclass(frozen=True, eq=False)
-class Gaps:
-    """How far a plan is off, call by call.
-
-    Attributes:
-        h: ``[N]``, over the mean of |y_i - y_j|.
-        episodes: ``[N]``, of which each call is.
-    """
-
-    h: Numbers
-    episodes: IntArray
-
-    @cached_property
-    def by_episode(self) -> list[Numbers]:
-        """Of each episode the h of its calls."""
-        return [self.h[self.episodes == one] for one in np.unique(self.episodes)]
-
-    @property
-    def mean(self) -> float:
-        """Over episodes, each of which counts alike."""
-        return float(np.mean([one.mean() for one in self.by_episode]))
-
-    @property
-    def clustered(self) -> bool:
-        """Whether episodes differ by more than the differences of their calls explain, as an analysis of variance asks.
-
-        Then the calls of an episode tell no more than one of them. Else they are as good as episodes, and there are
-        more of them: a bootstrap of four episodes covers the distance in 81 of 100 trials where it says 95.
-        """
-        groups, spare = self.by_episode, len(self.h) - len(self.by_episode)
-        if len(groups) < 2 or not spare:
-            return False
-        between = sum(len(one) * (one.mean() - self.h.mean()) ** 2 for one in groups) / (len(groups) - 1)
-        return bool(between > sum(((one - one.mean()) ** 2).sum() for one in groups) / spare)
-
-    def resampled(self, clustered: bool) -> Numbers:
-        """Means of h with calls drawn anew, or whole episodes; the same draws for equally many.
-
-        They are spread around the mean as Student's limits are, so that few calls tell little, and one nothing.
-        """
-        groups = self.by_episode
-        if clustered:
-            units = np.array([one.mean() for one in groups])
-        else:  # so that their mean is that of episodes
-            units = np.concatenate([one * len(self.h) / len(groups) / len(one) for one in groups])
-        drawn = np.random.default_rng(0).integers(0, len(units), (RESAMPLED, len(units)))
-        if len(units) == 1:
-            return np.where(np.arange(RESAMPLED) % 2, -LARGEST, LARGEST)
-        return np.asarray(self.mean + _wider(len(units)) * (units[drawn].mean(1) - self.mean))
-
-
-def _wider(count: int) -> float:
-    """By how much Student's limits are wider than a bootstrap's."""
-    spare = count - 1
-    limit = STUDENT[spare - 1] if spare <= len(STUDENT) else 1.96 + 2.4 / spare + 3 / spare**2
-    return float(limit / 1.96 * np.sqrt(count / spare))
 
 
 @dataclass(frozen=True)
@@ -323,9 +258,7 @@ def _scored(
     spec, flops, answers = trials.artifact.manifest.spec, trials.artifact.manifest.flops, sample.answers
     x, y = (spec.chunk.executed(one).astype(np.float64).reshape(*one.shape[:2], -1) for one in (made, answers))
     x = np.nan_to_num(x, nan=LARGEST, posinf=LARGEST, neginf=-LARGEST).clip(-LARGEST, LARGEST)
-    h, apart = pairs(x, y)
-    gaps = Gaps(h / max(float(apart.mean()), 1e-12), sample.episodes)
-    low, high = np.quantile(signed_root(gaps.resampled(gaps.clustered)), (0.025, 0.975))
+    gaps = Gaps.of(x, y, sample.episodes)
     error = error_p90 = None
     original = trials.runner.view.artifact.manifest.spec.sampler
     if plan.otherwise is None and trials.artifact.manifest.sampler_of(plan.loop).takes_noise_as(original):
@@ -339,8 +272,8 @@ def _scored(
     block_flops = cells.shape[1] * sum(flops.blocks)
     computed = float(np.mean([plan_flops(one, flops.blocks) for one in cells]))
     return Score(
-        distance=rooted(gaps.mean, 1.0),
-        interval=(float(low), float(high)),
+        distance=gaps.distance,
+        interval=gaps.interval,
         error=error,
         error_p90=error_p90,
         sparsity=sparsity(cells),

@@ -343,8 +343,7 @@ def choose_again(
         return None
     (name, _, wanted), before = chosen.partition("@"), artifact.manifest.default_plan
     told = ", ".join(f"{each} {ms(one.median)} ms" for each, one in times.items())
-    here = timed_on(threads)
-    record |= {"default_plan": name, "chosen_on": f"{here}: {told}", "timed_on": here}
+    record |= {"default_plan": name, "chosen_by": told, "timed_on": timed_on(threads)}
     precision: dict[str, str] | None = None
     if wanted:
         own, precision = artifact.plans[name].precision, dict(artifact.plan(chosen).precision)

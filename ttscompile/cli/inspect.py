@@ -1,6 +1,6 @@
 """``ttscompile inspect``: what is in an artifact, as tables, as a picture of a plan, or all of it on a page."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +10,16 @@ import numpy as np
 import ttscompile
 from ttscompile.artifact.files import replace_file
 from ttscompile.artifact.load import Artifact, load_artifact
+from ttscompile.calibration.progress import Bar
 from ttscompile.cli.options import artifact_argument, json_option
 from ttscompile.cli.output import only_results_on_stdout, progress, say
 from ttscompile.cli.sections import Recordings, Section, SectionedCommand, Sources, trajectories_options
 from ttscompile.cli.summary import print_artifact
 from ttscompile.cli.types import PAGE_OR_PICTURE, PAGES, TEXT
 from ttscompile.core.lattice import PlanArray
-from ttscompile.core.plan import SCHEDULE
-from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError
+from ttscompile.core.plan import FULL, SCHEDULE
+from ttscompile.errors import ArtifactChangedError, ArtifactError, OutputError, needing
+from ttscompile.measure.points import JudgedPlan
 from ttscompile.plots.figure import write_picture
 from ttscompile.plots.maps import plot_plan
 from ttscompile.report import Extras, Section as OfPage, build, render, verified
@@ -44,7 +46,11 @@ SECTIONS = (
     help="Write all about it into this page (.html), which needs no other file: its plans, its times on this machine,"
     " its errors, its limits. Or draw a plan into this picture (.png, .svg or .pdf).",
 )
-@trajectories_options(required=False, what="Run the first of these recorded episodes, and show what its calls execute.")
+@trajectories_options(
+    required=False,
+    what="Run the first of these recorded episodes, and show what its calls execute. A page also shows the calls in"
+    " which the plan is furthest from the original.",
+)
 @click.option(
     "--plan", "name", type=TEXT, help="Draw this plan. Without this option it is the default plan of the artifact."
 )
@@ -74,20 +80,21 @@ def inspect(
     if page is not None:
         require_page(page)
     console, artifact = progress(), load_artifact(directory)
-    spec, episode = artifact.manifest.spec, None
+    manifest, episodes = artifact.manifest, list[Episode]()
     if trajectories:
-        episode = episodes_of(spec, trajectories, sources, artifact.tokenizer)[0]
+        episodes = episodes_of(manifest.spec, trajectories, sources, artifact.tokenizer)
+    episode = episodes[0] if episodes else None
     passed, section = True, NOT_RUN
     if page is not None:
+        judged = judged_plan(artifact, episodes)
         with only_results_on_stdout(), console.status("loading") as status:
             if verifies:
-                passed, section = checked(directory, artifact.manifest.identity, trajectories, sources, status.update)
+                passed, section = checked(directory, manifest.identity, trajectories, sources, status.update)
             policy = open_policy(artifact, seed=0)
-            told = write_page(page, artifact, policy, Extras(episode, section), status.update)
+            told = write_page(page, artifact, policy, Extras(episode, section, judged), status.update)
         say(console, told)
     if picture is not None:
-        name = name or _drawn_by_default(artifact, episode)
-        kinds = [block.kind for block in artifact.manifest.blocks]
+        name, kinds = name or manifest.default_plan, [block.kind for block in manifest.blocks]
         write_picture(plot_plan(_plan(artifact, name, episode), kinds, f"plan {name!r}"), picture)
         say(console, f"wrote {picture}")
     print_artifact(replace(artifact, path=directory), as_json)  # of a zipped one, not where it was unpacked
@@ -96,18 +103,19 @@ def inspect(
         context.exit(1)
 
 
-def _drawn_by_default(artifact: Artifact, episode: Episode | None) -> str:
-    """The default plan; without an episode the best schedule in place of plans that depend on the observation."""
-    default = artifact.manifest.default_plan
-    record = artifact.manifest.plans.get(default)
-    if record is None or record.kind != "pruner" or episode is not None or SCHEDULE not in artifact.plans:
-        return default
-    say(
-        progress(),
-        f"plan {default!r} is made for each observation, and none was given: drawing {SCHEDULE!r}, the schedule that"
-        " it departs from",
-    )
-    return SCHEDULE
+def judged_plan(artifact: Artifact, episodes: Sequence[Episode]) -> JudgedPlan | None:
+    """The default plan, or what a build kept beside the original, on calls that its calibration held out.
+
+    None where there is no such plan, or nothing can be held out.
+    """
+    manifest = artifact.manifest
+    name = next((n for n in (manifest.default_plan, SCHEDULE) if n in manifest.plans and n != FULL), None)
+    if name is None or len(episodes) < 2:
+        return None
+    with needing("-t", "compile"):
+        from ttscompile.calibration.compare import judge_plan
+    with only_results_on_stdout(), Bar(shown=True) as bar:
+        return judge_plan(artifact, episodes, name, bar, int((manifest.calibration or {}).get("seed", 0)))
 
 
 def _plan(artifact: Artifact, name: str, episode: Episode | None) -> PlanArray:

@@ -34,11 +34,13 @@ def print_summary(artifact: Artifact, console: Console, whole: bool = True) -> N
     if whole:
         console.print(about)
     print_facts(console, facts.plan_table(artifact))
+    for line in facts.told_spare(manifest):
+        console.print(Padding(line, (0, 0, 1, 2)))
     record = manifest.calibration
     if record is None:
         console.print(Padding(uncalibrated(manifest), (0, 0, 1, 2)))
     else:
-        print_facts(console, facts.score_table(record))
+        print_facts(console, facts.score_table(record, facts.spare(manifest)))
         for line in facts.remarks(record):
             console.print(Padding(line, (0, 0, 0, 2)))  # as a row it would squeeze the figures
     if not whole:
@@ -100,6 +102,7 @@ def print_frontier(
         " read; a process takes more. Distance: between the actions and"
         " the original's, in units of what other noise changes; 0 is the same. Held-out episodes:"
         f" {len(record['episodes']['validation'])}. One stream, {threads} thread{'s' * (threads > 1)}.",
+        *facts.told_spare(artifact.manifest),
         *((*facts.chosen(record), *facts.learned(record)) if record.get("other_noise") else facts.remarks(record)),
         "",
         f"    policy = ttscompile.load({str(directory)!r}, threads={threads})",

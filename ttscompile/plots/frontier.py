@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.spec import FloatArray
-from ..measure.points import MeasuredPoint, Point
+from ..measure.points import FarCall, Point
 from .figure import beside, covered, new_figure, plain_powers, with_grid
 
 if TYPE_CHECKING:
@@ -96,24 +96,33 @@ def plot_chunk(actions: FloatArray, executed: range, title: str) -> Figure:
     return figure
 
 
-def plot_calls(points: Sequence[MeasuredPoint]) -> Figure:
-    """The furthest calls, a row for each of the first eight plans; lines are the original, dots the plan."""
-    shown = points[:8]
-    width = 1 + max(len(call.pictures) for p in shown for call in p.furthest)  # of a call
-    across = width * max(len(p.furthest) for p in shown)
-    figure = new_figure(2.2 * across, 2.4 * len(shown), "the calls")
-    for row, p in enumerate(shown):
-        for column, call in enumerate(p.furthest):
-            place = row * across + column * width + 1
-            for number, picture in enumerate(call.pictures.values()):
-                camera = figure.add_subplot(len(shown), across, place + number)
-                camera.imshow(np.moveaxis(picture, 0, -1).clip(0, 1), cmap="gray")
-                camera.set_axis_off()
-            axes = figure.add_subplot(len(shown), across, place + width - 1)
-            for number, (theirs, own) in enumerate(zip(*np.swapaxes(call.actions, 1, 2), strict=True)):
-                axes.plot(theirs, color=COLOURS[number % len(COLOURS)], linewidth=1)
-                axes.plot(own, color=COLOURS[number % len(COLOURS)], marker=".", linestyle="none")
-            told = f"{p.series}: {p.name}\nepisode {call.episode}, call {call.call}:\ndistance {call.distance:.2f}"
-            axes.set_title(told, fontsize=7, loc="left")
+MOST_NUMBERS = 3
+"""Of the action, that are drawn of a call: those in which it differs most."""
+
+
+def plot_calls(shown: Sequence[tuple[str, FarCall]]) -> Figure:
+    """A row for each call under its title: what the cameras saw, and the numbers of the action that differ most.
+
+    Of each number what the original and the plan execute with the same noise, and, thin, with other noise.
+    """
+    cameras = max(len(call.pictures) for _, call in shown)
+    columns = cameras + min(len(shown[0][1].numbers), MOST_NUMBERS)
+    figure = new_figure(1.0 + 2.2 * columns, 0.5 + 1.9 * len(shown), "the calls")
+    panels = figure.subplots(len(shown), columns, squeeze=False)
+    for row, (title, call) in zip(panels, shown, strict=True):
+        for axes, picture in zip(row, call.pictures.values(), strict=False):
+            axes.imshow(np.moveaxis(picture, 0, -1).clip(0, 1), cmap="gray")
+            axes.set_axis_off()
+        for axes, n in zip(row[cameras:], call.numbers, strict=False):
+            original, own = call.actions[..., n]
+            axes.plot(original[1:].T, color="#cccccc", linewidth=1.6, label="the original, other noise")
+            axes.plot(own[1:].T, color=COLOURS[0], linewidth=0.5, alpha=0.6, label="the plan, other noise")
+            axes.plot(original[0], color=COLOURS[1], linewidth=1.6, label="the original")
+            axes.plot(own[0], color=COLOURS[0], marker=".", linestyle="none", label="the plan")
+            axes.set_ylabel(f"number {n}", fontsize=7, labelpad=1)
+            axes.locator_params(axis="x", integer=True)
             axes.tick_params(labelsize=6)
+        row[0].set_title(title, fontsize=8, loc="left")
+    known = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    figure.legend(known.values(), known, loc="outside lower center", ncols=4, frameon=False, fontsize=7)
     return figure

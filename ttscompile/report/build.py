@@ -10,10 +10,10 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
 from ..core.plan import DENSE
 from ..measure.machine import fingerprint, one_line
-from ..measure.points import Point, efficient
+from ..measure.points import JudgedPlan, Point, efficient
 from ..measure.units import ms, share
 from ..plots.figure import encoded
-from ..plots.frontier import plot_frontier
+from ..plots.frontier import MOST_NUMBERS, plot_calls, plot_frontier
 from ..plots.maps import plot_errors
 from ..runtimes.policy import CompiledPolicy
 from ..trajectories.episodes import Episode
@@ -26,9 +26,6 @@ from .usage import Course, run_episode
 
 NOT_RUN = Section("Verification", ("Not run for this page: --verify adds it, ttscompile verify DIR runs it alone.",))
 
-MOST_PICTURES = 6
-"""Schedules that are drawn; an artifact may hold many."""
-
 
 @dataclass(frozen=True)
 class Extras:
@@ -37,10 +34,12 @@ class Extras:
     Attributes:
         episode: recorded observations; None for none.
         verification: what was found; see ``verified``.
+        judged: a plan on recorded calls; None where none was judged.
     """
 
     episode: Episode | None = None
     verification: Section = NOT_RUN
+    judged: JudgedPlan | None = None
     calls: int = 10
 
 
@@ -59,25 +58,24 @@ def build(
     manifest = artifact.manifest
     require_packages()
     progress("timing calls")
-    measured = measure_plans(policy, manifest.spec, (DENSE, *manifest.plans), extras.calls)
+    timed = [name for name in (DENSE, *manifest.plans) if name not in facts.spare(manifest)]
+    measured = measure_plans(policy, manifest.spec, timed, extras.calls)
     course = None
     if extras.episode is not None:
         progress("running an episode")
         course = run_episode(policy, extras.episode)
     progress("drawing")
-    frontier = _frontier(artifact, measured)
-    chosen = facts.chosen(manifest.calibration or {})  # of a build, whose page begins with what it tried
     sections = (
-        *[frontier] * bool(chosen),
+        _frontier(artifact, measured),
+        _plans(artifact, course),
+        _calls(manifest, extras.judged),
+        *(() if course is None else (_episode(course),)),
+        _latency(measured, manifest.default_plan),
         facts.provenance(artifact),
         facts.policy(artifact),
         facts.hoisting(artifact),
         facts.blocks(manifest),
-        _plans(artifact, course),
-        *(() if course is None else (_episode(course),)),
-        _latency(measured, manifest.default_plan),
-        *[frontier] * (not chosen),
-        _calibration(manifest),
+        facts.calibration(manifest),
         extras.verification,
         facts.limits(artifact),
     )
@@ -85,7 +83,7 @@ def build(
     source = ", ".join(f"{value}" for value in manifest.spec.source.values()) or "A policy of the user's own network"
     return Page(
         title=f"Report on artifact {manifest.short_identity}",
-        lead=" ".join((f"{source}.", *chosen)),
+        lead=" ".join((f"{source}.", *facts.chosen(manifest.calibration or {}))),
         figures=_figures(artifact, measured),
         sections=sections,
         foot=f"Made by ttscompile {machine.get('ttscompile', '')} from identity {manifest.identity}. Times: medians of"
@@ -104,8 +102,8 @@ def _figures(artifact: Artifact, measured: Sequence[Measurement]) -> tuple[tuple
         ("denoising steps", str(manifest.steps)),
         ("residual blocks", str(len(manifest.blocks))),
     ]
-    if (score := facts.scores(manifest.calibration, ("error",)).get(manifest.default_plan)) is not None:
-        made.append(("held-out action error", f"{score['error']:.3g}"))
+    if (score := facts.scores(manifest.calibration, ("distance",)).get(manifest.default_plan)) is not None:
+        made.append(("distance from the original", f"{score['distance']:.3f}"))
     return tuple(made)
 
 
@@ -113,10 +111,10 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
     manifest = artifact.manifest
     kinds = [block.kind for block in manifest.blocks]
     drawn: list[Picture] = []
-    own = {name: artifact.plans[name].cells for name, one in manifest.plans.items() if one.kind == "schedule"}
-    schedules = {name: cells for name, cells in own.items() if cells is not None}
+    own = {name: artifact.plans[name].cells for name in manifest.plans if name not in facts.spare(manifest)}
+    schedules = {name: cells for name, cells in own.items() if cells is not None and manifest.plans[name].kind != "all"}
     ordered = sorted(schedules, key=lambda name: name != manifest.default_plan)
-    for name in ordered[:MOST_PICTURES]:
+    for name in ordered:
         caption = f"Plan {name!r} of one call: steps across, blocks down."
         drawn.append(pictures.plan_picture(schedules[name], kinds, f"plan {name!r}", caption))
     if course is not None:
@@ -124,19 +122,42 @@ def _plans(artifact: Artifact, course: Course | None) -> Section:
         if not any(np.array_equal(last, schedule) for schedule in schedules.values()):
             caption = f"What the last of {calls} calls of the episode executed."
             drawn.append(pictures.plan_picture(last, kinds, f"executed in call {calls - 1}", caption))
-        caption = f"Mean over {calls} calls of the episode {course.name}, a map for each source."
-        alt = "A heat map a source: the share of calls in which a cell had this source."
-        drawn.append(Picture(pictures.shares_picture(course), caption, alt))
     elsewhere = "the last block of its kind (FORWARD), an earlier step (TIMESTEP) or the last call (ROLLOUT)"
     computed = "A plan says for every denoising step and every block whether it is computed"
     text = [f"{computed}, or its residual taken from {elsewhere}."]
-    if len(ordered) > MOST_PICTURES:
-        text.append(f"{MOST_PICTURES} of {len(ordered)} schedules are drawn.")
     if not ordered:
         text.append("This artifact has no schedule to draw.")
-    text.append(usage.told_unused(artifact))
+    text += [*facts.told_spare(manifest), usage.told_unused(artifact)]
     tables = facts.plan_table(artifact), usage.usage_table(artifact)
     return Section("Plans", tuple(text), tables, tuple(drawn))
+
+
+def _calls(manifest: Manifest, judged: JudgedPlan | None) -> Section:
+    """In which calls a plan is furthest from the original, and how they look."""
+    title = "Furthest calls"
+    if judged is None:
+        how = "ttscompile inspect DIR -o page.html -t calls.npz, with two recorded episodes or more, shows them"
+        return Section(title, (f"The calls in which a plan is furthest from the original: {how}.",))
+    gaps, middle, worst = judged.gaps, judged.shown[-1].distance, judged.shown[0].distance
+    (low, high), count = gaps.interval, len(gaps.by_episode)
+    told = (
+        f"Plan {judged.name!r} is {gaps.distance:.3f} from the original, with 95 % confidence {low:.3f} to"
+        f" {high:.3f}; 1 is what other noise changes. It was judged on {len(gaps.h)} calls of {count} recorded"
+        f" episode{'s' * (count > 1)}: in half of them it is up to {middle:.3f} away, and in the worst {worst:.3f}."
+    )
+    hertz, chunk = (manifest.calibration or {}).get("policy_hz"), manifest.spec.chunk
+    rows, titles = list[tuple[str, ...]](), list[str]()
+    for one in judged.shown:
+        place = "in the middle" if one is judged.shown[-1] else "furthest"
+        at = "" if hertz is None else f"{one.call * (chunk.stop - chunk.start) / hertz:.1f} s"
+        off = np.abs(one.actions[1, 0] - one.actions[0, 0]).max(0)
+        numbers = ", ".join(f"{off[n]:.3g} in number {n}" for n in one.numbers[:MOST_NUMBERS])
+        rows.append((place, f"{plain(one.name)}, call {one.call}", at, f"{one.distance:.3f}", numbers))
+        titles.append(f"{place}: {plain(one.name, 30)}, call {one.call}, distance {one.distance:.3f}")
+    head = ("", "recorded call", "time in its episode", "distance", "largest difference of the actions")
+    caption = "What is executed, a row for each call: the numbers of the action that differ most, in their units."
+    drawn = Picture(encoded(plot_calls([*zip(titles, judged.shown, strict=True)])), caption)
+    return Section(title, (told, *judged.warnings), (Table(head, tuple(rows)),), (drawn,))
 
 
 def _episode(course: Course) -> Section:
@@ -148,15 +169,13 @@ def _episode(course: Course) -> Section:
     if replaced := sum(course.legalised):
         found = f"{replaced} cells were replaced because what they read was not computed yet."
     text = f"{len(course.plans)} consecutive calls of {course.name} with the default plan: {reused} {found}"
-    caption = "Share of the cells that were reused, as executed. Step 0 of every call is dense."
-    alt = "A line: the share of reused cells, call by call."
-    drawn = [Picture(pictures.sparsity_picture(course), caption, alt)]
+    drawn, work = list[Picture](), course.frames
     if course.seen:
-        work = course.frames
         caption = (
             f"{work.tokens} of {work.of} tokens of the image encoders were computed, {share(work.tokens / work.of)};"
             f" {work.forward} took the rows of a computed one, and the others kept their own. A row is a camera. In"
-            " colour: patches whose tokens were computed in this call. Pale and framed: those that took rows."
+            " colour: patches whose tokens were computed in this call. Pale and framed: those that took rows. They were"
+            " computed since the frame is the first, or one that is refreshed whole, or since patches changed."
         )
         drawn.append(Picture(pictures.seen_picture(course), caption))
     return Section("Episode", (text,), pictures=tuple(drawn))
@@ -197,15 +216,6 @@ def _tried(row: Mapping[str, Any]) -> Point:
         return Point("the original", DENSE, 0.0, row["milliseconds"])
     nearness = "may be taken" if row["near"] else "too far"
     return Point(nearness, row["name"], max(float(row["distance"]), 0.0), row["milliseconds"])
-
-
-def _calibration(manifest: Manifest) -> Section:
-    made, told = facts.calibration(manifest), facts.scores(manifest.calibration, ("sparsity", "error", "error_p90"))
-    if told and all(score["error"] > 0 for score in told.values()):
-        caption = "Held-out action error against computed cells: mean (point) and 90th percentile (bar)."
-        alt = "Points: held-out action error of each plan against the share of cells it computes."
-        made = replace(made, pictures=(Picture(pictures.plans_picture(told), caption, alt),))
-    return made
 
 
 def verified(found: Verification) -> Section:

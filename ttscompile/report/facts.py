@@ -198,11 +198,24 @@ def plan_flops(artifact: Artifact, name: str) -> float | None:
     return dense - own.flops_sparsity * manifest.steps * sum(manifest.flops.blocks)
 
 
+def spare(manifest: Manifest) -> list[str]:
+    """Plans that a build keeps for other machines; whatever is the default is none of them."""
+    kept = [row["name"] for row in (manifest.calibration or {}).get("frontier", ()) if row.get("spare")]
+    return [name for name in kept if name in manifest.plans and name != manifest.default_plan]
+
+
+def told_spare(manifest: Manifest) -> tuple[str, ...]:
+    """Which these are, and what they are for."""
+    use = "'ttscompile bench DIR --choose' chooses among them on another machine, or by another deadline"
+    return (f"Beside these it has {', '.join(map(repr, names))}: {use}.",) if (names := spare(manifest)) else ()
+
+
 def plan_table(artifact: Artifact) -> Table:
-    """Every plan: what it computes, its sparsity, its cost."""
-    manifest = artifact.manifest
-    rows = []
+    """Every plan but spare ones: what it computes, its sparsity, its cost."""
+    manifest, rows = artifact.manifest, list[tuple[str, ...]]()
     for name, own in plans_of(manifest).items():
+        if name in spare(manifest):
+            continue
         told = f"{name} (default)" if name == manifest.default_plan else marked(name)
         saved = (artifact.plans[name].in_words(), own.kind, share(own.sparsity), share(own.flops_sparsity))
         cost = plan_flops(artifact, name)
@@ -212,8 +225,8 @@ def plan_table(artifact: Artifact) -> Table:
     return Table(head, tuple(rows))
 
 
-def score_table(record: Mapping[str, Any]) -> Table:
-    """What calibration measured on episodes that it did not learn from."""
+def score_table(record: Mapping[str, Any], without: Sequence[str] = ()) -> Table:
+    """What calibration measured of plans on episodes that it did not learn from."""
     rows = [
         (
             marked(name),
@@ -224,6 +237,7 @@ def score_table(record: Mapping[str, Any]) -> Table:
             share(score["flops_saved"]),
         )
         for name, score in scores(record).items()
+        if name not in without
     ]
     errors = "mean action error", "90th percentile"
     head = ("held-out episodes", "distance from the original", *errors, "cells reused", "FLOPs saved")
@@ -242,7 +256,7 @@ def calibration(manifest: Manifest) -> Section:
         text.insert(
             0, f"{errors}, against the dense policy with the same noise: the mean over calls, and the 90th percentile."
         )
-        tables.insert(0, score_table(record))
+        tables.insert(0, score_table(record, spare(manifest)))
     return Section("Calibration", tuple(text) or ("No errors were measured.",), tuple(tables))
 
 
@@ -317,7 +331,7 @@ def record_table(record: Mapping[str, Any], most: int = 200) -> Table:
     """The rest of the calibration record, shortened where it is longer than so many characters."""
     rows = []
     for name, value in record.items():
-        if name in _NOT_TOLD:
+        if name in _NOT_TOLD or value in (None, {}, [], ""):
             continue
         text = plain(value)
         if isinstance(value, list | Mapping) and len(text) > most:

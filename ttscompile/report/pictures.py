@@ -3,14 +3,14 @@
 They are narrow, so that their text can be read where a phone makes them narrower still.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..core.lattice import PlanArray, Source, sparsity
 from ..measure.units import ms
-from ..plots.figure import STEPS_AXIS, beside, encoded, new_figure, plain_powers, with_grid
+from ..plots.figure import encoded, new_figure
 from ..plots.maps import COLOURS, plot_plan
 from .page import Picture
 from .timing import Measurement
@@ -41,39 +41,6 @@ def plan_picture(plan: PlanArray, kinds: Sequence[str], title: str, caption: str
     return Picture(png, f"{caption} {sparsity(plan):.1%} of {plan.size} cells are reused: {counts}.")
 
 
-def shares_picture(course: Course) -> bytes:
-    """For each source that occurs, in how many of the episode's calls each cell had it."""
-    shares = course.shares()
-    used = [source for source in Source if shares[source].any()]
-    steps, blocks = shares.shape[1:]
-    figure = new_figure(min(6.0 + 0.03 * steps, 12.0), len(used) * min(1.0 + 0.09 * blocks, 6.0) + 0.6)
-    panels = figure.subplots(len(used), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, source in zip(panels, used, strict=True):
-        drawn = axes.imshow(shares[source].T, cmap="cividis", vmin=0, vmax=1, aspect="auto", interpolation="none")
-        axes.set_title(f"{source.name}: {shares[source].mean():.1%} of the cells", fontsize=10, loc="left")
-        axes.set_ylabel("block")
-        axes.locator_params(integer=True, min_n_ticks=1)
-    panels[-1].set_xlabel(STEPS_AXIS)
-    figure.colorbar(drawn, ax=list(panels), label="share of the calls", pad=0.01)
-    return encoded(figure)
-
-
-def sparsity_picture(course: Course) -> bytes:
-    """Reused cells, call by call; and those that had to be replaced."""
-    figure = new_figure(6.0, 3.2)
-    axes = figure.add_subplot()
-    calls = np.arange(len(course.sparsity))
-    axes.plot(calls, 100 * course.sparsity, color=COLOURS[Source.COMPUTE], marker="o", markersize=3, linewidth=1.2)
-    axes.locator_params(axis="x", integer=True)
-    axes.set(xlabel="call of the episode", ylabel="cells reused, %")
-    axes.set_ylim(max(min(100 * float(course.sparsity.min()) - 2, 90.0), -2.0), 100.5)
-    with_grid(axes)
-    if len(replaced := np.flatnonzero(course.legalised)):
-        axes.scatter(replaced, 100 * course.sparsity[replaced], marker="x", color="#0072b2", zorder=3)
-        axes.set_title("crosses: cells that read what was never computed were replaced", fontsize=9, loc="left")
-    return encoded(figure)
-
-
 def seen_picture(course: Course) -> bytes:
     """What each camera showed in some calls: in colour where tokens were computed, pale grey where they were not.
 
@@ -94,7 +61,9 @@ def seen_picture(course: Course) -> bytes:
             for framed, source in ((cut, Source.COMPUTE), (taken, Source.FORWARD)):
                 if framed.any() and not framed.all():
                     axes.contour(framed, levels=[0.5], colors=COLOURS[source], linewidths=1)
-            axes.set_title(f"call {call}: {np.count_nonzero(one.computed)} of {one.computed.size}", fontsize=8)
+            count = np.count_nonzero(one.computed)
+            why = "".join(f", {why}" for why in ("first", "refresh", "changed") if count and getattr(one.work, why))
+            axes.set_title(f"call {call}: {count} of {one.computed.size}{why}", fontsize=7)
             axes.set_axis_off()
     return encoded(figure)
 
@@ -124,27 +93,4 @@ def latency_picture(measured: Sequence[Measurement]) -> bytes:
     axes.set_xlabel("ms of a call, median")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    return encoded(figure)
-
-
-def plans_picture(scores: Mapping[str, Mapping[str, Any]]) -> bytes:
-    """Held-out action error of each plan of a calibration against the share of cells that it computes."""
-    figure = new_figure(6.0, 4.0)
-    axes = figure.add_subplot()
-    computed = [100 * (1 - score["sparsity"]) for score in scores.values()]
-    span = (max(computed) - min(computed)) or 1.0
-    errors = [score["error"] for score in scores.values()]
-    for i, (name, score) in enumerate(scores.items()):
-        x, middle, high = computed[i], errors[i], score["error_p90"]
-        over = sum(abs(x - computed[j]) < span / 20 and abs(middle - errors[j]) < middle / 10 for j in range(i))
-        axes.plot([x, x], [middle, high], color="#999999", linewidth=1, zorder=1)
-        axes.plot(x, middle, "o", color=COLOURS[Source.COMPUTE], zorder=2)
-        axes.plot(x, high, "_", color="#999999", markersize=10, zorder=1)
-        told = plain(name, 24)
-        axes.annotate(told, (x, middle), fontsize=9, **beside((x - min(computed)) / span, told, 11 * over - 3))
-    axes.set_yscale("log")
-    plain_powers(axes.yaxis)
-    axes.set(xlabel="cells computed, %", ylabel="error of the actions, in their units")
-    axes.margins(x=0.2, y=0.1)
-    with_grid(axes)
     return encoded(figure)

@@ -17,7 +17,7 @@ from ..runtimes.liveness import sources_of_pruner
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.tokens import Seen
 from ..trajectories.episodes import Episode
-from .facts import of_blocks
+from . import facts
 from .page import Table
 
 HEAD, BRANCH, TABLE = "head", "branch", "table"
@@ -76,20 +76,18 @@ def uses(artifact: Artifact) -> tuple[Use, ...]:
     return tuple(found)
 
 
-def unused(found: tuple[Use, ...]) -> int:
-    """How many of them no plan uses."""
-    return sum(not use.plans for use in found)
-
-
 def usage_table(artifact: Artifact) -> Table:
     """Of every head, branch and table the plans that use it; blocks of one use are one row."""
     alike: dict[tuple[str, str, tuple[str, ...]], list[Use]] = {}
     for use in uses(artifact):
         alike.setdefault((use.kind, use.name, use.plans), []).append(use)
     rows = []
+    spare = {(name,) for name in facts.spare(artifact.manifest)}
     for (kind, name, plans), group in alike.items():
+        if kind == TABLE and plans in spare:  # its own
+            continue
         blocks = [use.of for use in group if isinstance(use.of, int)]
-        of = f" of blocks {of_blocks(blocks)}" if blocks else f" ({len(group)})" if len(group) > 1 else ""
+        of = f" of blocks {facts.of_blocks(blocks)}" if blocks else f" ({len(group)})" if len(group) > 1 else ""
         rows.append((f"{kind}: {name}{of}", ", ".join(plans) or "no plan: unused"))
     return Table(("part", "used by"), tuple(rows), prose=True)
 
@@ -97,7 +95,7 @@ def usage_table(artifact: Artifact) -> Table:
 def told_unused(artifact: Artifact) -> str:
     """How much is unused, in words."""
     found = uses(artifact)
-    count = unused(found)
+    count = sum(not use.plans for use in found)
     if not count:
         return f"Each of the {len(found)} heads, branches and tables is used by a plan."
     verb = "is" if count == 1 else "are"
@@ -146,10 +144,6 @@ class Course:
     def sparsity(self) -> npt.NDArray[np.float64]:
         """Share of reused cells of each call, ``[R]``."""
         return np.asarray(np.mean(self.plans != Source.COMPUTE, axis=(1, 2)), dtype=np.float64)
-
-    def shares(self) -> npt.NDArray[np.float64]:
-        """For each source and cell the share of calls in which the cell had it, ``[4, K, blocks]``."""
-        return np.stack([np.mean(self.plans == source, axis=0) for source in Source])
 
 
 def run_episode(policy: CompiledPolicy, episode: Episode, plan: str | None = None) -> Course:

@@ -23,7 +23,7 @@ from ..trajectories.episodes import episodes_of
 from .calls import DENSE_CALL, PLANS, RUNTIMES, TOKENS, check_dense, check_plans, check_runtimes, check_tokens
 from .network import BLOCK, EVALUATION, PREPROCESSING, Probe, check_blocks, check_evaluation, check_preprocessing
 from .precision import PLANS_PRECISION, PRECISION, check_plans_precision, check_precision
-from .reuse import ENGAGED, SPARSITY, Progress, check_engaged, check_episodes, choose
+from .reuse import DISTANCE, ENGAGED, Progress, check_engaged, check_episodes, choose
 from .rung import FAILED, PASSED, ErrorMap, Rung, Verification
 
 INTEGRITY = "integrity"
@@ -42,13 +42,13 @@ def verify(
 
     From the bottom: its bytes; what is around the network; each residual block; single evaluations; a dense call, which
     are all held against what the original network answered when the artifact was made; the runtimes against each other
-    (where there is torch); plans against what calibration stored; reuse against dense calls with the same noise over
-    whole episodes; and whether the plans save anything. A rung that fails says where, and what to do; those above it
+    (where there is torch); plans against what calibration stored; how far they are from the original over whole
+    recorded episodes; and whether they save anything. A rung that fails says where, and what to do; those above it
     are tried all the same, except after the first.
 
     Args:
         path: the artifact's directory, or the same zipped.
-        trajectories: recorded episodes, see ``ttscompile.trajectories``. None: errors of reuse are not judged.
+        trajectories: recorded episodes, see ``ttscompile.trajectories``. None: how far plans are is not judged.
         sources: by key of the observation, the arrays of a recording that it is made of.
         calls: recorded calls to go through at least, in whole episodes.
 
@@ -168,6 +168,6 @@ def _climb(
     climb(RUNTIMES, lambda: check_runtimes(artifact, golden, runtime))
     climb(PLANS, plans)
     climb(PLANS_PRECISION, lambda: check_plans_precision(artifact, golden, recorded, runtime))
-    climb(SPARSITY, lambda: check_episodes(artifact, golden, policy, episodes, progress))
+    climb(DISTANCE, lambda: check_episodes(artifact, policy, episodes, progress))
     climb(ENGAGED, lambda: check_engaged(artifact, golden, policy))
     return rungs, errors

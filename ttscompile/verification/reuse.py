@@ -1,4 +1,4 @@
-"""The rungs of reuse: what it changes in the actions, beside what other noise would change; and what plans save.
+"""The rungs of reuse: how far plans are from the original, in units of what other noise changes; and what they save.
 
 A cache that never engages gives perfect actions, and saves nothing: so neither is enough alone.
 """
@@ -18,34 +18,30 @@ from ..artifact.load import Artifact
 from ..artifact.manifest import PlanRecord
 from ..core.lattice import sparsity
 from ..core.plan import DENSE, FULL, UNIFORM
-from ..core.spec import Noise, PolicySpec
+from ..core.spec import Noise
 from ..measure.machine import busy
-from ..measure.points import pairs, rooted
+from ..measure.points import Gaps
 from ..measure.timer import Timer
 from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import random_noise
 from ..runtimes.report import CallReport
 from ..trajectories.episodes import Episode
-from .rung import FAILED, PASSED, SKIPPED, Rung, finite, judged
+from .rung import FAILED, PASSED, SKIPPED, Rung, finite
 
-SPARSITY, UNIT, OF_NOISE = "sparsity error", "action units", "other noise"
+DISTANCE, UNIT = "distance", "other noise"
 
-AS_CALIBRATED, FEW_AS_CALIBRATED = 2.0, 3.0
-"""How often the mean error that calibration measured on held-out calls a plan's may be; and with ``FEW`` calls or less,
-which are of a few episodes, whose calls are alike."""
+AS_CALIBRATED = 2.0
+"""How often the distance that calibration measured on held-out calls a plan's may be."""
 
-FEW = 32
+DRAWS = 2
+"""Of noise for each call. The judge of calibration, which is not in a hurry, asks more often."""
 
-ROUNDING, NEGLIGIBLE = 0.001, 0.05
-"""Share of the yardstick below which an error, or a distance, is no worse than calibrated: other processors round
-otherwise, and distances are estimates."""
+NEGLIGIBLE = 0.05
+"""A distance that is no worse than calibrated, whatever calibration measured: it is an estimate, and other processors
+round otherwise."""
 
 Progress = Callable[[str], None]
 """Told what is being done."""
-
-Errors = dict[str | None, list[float]]
-"""By plan, for each call: mean absolute difference of the executed actions from the dense call's with the same noise,
-in their units. None: of a dense call with other noise."""
 
 
 def choose(episodes: Sequence[Episode], calls: int) -> list[Episode]:
@@ -60,133 +56,68 @@ def choose(episodes: Sequence[Episode], calls: int) -> list[Episode]:
     return [episodes[number] for number in sorted(chosen)]
 
 
-def check_episodes(
-    artifact: Artifact, golden: Golden, policy: CompiledPolicy, episodes: Sequence[Episode], told: Progress
-) -> Rung:
-    """Every plan against the dense policy with the same noise, call by call through whole episodes.
+def check_episodes(artifact: Artifact, policy: CompiledPolicy, episodes: Sequence[Episode], told: Progress) -> Rung:
+    """How far every plan is from the original, by calls through whole episodes; the default's distance is judged.
 
-    A plan of another sampler, or one that begins with the chunk before, answers the same noise with other actions; what
-    is judged of it is how far its answers to two draws of noise are from two of the dense policy's, in units of what
-    other noise changes (``measure.points``). Else:
-
-    The mean error of the default plan has to keep within what two dense calls with different noise are apart, or within
-    what calibration measured on held-out calls (90th percentile), whichever is more. It also has to keep within
-    ``AS_CALIBRATED`` times the mean that calibration measured, where it did: a plan that is much worse than it was may
-    still be within the noise of its policy. Without episodes the recorded observations are used, which are random: then
-    nothing is judged.
+    It is the distance of calibration's judge (``measure.points``), of ``DRAWS`` answers to each call and without torch.
+    The rung fails where it is too large with 95 % confidence. The golden record says nothing of it: its observations
+    are random.
     """
     manifest = artifact.manifest
     if manifest.plans.keys() <= {FULL}:
-        return Rung(SPARSITY, SKIPPED, "the artifact is not calibrated: every call computes all cells")
+        return Rung(DISTANCE, SKIPPED, "the artifact is not calibrated: every call computes all cells")
+    if not episodes:
+        remedy = "Give recorded episodes with --trajectories to have this judged."
+        return Rung(DISTANCE, SKIPPED, "there are no recorded episodes to measure it on", remedy=remedy)
     spec, draw = manifest.spec, np.random.default_rng(0)
     name = manifest.default_plan if manifest.default_plan in manifest.plans else next(iter(manifest.plans))
-    errors: Errors = {each: [] for each in (*manifest.plans, None)}
-    own = artifact.plans[name]
-    shared = own.otherwise is None and manifest.sampler_of(own.loop).takes_noise_as(spec.sampler)
-    unpaired = None if shared else Unpaired(name)
-    for i, obs in enumerate([one.observations for one in episodes] or [golden.raw_observations(spec)]):
-        rows = [{k: a[r : r + 1] for k, a in obs.items()} for r in range(len(next(iter(obs.values()))))]
-        if episodes:
-            told(f"episode {i + 1} of {len(episodes)}, {len(rows)} call{'s' * (len(rows) != 1)}")
-        _run(policy, spec, rows, draw, errors, unpaired)
-    calls, other_noise = len(errors[None]), float(np.mean(errors.pop(None)))
-    figures = {
-        name: {"error": finite(float(np.mean(e))), "error_p90": finite(float(np.quantile(e, 0.9)))}
-        for name, e in errors.items()
-    }
-    error = float(np.mean(errors[name]))
-    details = {"plan": name, "calls": calls, "episodes": len(episodes), "plans": figures, "other_noise": other_noise}
-    others = ", ".join(f"{n!r} {np.mean(e):.3g}" for n, e in errors.items() if n != name)
-    found = f"executed actions of plan {name!r} are {error:.3g} from the dense policy's with the same noise, in their"
-    found += f" units{f' ({others})' * bool(others)}; two dense calls with different noise are {other_noise:.3g} apart"
-    if not episodes:
-        found += f". No trajectories were given: these are {calls} calls on random observations, and not judged"
-        remedy = "Give recorded episodes with --trajectories to have this judged."
-        return Rung(SPARSITY, SKIPPED, found, finite(error), None, UNIT, remedy, details=details)
-    promised, promised_p90 = (_promised(manifest.calibration, name, key) for key in ("error", "error_p90"))
-    noise, unit, least = other_noise, UNIT, ROUNDING * other_noise
-    if unpaired is not None:
-        error, noise, unit, least = unpaired.distance, 1.0, OF_NOISE, NEGLIGIBLE
-        promised, promised_p90 = _promised(manifest.calibration, name, "distance", "interval"), None
-        found += f". It is of another loop, in which the same noise means something else: by two draws {error:.3g} away"
-    beyond = max(noise, promised_p90 or 0.0)
-    factor, worse = allowed(promised, least, calls)
-    reasons = list[str]()
-    if not error <= beyond:
-        reasons.append("more than other noise would change")
-    if not error <= worse:
-        before = f"more than {factor:g} times the {promised:.3g} that calibration measured on held-out calls"
-        reasons.append(f"worse than calibrated, {before}")
-    details |= {"promised": promised, "promised_p90": promised_p90, "reasons": reasons}
-    made = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}"
-    made += f"{f' (few: more than {FEW} say more)' * (calls <= FEW)}: {found}"
+
+    def executed(plan: str, rows: Sequence[Mapping[str, npt.NDArray[Any]]], noises: Sequence[Noise]) -> Any:
+        """What a plan answers to the calls of an episode, normalised, ``[R, A]``."""
+        policy.reset()
+        made = [policy.predict_action(o, noise=n, plan=plan)["action"] for o, n in zip(rows, noises, strict=True)]
+        return (np.concatenate(made) * spec.chunk.scale).astype(np.float64).reshape(len(rows), -1)
+
+    answers: dict[str, list[Any]] = {each: [] for each in (DENSE, *manifest.plans)}  # by episode [R, DRAWS, A]
+    for i, episode in enumerate(episodes):
+        rows = [{k: a[r : r + 1] for k, a in episode.observations.items()} for r in range(episode.calls)]
+        told(f"episode {i + 1} of {len(episodes)}, {len(rows)} call{'s' * (len(rows) != 1)}")
+        noises = [[random_noise(spec, draw) for _ in rows] for _ in range(DRAWS)]
+        for plan, made in answers.items():
+            made.append(np.stack([executed(plan, rows, one) for one in noises], 1))
+    original, numbers = answers.pop(DENSE), np.repeat(np.arange(len(episodes)), [*map(len, answers[name])])
+    # All calls at once: whether noise changes anything is asked of the policy, and not of a call at rest.
+    gaps = {n: Gaps.of(np.concatenate(made), np.concatenate(original), numbers) for n, made in answers.items()}
+    calls, found, (low, high) = len(numbers), gaps[name].distance, gaps[name].interval
+    details = {"plan": name, "calls": calls, "episodes": len(episodes)}
+    details["plans"] = {n: {"distance": finite(one.distance), "interval": one.interval} for n, one in gaps.items()}
+    others = ", ".join(f"{n!r} {one.distance:.3f}" for n, one in gaps.items() if n != name)
+    shown = f"plan {name!r} is {found:.3f} from the original, and with 95 % confidence {low:.3f} to {high:.3f}"
+    shown += f"{f' ({others})' * bool(others)}, in units of what other noise changes"
+    most = bounds((manifest.calibration or {}).get("plans", {}).get(name, {}))
+    details["reasons"] = reasons = [why for why, bound in most.items() if not low <= bound]
+    shown = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}: {shown}"
     if reasons:
-        made += f". This is {'; and '.join(reasons)}"
+        shown += f". This is surely {'; and '.join(reasons)}"
     remedy = "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such"
     remedy += " episodes, or with a lower --target-sparsity."
-    return judged(SPARSITY, error, min(beyond, worse), unit, made, remedy, details=details)
+    status, remedy = (FAILED, remedy) if reasons else (PASSED, "")
+    return Rung(DISTANCE, status, shown, finite(found), min(most.values()), UNIT, remedy, details=details)
 
 
-class Unpaired:
-    """What a plan and the dense policy answer to the same two draws of noise, over many calls."""
+def bounds(score: Mapping[str, Any]) -> dict[str, float]:
+    """The largest distances that a plan may have, by what one is called that is larger, given what calibration found.
 
-    def __init__(self, plan: str) -> None:
-        self.plan = plan
-        self._own, self._dense = list[npt.NDArray[np.float64]](), list[npt.NDArray[np.float64]]()
-
-    def add(self, own: npt.NDArray[np.float64], dense: npt.NDArray[np.float64]) -> None:
-        """The actions that were executed of one call, ``[2, ...]``: a draw each."""
-        self._own.append(own.reshape(2, -1))
-        self._dense.append(dense.reshape(2, -1))
-
-    @property
-    def distance(self) -> float:
-        """Between the two, in units of what other noise changes."""
-        # All calls at once: whether noise changes anything is asked of the policy, and not of a call at rest.
-        h, apart = pairs(np.stack(self._own), np.stack(self._dense))
-        return rooted(float(h.mean()), float(apart.mean()))
-
-
-def _run(
-    policy: CompiledPolicy,
-    spec: PolicySpec,
-    rows: Sequence[Mapping[str, npt.NDArray[Any]]],
-    draw: np.random.Generator,
-    errors: Errors,
-    unpaired: Unpaired | None,
-) -> None:
-    noises, others = ([random_noise(spec, draw) for _ in rows] for _ in range(2))
-
-    def actions(plan: str, with_noise: Sequence[Noise]) -> list[npt.NDArray[np.float64]]:
-        policy.reset()
-        made = (policy.predict_action(o, noise=n, plan=plan)["action"] for o, n in zip(rows, with_noise, strict=True))
-        return [np.asarray(one, np.float64) for one in made]
-
-    dense, other = actions(DENSE, noises), actions(DENSE, others)
-    for name, found in errors.items():
-        made = other if name is None else actions(name, noises)
-        found += [float(np.abs(one - same).mean()) for one, same in zip(made, dense, strict=True)]
-    if unpaired is not None:
-        own = zip(actions(unpaired.plan, noises), actions(unpaired.plan, others), strict=True)
-        for pair, both in zip(own, zip(dense, other, strict=True), strict=True):
-            unpaired.add(*(np.stack(each) * spec.chunk.scale for each in (pair, both)))
-
-
-def allowed(promised: float | None, least: float, calls: int) -> tuple[float, float]:
-    """How often the error that calibration measured a plan's may be, and what that comes to.
-
-    An error is recorded by whoever made the artifact: one that is better than what is measured is no excuse, however
-    small both are.
+    That is recorded by whoever made the artifact: a score that is better than what is measured is no excuse, unless
+    both are ``NEGLIGIBLE``. Its estimate may lie below 0, and promises no more than its interval.
     """
-    factor = FEW_AS_CALIBRATED if calls <= FEW else AS_CALIBRATED
-    return factor, float("inf") if promised is None else max(factor * promised, least)
-
-
-def _promised(calibration: Mapping[str, Any] | None, name: str, *keys: str) -> float | None:
-    """The most that calibration measured of a plan; of an interval its upper end, as an estimate may lie below 0."""
-    plan = (calibration or {}).get("plans", {}).get(name, {})
-    found = [plan[key] for key in keys if plan.get(key) is not None]
-    return float(np.hstack(found).max()) if found else None
+    known = score.get("distance")
+    beyond = {"more than other noise would change": max(1.0, AS_CALIBRATED * (known or 0.0))}
+    if known is None:
+        return beyond
+    most = max((known, *score.get("interval", ())))
+    before = f"more than {AS_CALIBRATED:g} times the {most:.3g} that calibration measured on held-out calls"
+    return {**beyond, f"worse than calibrated, {before}": max(AS_CALIBRATED * most, NEGLIGIBLE)}
 
 
 ENGAGED, NO_TIME = "engaged", "saves no time"

@@ -12,7 +12,7 @@ from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.manifest import StartRecord
 from ttscompile.calibration.clock import Clock
-from ttscompile.calibration.judge import Gaps, Score, judge
+from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.kept import Kept, holding
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import Proposal
@@ -22,6 +22,7 @@ from ttscompile.calibration.trials import LEARNED, Trials
 from ttscompile.core.lattice import Source, dense_plan, whole_steps_plan
 from ttscompile.core.plan import FULL, Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.measure.points import Gaps
 
 from .trying import proposed, request, trials_of
 
