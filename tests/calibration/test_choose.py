@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +17,19 @@ from ttscompile.calibration.judge import Score
 from ttscompile.calibration.kept import Kept
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.calibration.proposer import least_bound
+from ttscompile.calibration.runner import Runner
+from ttscompile.calibration.state import FILE
 from ttscompile.calibration.trials import Trials
 from ttscompile.core.plan import DENSE, Plan
-from ttscompile.errors import CalibrationFailedError
+from ttscompile.errors import CalibrationError, CalibrationFailedError
 from ttscompile.measure.timer import Times
 from ttscompile.report.facts import chosen as chosen_of, limits
 
 from .proposers.trying import request, trials_of
 
 
-def score_of(distance: float) -> Score:
-    return Score(distance, (distance, distance), None, None, 0.0, 0.0, 0.0, 1)
+def score_of(distance: float, limit: float | None = None) -> Score:
+    return Score(distance, (0.0, distance if limit is None else limit), None, None, 0.0, 0.0, 0.0, 1)
 
 
 def chosen(
@@ -137,6 +140,53 @@ def test_nothing_that_may_cost_success_is_the_default_unasked(
         chosen(monkeypatch, trials, figures, deadline_ms=3.0, **bounds)
 
 
+def test_what_another_machine_may_choose_is_kept_beside(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    """Of the frontier what has no name of its own, unless another plan is as fast, or nearly as near and faster."""
+    trials = trials_of(artifact, [recording])
+    figures = {
+        "a": (0.20, 0.22, 1.0),
+        "b": (0.08, 0.09, 2.0),
+        "c": (0.05, 0.06, 2.3),  # as fast as b
+        "d": (0.045, 0.05, 4.0),  # hardly nearer than c
+        "e": (0.03, 0.04, 6.0),
+        "f": (0.02, 0.03, 8.0),
+        "g": (0.04, 0.05, 9.0),  # slower than f and further
+        "h": (0.01, 0.90, 9.0),  # not surely near
+    }
+    kept, names = Kept(trials, anew=True), dict[int, str]()
+    kept.plans |= {name: replace(trials.base) for name in figures}
+    names = {id(plan): name for name, plan in kept.plans.items()}
+    times = {DENSE: (0.0, 0.0, 100.0), **figures}
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.judge",
+        lambda _, plan: score_of(times[names[id(plan)]][0], times[names[id(plan)]][1]),
+    )
+    monkeypatch.setattr(
+        "ttscompile.calibration.choose.timed",
+        lambda entrants, threads, rounds=3: [Times((times[names[id(plan)]][2],) * rounds) for _, plan in entrants],
+    )
+    found = choose(kept, request(bound=0.1, farthest=0.25))
+    assert {name: names[id(plan)] for name, plan in found.plans.items() if name != DENSE} == {
+        "schedule": "c",
+        "safe": "e",
+        "fast": "a",
+    }
+    assert [*found.spare] == ["f"] and found.spare["f"] is kept.plans["f"]
+    assert {row["name"] for row in found.tried if row["kept"]} == {DENSE, "schedule", "safe", "fast", "f"}
+    assert [row["name"] for row in found.tried if row["spare"]] == ["f"]
+    assert found.scores.keys() == {"schedule", "safe", "fast", "f"}, "which 'bench --choose' reads"
+
+
+def test_a_distance_that_is_estimated_below_0_ends_the_frontier(
+    monkeypatch: pytest.MonkeyPatch, artifact: Path, recording: Path
+) -> None:
+    figures = {"a": (-0.1, 0.05, 1.0), "b": (-0.2, 0.04, 4.0), "c": (0.02, 0.04, 5.0)}
+    named = chosen(monkeypatch, trials_of(artifact, [recording]), figures, bound=0.1, farthest=0.25)
+    assert named["schedule"] == "a"
+
+
 @pytest.mark.slow
 def test_a_calibration_without_a_near_plan_leaves_the_original_the_default(
     artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
@@ -152,6 +202,42 @@ def test_a_calibration_without_a_near_plan_leaves_the_original_the_default(
     policy = ttscompile.load(artifact)
     assert policy.info.default_plan == DENSE
     assert policy.predict_action({"obs": np.zeros((1, 2, 3), np.float32)})["action"].shape == (1, 4, 2)
+
+
+@pytest.mark.slow
+def test_after_a_deadline_that_no_plan_keeps_another_error_is_chosen_from_what_was_found(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is answered or searched again."""
+    how: dict[str, Any] = {"learn": ("loops",), "progress": False, "max_minutes": 2, "resume": True}
+
+    def none(kept: Kept, asked: object) -> None:
+        raise CalibrationFailedError("no plan keeps the deadline.")
+
+    with monkeypatch.context() as late:
+        late.setattr(pipeline, "choose", none)
+        with pytest.raises(CalibrationFailedError, match="no plan keeps"):
+            calibrate(artifact, [recording], latency_ms=1e3, max_distance=2.0, **how)
+    assert (artifact / FILE).exists()
+    answered = list[int]()
+    monkeypatch.setattr(Runner, "run_dense", lambda self, calls: answered.append(calls.count))
+    result = calibrate(artifact, [recording], max_distance=3.0, **how)
+    assert not answered and result.budget == {"max_distance": 3.0} and "schedule" in load_artifact(artifact).plans
+
+
+def test_weights_that_were_trained_for_one_choice_are_no_other_ones(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(kept: Kept, *_: object) -> None:
+        kept.trials.state.save()
+        raise CalibrationFailedError("enough.")
+
+    monkeypatch.setattr(pipeline, "_hear", end)
+    how: dict[str, Any] = {"learn": ("loops", "weights"), "progress": False, "resume": True}
+    with pytest.raises(CalibrationFailedError, match="enough"):
+        calibrate(artifact, [recording], max_distance=0.1, **how)
+    with pytest.raises(CalibrationError, match=r"max_distance was 0.1, now 0.2"):
+        calibrate(artifact, [recording], max_distance=0.2, **how)
 
 
 def test_by_a_deadline_the_nearest_are_timed_until_99_of_100_calls_are_known(

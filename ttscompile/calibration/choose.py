@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ..artifact.corrections import correction_arrays
 from ..artifact.load import Artifact
 from ..artifact.onnx_files import weight_bytes
 from ..artifact.view import view_of
@@ -20,6 +21,9 @@ from .step_counts import FAST, SAFE
 TIMED_LONG = 200
 """Calls of a plan that may be the default by a deadline: their 99th percentile has to keep it."""
 
+SMALL = 0.05
+"""Of the artifact's files: a spare plan takes at most so much. Push-T's takes 1.6 %, of a small network a tenth."""
+
 
 @dataclass(frozen=True)
 class Frontier:
@@ -31,13 +35,16 @@ class Frontier:
             the original on held-out episodes, with 95 % limits (``judge``), and ``within`` the least bound that allows
             that; ``milliseconds`` and ``worst`` the median and ``Times.worst`` of its ``calls`` on this machine, in
             milliseconds; ``weights`` the bytes of those that its models read; ``near`` whether it is within
-            ``Request.farthest``; ``kept`` whether the artifact gets it.
+            ``Request.farthest``; ``kept`` whether the artifact gets it, and ``spare`` whether it does so for other
+            machines.
         plans: that the artifact gets, by name.
+        spare: that it gets for other machines, by the names that they had while they were tried.
         default: ``schedule``, or ``dense`` where no plan may be the default unasked.
     """
 
     tried: tuple[dict[str, Any], ...]
     plans: dict[str, Plan]
+    spare: dict[str, Plan]
     scores: dict[str, Score]
     default: str
 
@@ -48,7 +55,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     ``schedule`` is ``best_plan`` of those within ``Request.bound``, which are near enough, and the default; if there
     is none, it is the nearest within ``Request.farthest``, and ``dense`` the default. ``safe`` is the fastest that is
     near enough and a good deal nearer, and ``fast`` the fastest within ``Request.farthest``, where it saves more than
-    what counts as equally fast.
+    what counts as equally fast. What else may be it on another machine, or by another deadline, is kept as spare.
 
     Raises:
         CalibrationFailedError: no plan is within ``Request.farthest``; or none that is near enough keeps the deadline,
@@ -69,9 +76,12 @@ def choose(kept: Kept, request: Request) -> Frontier:
     if faster := {name: times[name].median for name in allowed if ALIKE * times[name].median < took}:
         named[fastest(faster, distances)] = FAST
     plans = {DENSE: kept.plans[DENSE], **{named[name]: entrants.plans[name] for name in named}}
-    plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other.otherwise for other in plans.values())}
+    spare = entrants.spare(named, allowed)
+    others = [plan.otherwise for plan in (*plans.values(), *spare.values())]
+    plans |= {one: plan for one, plan in kept.plans.items() if any(plan is other for other in others)}
     held = {**named, DENSE: DENSE} if default == DENSE else named
-    return Frontier(entrants.rows(named, allowed), plans, {held[name]: scores[name] for name in held}, default)
+    judged = {held[name]: scores[name] for name in held} | {name: scores[name] for name in spare}
+    return Frontier(entrants.rows(named, allowed, spare), plans, spare, judged, default)
 
 
 class _Entrants:
@@ -145,7 +155,24 @@ class _Entrants:
     def _nearness(self, name: str) -> tuple[float, float]:
         return round(self.distances[name], 3), self.times[name].median
 
-    def rows(self, named: dict[str, str], allowed: Sequence[str]) -> tuple[dict[str, Any], ...]:
+    def spare(self, named: Iterable[str], allowed: Sequence[str]) -> dict[str, Plan]:
+        """Of what may be taken the frontier: each nearer by more than a fifth than what is faster by more than that.
+
+        Without what the ``named`` plans are in another precision: any plan can be loaded in fp32 (``NAME@fp32``).
+        """
+        found, left = list[str](), {name: self.times[name].median for name in allowed}
+        while left:
+            found.append(fastest(left, self.distances))
+            most = max(self.distances[found[-1]], 0.0) / ALIKE  # below 0 is an estimate of 0
+            left = {name: took for name, took in left.items() if self.distances[name] < most}
+        known, spare = set(map(_base, named)), dict[str, Plan]()
+        for plan, name in ((self.plans[one], one) for one in map(_base, found) if one in allowed and one not in known):
+            arrays = {} if plan.correction is None else correction_arrays(name, plan.correction)
+            if sum(one.nbytes for one in arrays.values()) <= SMALL * self._trials.artifact.bytes:
+                spare[name] = plan
+        return spare
+
+    def rows(self, named: dict[str, str], allowed: Sequence[str], spare: Iterable[str]) -> tuple[dict[str, Any], ...]:
         """See ``Frontier.tried``, given the names that plans get, and which may be taken."""
         return tuple(
             {
@@ -159,10 +186,16 @@ class _Entrants:
                 "calls": len(times.ms),
                 "weights": weights_read(self._trials.artifact, self.plans[name]),
                 "near": name == DENSE or name in allowed,
-                "kept": name == DENSE or name in named,
+                "kept": name == DENSE or name in named or name in spare,
+                "spare": name in spare,
             }
             for name, times in sorted(self.times.items(), key=lambda one: one[1].median)
         )
+
+
+def _base(name: str) -> str:
+    """The plan that a variant of ``_Entrants.plans`` is of."""
+    return name.partition("@")[0].partition(",")[0]
 
 
 def weights_read(artifact: Artifact, plan: Plan) -> int:

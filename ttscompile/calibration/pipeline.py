@@ -236,18 +236,20 @@ def calibrate(
         corrects = correct or any(row.corrects for row in rows) or (SCHEDULE in learn and strategy_row.fits_correction)
         rate = policy_hz or recorded_rate(trajectories) or (artifact.manifest.calibration or {}).get("policy_hz")
         trains = any(row.trains for row in rows)
+        chosen_anew = chooses and not trains  # weights are trained for what was best
         limits = calls_to_learn_from(view.manifest, max_minutes, corrects=corrects, trains=trains)
         settings = {
             # Where plans stay, these too: what is learned is learned for one of them.
             "model": (artifact.manifest.model_identity if anew else artifact.manifest.identity)[:16],
             "trajectories": digest_of(episodes),
-            "budget": goal.record(),
+            # What is chosen in the end may be asked for anew of what was found: no search depends on it.
+            "budget": None if chosen_anew else goal.record(),
             "threads": goal.threads if chooses else 1,
             "learn": [row.name for row in rows],
             "strategy": strategy,
             "seed": seed,
             "validation_fraction": validation_fraction,
-            "max_distance": max_distance,
+            "max_distance": None if chosen_anew else max_distance,
             "correct": correct,
             "device": "cpu" if torch_device is None else str(torch_device),
             "max_intervals": max_intervals,
@@ -271,6 +273,7 @@ def calibrate(
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.keep_only(frontier.plans, frontier.scores, frontier.default)
+                kept.plans |= frontier.spare
             else:
                 kept.judge_changed(artifact.plans)
         # Where no schedule is learned: what one would have been asked for.

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...artifact.view import view_of
-from ...core.lattice import dense_plan, uniform_plan
+from ...core.lattice import dense_plan, uniform_plan, whole_steps_plan
 from ...core.plan import ORIGINAL, Plan
 from ...core.spec import Noise
 from ...errors import CalibrationFailedError
@@ -35,7 +35,7 @@ from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..schedule import open_search, resumed_search
-from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules
+from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules, spaced_steps
 from ..task import Found, Task
 from ..trials import LEARNED, Trials
 
@@ -51,6 +51,9 @@ are 0.38 away."""
 CLEARLY = 1.2
 """Nothing is left out as slower that takes less than so many times as long: costs are medians of a few calls on a
 machine that does other work too. In the end all plans are timed in turn."""
+
+UNCORRECTED = 2.0
+"""Crowding (``step_counts.CROWDING``) of schedules without a correction."""
 
 ANSWERING = 0.4
 """Share of a loop's time for the answers to learn from."""
@@ -105,13 +108,16 @@ class Loops(Proposer):
             share = clock.left() * weights[0] / sum(weights)
             own = self._opened(trials, loop, share)
             yield from self._of_loop(own, loop, _ending(clock, share), costs[loop], wanted)
+        if self._best is None:
+            yield from self._uncorrected(trials.of_loop(ORIGINAL), costs[ORIGINAL])
         best = self._best or self._nearest
         found = "computes the least of those that are near enough" if self._best else "is the nearest"
         if best is None:
             raise CalibrationFailedError(self._none(trials, min(order, key=lambda loop: costs[loop].one), costs))
         yield best
         left = f"left out: {', '.join(self._left_out)}" if self._left_out else ""
-        more = self._tasks[best.name].whole.told_of_episodes(best.notes["steps"])
+        task = self._tasks.get(best.name)
+        more = "" if task is None else task.whole.told_of_episodes(best.notes["steps"])
         self.told = "; ".join(filter(None, (f"{best.name} {found}", left, more)))
 
     def _by_distance(self, trials: Trials, costs: Mapping[str, Cost]) -> tuple[list[str], list[str]]:
@@ -188,6 +194,22 @@ class Loops(Proposer):
             if before or (reached and safer):
                 break
         return hopeful
+
+    def _uncorrected(self, own: Trials, cost: Cost) -> Proposals:
+        """Crowded schedules of the original's loop that there was no time for, as they are, until one is near enough.
+
+        They have the original's noise, so few answers tell that they are near, and nothing is learned for them.
+        """
+        steps, blocks = own.runner.model.steps, own.runner.model.blocks
+        most = max((n for n in COUNTS if _name(ORIGINAL, n) in self._scores), default=0)
+        for count in (n for n in COUNTS if most < n <= steps // 2):
+            if self._best is not None or self._too_slow(cost.of(count), self._fastest):
+                return
+            computed = spaced_steps(steps, count, UNCORRECTED)
+            plan = Plan(ORIGINAL, whole_steps_plan(steps, blocks, computed), repair=True)
+            name = _name(ORIGINAL, count)
+            one = Proposal(name, plan, {"steps": list(computed)}, beside=True, refusal=partial(self._refusal, name))
+            yield from self._judged(own, one, cost.of(count))
 
     def _within_reach(self, loop: str, counts: list[int], wanted: float) -> list[int]:
         """Those of these numbers of steps that a search with more calls may bring as near as is wanted."""
