@@ -82,6 +82,7 @@ class Seen:
         forward: bool ``[rows, columns]``, those whose tokens took the rows of a computed one.
         patch: height and width of a patch; pixels beyond the last one are in none.
         number: of this frame, new ones counted alone.
+        work: how many tokens were computed for it, and why.
     """
 
     pixels: Array
@@ -89,6 +90,7 @@ class Seen:
     forward: Array
     patch: tuple[int, int]
     number: int
+    work: TokenWork
 
 
 @dataclass
@@ -98,7 +100,8 @@ class _Kept:
     Attributes:
         pixels: that each token was computed for, ``[C, H, W]``.
         arrays: rows ``[T, ...]`` by input of the piece.
-        index: of the tokens that were computed for the newest frame.
+        work: for the newest frame.
+        index: of the tokens that were computed for it.
         forward: of those that took the rows of a computed one.
         age: new frames since all tokens were computed.
         number: of the newest frame.
@@ -107,6 +110,7 @@ class _Kept:
     pixels: Array
     arrays: dict[str, Array]
     values: tuple[Array, ...]
+    work: TokenWork
     index: Array
     forward: Array
     age: int = 0
@@ -144,7 +148,7 @@ class TokenTower:
             _, rows, columns, *_ = self._patches(kept.pixels).shape
             numbers = self._record.fixed + np.arange(rows * columns).reshape(rows, columns)
             computed, forward = np.isin(numbers, kept.index), np.isin(numbers, kept.forward)
-            yield Seen(kept.pixels.copy(), computed, forward, self._record.patch, kept.number)
+            yield Seen(kept.pixels.copy(), computed, forward, self._record.patch, kept.number, kept.work)
 
     def compute(self, lane: Lane, row: Mapping[str, Array]) -> tuple[tuple[Array, ...], TokenWork]:
         """What the tower gives for a new frame, a row ``[1, ...]`` by the input of the frame piece, and what was done.
@@ -161,7 +165,7 @@ class TokenTower:
         index, off, work = self._changed(kept, pixels[0])
         if kept is None:
             nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
-            kept = _Kept(pixels[0], nothing, (), index, index[:0])
+            kept = _Kept(pixels[0], nothing, (), work, index, index[:0])
         else:
             kept.age, kept.number, kept.forward = kept.age + 1, kept.number + 1, index[:0]
         if index.size:
@@ -177,7 +181,8 @@ class TokenTower:
             y, x = np.divmod(index[self._record.fixed :] - self._record.fixed, ours.shape[2])
             theirs[:, y, x] = ours[:, y, x]
         kept.index, self._lanes[lane] = index, kept
-        return kept.values, replace(work, forward=len(kept.forward), camera=lane.camera, stream=lane.stream)
+        kept.work = replace(work, forward=len(kept.forward), camera=lane.camera, stream=lane.stream)
+        return kept.values, kept.work
 
     def _changed(self, kept: _Kept | None, pixels: Array) -> tuple[Array, Array, TokenWork]:
         """Numbers of the tokens to compute, int64, none where no patch changed; how much each patch differs; and why.
