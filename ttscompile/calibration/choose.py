@@ -163,7 +163,7 @@ class _Entrants:
         found, left = list[str](), {name: self.times[name].median for name in allowed}
         while left:
             found.append(fastest(left, self.distances))
-            most = max(self.distances[found[-1]], 0.0) / ALIKE  # below 0 is an estimate of 0
+            most = min(self.distances[found[-1]], self.distances[found[-1]] / ALIKE)  # an estimate may be below 0
             left = {name: took for name, took in left.items() if self.distances[name] < most}
         known, spare = set(map(_base, named)), dict[str, Plan]()
         for plan, name in ((self.plans[one], one) for one in map(_base, found) if one in allowed and one not in known):

@@ -95,6 +95,11 @@ class SpacedSchedules:
             self._bar.update(number + 1, f"error {found[0].units:.4g}", self._clock.left())
         return None if found is None else Best(found[1], found[0].units)
 
+    def knows(self, full_steps: int) -> bool:
+        """Whether one of the family is known, which is the first that ``best`` looks at: no time is needed for it."""
+        first = spacings(self._whole.steps, full_steps, FEWER_CROWDINGS[:1])[0]
+        return ",".join(map(str, first)) in self._state.progress.get(self._key, {})
+
     def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]]) -> Errors | None:
         """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
         known = self._state.progress.setdefault(self._key, {})

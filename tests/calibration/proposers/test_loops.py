@@ -23,7 +23,7 @@ from ttscompile.calibration.calls import Calls
 from ttscompile.calibration.clock import Clock
 from ttscompile.calibration.judge import Score, judge
 from ttscompile.calibration.pipeline import calibrate
-from ttscompile.calibration.proposer import SAFER, Proposal, least_bound, near
+from ttscompile.calibration.proposer import SAFER, Proposal, near
 from ttscompile.calibration.proposers import loops
 from ttscompile.calibration.proposers.loops import REACH, Cost, Loops, would_help
 from ttscompile.calibration.runner import Runner
@@ -127,7 +127,6 @@ def test_a_loop_that_may_only_give_fast_comes_last_and_gets_less_of_the_time(
         return iter(())
 
     monkeypatch.setattr(Loops, "_of_loop", of_loop)
-    monkeypatch.setattr(Loops, "_uncorrected", lambda *_: iter(()))
     monkeypatch.setattr(Clock, "elapsed", lambda self: 0.0)
     trials = replace(trials_of(directory, [recording]), clock=Clock(100.0))
     for bound in (0.4, 0.01):
@@ -136,25 +135,6 @@ def test_a_loop_that_may_only_give_fast_comes_last_and_gets_less_of_the_time(
     close, far = tried[:2], tried[2:]
     assert close == [("short", 0.4, 50.0), (ORIGINAL, 0.4, 100.0)]
     assert far == [(ORIGINAL, 0.01, 80.0), ("short", 0.4, 100.0)]
-
-
-def test_where_nothing_is_near_schedules_of_the_original_are_tried_as_they_are(
-    directory: Path, recording: Path, timed: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The time was over before any was learned."""
-    monkeypatch.setattr(Loops, "_of_loop", lambda *_: iter(()))
-    trials = trials_of(directory, [recording])
-    every = proposed(Loops(request(bound=1e-6, farthest=100.0)), trials)
-    assert list(every) == [f"{ORIGINAL}.{count}" for count in (1, 2, 3, 4)], "up to half of the steps"
-    assert all(one.plan.loop == ORIGINAL and one.plan.correction is None for one, _ in every.values())
-    bounds = [least_bound(score.distance, score.interval) for _, score in every.values()]
-    proposer = Loops(request(bound=bounds[2], farthest=100.0))
-    proposer._scores[f"{ORIGINAL}.1"] = score_of(200.0)
-    found = proposed(proposer, trials)
-    assert bounds[2] < bounds[1] and list(found) == [f"{ORIGINAL}.{count}" for count in (2, 3)], "1 is known"
-    assert proposer.told.startswith(f"{ORIGINAL}.3 computes the least of those that are near enough")
-    late = Loops(request(bound=bounds[2], farthest=100.0, deadline_ms=11.5))
-    assert list(proposed(late, trials)) == [f"{ORIGINAL}.{count}" for count in (1, 2)], "a third step takes 12 ms"
 
 
 def test_a_plan_that_was_placed_by_rule_stays_where_a_search_finds_no_nearer_one() -> None:
@@ -211,6 +191,16 @@ def test_a_slow_original_is_left_out_where_the_fastest_plan_is_near(
 def test_where_no_plan_is_near_enough_the_nearest_is_told(directory: Path, recording: Path, timed: None) -> None:
     with pytest.raises(CalibrationFailedError, match=r"the nearest, '\w+\.\d', is .* 0.0001 and 0.000125 are allowed"):
         proposed(Loops(request(bound=1e-4)), trials_of(directory, [recording]))
+
+
+@pytest.mark.slow
+def test_what_was_found_before_the_time_was_over_is_found_again(directory: Path, recording: Path, timed: None) -> None:
+    """As where the last seconds of a build are interrupted, or nothing was near enough and it is asked again."""
+    trials = trials_of(directory, [recording])
+    found = proposed(Loops(request(bound=0.4)), trials)
+    over = replace(trials, clock=Clock(1.0, before=2.0))
+    assert {*proposed(Loops(request(bound=0.4)), over)} == {*found}
+    assert len(found) > 3 and over.clock.left() < 0
 
 
 @pytest.mark.slow

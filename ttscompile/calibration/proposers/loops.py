@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...artifact.view import view_of
-from ...core.lattice import dense_plan, uniform_plan, whole_steps_plan
+from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
 from ...core.spec import Noise
 from ...errors import CalibrationFailedError
@@ -35,7 +35,7 @@ from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..schedule import open_search, resumed_search
-from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules, spaced_steps
+from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules
 from ..task import Found, Task
 from ..trials import LEARNED, Trials
 
@@ -51,9 +51,6 @@ are 0.38 away."""
 CLEARLY = 1.2
 """Nothing is left out as slower that takes less than so many times as long: costs are medians of a few calls on a
 machine that does other work too. In the end all plans are timed in turn."""
-
-UNCORRECTED = 2.0
-"""Crowding (``step_counts.CROWDING``) of schedules without a correction."""
 
 ANSWERING = 0.4
 """Share of a loop's time for the answers to learn from."""
@@ -100,7 +97,7 @@ class Loops(Proposer):
             if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
-            if number and clock.left() <= 0:
+            if number and clock.left() <= 0 and f"crowded, {loop}" not in trials.state.progress:
                 clock.cut = True
                 self._left_out.append(f"{loop} for want of time")
                 continue
@@ -108,16 +105,13 @@ class Loops(Proposer):
             share = clock.left() * weights[0] / sum(weights)
             own = self._opened(trials, loop, share)
             yield from self._of_loop(own, loop, _ending(clock, share), costs[loop], wanted)
-        if self._best is None:
-            yield from self._uncorrected(trials.of_loop(ORIGINAL), costs[ORIGINAL])
         best = self._best or self._nearest
         found = "computes the least of those that are near enough" if self._best else "is the nearest"
         if best is None:
             raise CalibrationFailedError(self._none(trials, min(order, key=lambda loop: costs[loop].one), costs))
         yield best
         left = f"left out: {', '.join(self._left_out)}" if self._left_out else ""
-        task = self._tasks.get(best.name)
-        more = "" if task is None else task.whole.told_of_episodes(best.notes["steps"])
+        more = self._tasks[best.name].whole.told_of_episodes(best.notes["steps"])
         self.told = "; ".join(filter(None, (f"{best.name} {found}", left, more)))
 
     def _by_distance(self, trials: Trials, costs: Mapping[str, Cost]) -> tuple[list[str], list[str]]:
@@ -151,12 +145,13 @@ class Loops(Proposer):
         first = replace(own.runner.select(calls, range(few)), late=late) if small else calls
         task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
-        if small and clock.left() > 0:
+        # What the state has found by an interrupted build is taken even where the time is over.
+        if small and (clock.left() > 0 or any(_search(loop, count) in own.state.progress for count in counts)):
             task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small=small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         reached = False  # what is wanted; then one number of steps more is tried
         for number, count in enumerate(counts):
-            if number and clock.left() <= 0:
+            if number and clock.left() <= 0 and _search(loop, count) not in own.state.progress:
                 clock.cut = True
                 break
             share = _ending(clock, clock.left() / (len(counts) - number))
@@ -179,7 +174,8 @@ class Loops(Proposer):
         hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
         hopeful, reached = list[int](), False
         for number, count in enumerate(counts):
-            if number and (task.clock.left() <= 0 or self._too_slow(cost.of(count), fastest)):
+            late = task.clock.left() <= 0 and not crowded.knows(count)
+            if number and (late or self._too_slow(cost.of(count), fastest)):
                 break
             quick = crowded.best(count, f"{loop}, {count} steps", FEWER_CROWDINGS)
             if quick is None:  # no time; a search gives something
@@ -194,22 +190,6 @@ class Loops(Proposer):
             if before or (reached and safer):
                 break
         return hopeful
-
-    def _uncorrected(self, own: Trials, cost: Cost) -> Proposals:
-        """Crowded schedules of the original's loop that there was no time for, as they are, until one is near enough.
-
-        They have the original's noise, so few answers tell that they are near, and nothing is learned for them.
-        """
-        steps, blocks = own.runner.model.steps, own.runner.model.blocks
-        most = max((n for n in COUNTS if _name(ORIGINAL, n) in self._scores), default=0)
-        for count in (n for n in COUNTS if most < n <= steps // 2):
-            if self._best is not None or self._too_slow(cost.of(count), self._fastest):
-                return
-            computed = spaced_steps(steps, count, UNCORRECTED)
-            plan = Plan(ORIGINAL, whole_steps_plan(steps, blocks, computed), repair=True)
-            name = _name(ORIGINAL, count)
-            one = Proposal(name, plan, {"steps": list(computed)}, beside=True, refusal=partial(self._refusal, name))
-            yield from self._judged(own, one, cost.of(count))
 
     def _within_reach(self, loop: str, counts: list[int], wanted: float) -> list[int]:
         """Those of these numbers of steps that a search with more calls may bring as near as is wanted."""
@@ -305,6 +285,11 @@ class Loops(Proposer):
 
 def _name(loop: str, count: int) -> str:
     return f"{loop.replace('+', '')}.{count}"  # in the name of a plan a + is before a part
+
+
+def _search(loop: str, count: int) -> str:
+    """The name under which ``schedule.resumed_search`` keeps how far a search of so many steps is."""
+    return f"search, {loop}, {count} steps intervals"
 
 
 def _ending(clock: Clock, seconds: float) -> Clock:
