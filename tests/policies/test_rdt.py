@@ -128,6 +128,6 @@ def test_more_weights_than_the_machine_can_compile_are_refused(
 def test_options_of_other_families_are_refused(tmp_path: Path) -> None:
     assert_not_read(
         save_rdt(tmp_path / "rdt"),
-        "the option task is for policies of LeRobot, GR00T, Dita, openpi, Octo; this is one of RDT",
+        "the option task is for policies of LeRobot, GR00T, Evo-1, Dita, openpi, Octo; this is one of RDT",
         options=LoadOptions(task="push the block"),
     )
