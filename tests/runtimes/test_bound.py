@@ -159,4 +159,4 @@ def test_a_record_of_before_is_held_against_what_it_is_bounded_to(corrected: Cor
     for beyond, expected in ((5.0, True), (0.5, False)):
         stored = np.where(np.abs(sample) == 1, sample * beyond, sample)
         record = GoldenPlan(plan=plans, sample=np.stack([stored, stored[::-1]]), path=np.zeros(0, np.float32))
-        assert (replay(artifact, golden, opened, artifact.plans["fast"], record)[2] < 1e-3) == expected
+        assert (replay(artifact, golden, opened, artifact.plans["fast"], record)[3] < 1e-3) == expected

@@ -196,7 +196,7 @@ def test_a_plan_shifted_by_a_step(artifact: Path) -> None:
     rung = failure(artifact)
     assert (rung.name, rung.step) == ("plans", 1)
     assert "plan 'schedule'" in rung.told
-    assert "first at step 1, block 0" in rung.told
+    assert "first at step 1, block 0: it is the stored plan 1 step later" in rung.told
     errors = ttscompile.verify(artifact).map
     assert errors is not None
     assert errors.plan == "schedule"

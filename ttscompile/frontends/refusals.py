@@ -22,13 +22,6 @@ _RENAMED = (
     "If its class adds nothing to the original's that changes actions, save it again with the name of that class at the"
     " end of cfg.policy._target_. Otherwise:"
 )
-_ANOTHER = "a diffusion policy with another observation encoder than those that are read, or one of these renamed"
-_INSIDE = f"{_RENAMED} {_BUILD}. Its observation encoder belongs inside the module: hoisting takes it out of the loop."
-_JOINED = (
-    f"{_BUILD}. Two streams that attend to each other make no chain of additions: what lies between two points that all"
-    " paths cross becomes one block, and where there are none the compiler says so."
-)
-_VIDEO = "a world model that denoises video beside actions, Wan2.2, which is not rebuilt here"
 _HYDRA = "Give the file with the .hydra/config.yaml that its training wrote, in its folder or in the one above."
 _DIFFUSION_BC = "Give the state_dict of the Model_Cond_Diffusion. Their other models have no denoising loop to compile."
 _EXPERTS = f"{_BUILD}. The module has to compute all experts and weigh them, in place of choosing rows of the data."
@@ -73,7 +66,11 @@ class Refusal:
 POLICIES = (
     Refusal(r"^(ibc|bet|robomimic)", "a policy without diffusion", _NO_LOOP),
     Refusal(r"onedp", "a policy of OneDP, distilled to one evaluation", _ONCE),
-    Refusal(r"transformer|unet", _ANOTHER, _INSIDE),
+    Refusal(
+        r"transformer|unet",
+        "a diffusion policy with another observation encoder than those that are read, or one of these renamed",
+        f"{_RENAMED} {_BUILD}. Its observation encoder belongs inside the module: hoisting takes it out of the loop.",
+    ),
     Refusal(r"", "a policy of its own kind", f"{_RENAMED} {_BUILD}."),
 )
 """By the class name of a configuration's ``policy``, in lower case."""
@@ -110,7 +107,11 @@ LEROBOT = (
     Refusal(r"^tdmpc$", "a world model with a planner", _NO_LOOP),
     Refusal(r"^sac$", "an actor of reinforcement learning", _NO_LOOP),
     Refusal(r"^molmoact2$", "a policy whose backbone, Molmo, is not rebuilt here", _HEAD),
-    Refusal(r"^(fastwam|lingbot_va)$", _VIDEO, "No module of it was compiled yet."),
+    Refusal(
+        r"^(fastwam|lingbot_va)$",
+        "a world model that denoises video beside actions, Wan2.2, which is not rebuilt here",
+        "No module of it was compiled yet.",
+    ),
     Refusal(r"", "not known", f"Expected {LEROBOT_TYPES}. If it denoises: {_BUILD}."),
 )
 """By the type of a LeRobot policy, in lower case."""
@@ -128,7 +129,12 @@ STATES = (
     Refusal(r"(^|\.)(noise|time)_net\.", "a checkpoint of DiT-Policy", "Put its agent_config.yaml beside it."),
     Refusal(r"\.router\.|\.experts?\.\d+\.", "a mixture of experts (MoDE, say)", _EXPERTS),
     Refusal(r"(^|\.)inner_model\.", "a policy of k-diffusion (BESO or MDT, say)", _INNER_MODEL),
-    Refusal(r"\.add_[qkv]_proj\.|\.context_block\.|\.txt_(mlp|attn)", "a transformer of two streams (MM-DiT)", _JOINED),
+    Refusal(
+        r"\.add_[qkv]_proj\.|\.context_block\.|\.txt_(mlp|attn)",
+        "a transformer of two streams (MM-DiT)",
+        f"{_BUILD}. Two streams that attend to each other make no chain of additions: what lies between two points"
+        " that all paths cross becomes one block, and where there are none the compiler says so.",
+    ),
     Refusal(r"(^|\.)(down|up)_modules\.|(^|\.)unet\.", "weights of a U-Net", _WEIGHTS),
     Refusal(r"\blora_[AB]\b", "an adapter (LoRA) without the weights that it adapts", MERGE),
     Refusal(r"", "a plain dictionary of weights", _WEIGHTS),

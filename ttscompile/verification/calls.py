@@ -126,12 +126,12 @@ def check_plans(
     cells, worst = dict[str, npt.NDArray[np.bool_]](), 0.0
     for name, record in recorded.items():
         plan = artifact.plans[name].exact
-        differ, few, error = replay(artifact, golden, runtime, plan, record)
+        made, differ, few, error = replay(artifact, golden, runtime, plan, record)
         if not few:
             cells[name] = differ
             step, block = np.argwhere(differ)[0].tolist()
             told = f"plan {name!r} is not what calibration stored in {int(differ.sum())} of {differ.size} cells"
-            told += f", first at step {step}, block {block}"
+            told += f", first at step {step}, block {block}{_shifted(made[0, 0], record.plan[0, 0])}"
             failures.append((told, step, tuple(np.flatnonzero(differ[step]).tolist())))
             continue
         worst = max(worst, error)
@@ -156,12 +156,12 @@ def check_plans(
 
 def replay(
     artifact: Artifact, golden: Golden, runtime: Runtime, plan: Plan, record: GoldenPlan
-) -> tuple[npt.NDArray[np.bool_], bool, float]:
+) -> tuple[PlanArray, npt.NDArray[np.bool_], bool, float]:
     """The episode that ``GoldenPlan`` describes.
 
     Returns:
-        The cells ``[K, blocks]`` that are not those of the record; whether these may differ; and the error of the
-        samples, with the stored plan where cells differ.
+        Executed plans ``[2, B, K, blocks]``; the cells ``[K, blocks]`` that are not those of the record; whether these
+        may differ; and the error of the samples, with the stored plan where cells differ.
     """
     spec, start = artifact.manifest.spec, artifact.manifest.starts.get(plan.loop)
     loop = plan.loop if start is None else start.loop
@@ -187,7 +187,7 @@ def replay(
         _, samples = episode([replace(plan, cells=cells) for cells in record.plan])
     few = bool(np.count_nonzero(differ) <= (CELLS * differ.size if plan.pruned else 0))
     expected = bounded(artifact.manifest.sampler_of(loop), record.sample)  # records are older than what bounds a sample
-    return differ, few, largest(samples, expected)
+    return made, differ, few, largest(samples, expected)
 
 
 def _where(artifact: Artifact, golden: Golden, plan: Plan, path: npt.NDArray[np.float32]) -> tuple[int | None, str]:
@@ -211,6 +211,19 @@ def _where(artifact: Artifact, golden: Golden, plan: Plan, path: npt.NDArray[np.
             return k, f"the sampler goes another way from step {k} on, where the network's output is the original's"
         return k, f"the network's output is another from step {k} on"
     return k, f"the sample is another from step {k} on"
+
+
+def _shifted(found: PlanArray, recorded: PlanArray) -> str:
+    """In words: whether one plan ``[K, blocks]`` is the other, moved by a few steps."""
+    for by in (1, -1, 2, -2, 3, -3):
+        if len(found) <= abs(by):
+            continue
+        moved = np.roll(recorded, by, axis=0)
+        inner = slice(max(by, 0) + 1, len(found) + min(by, 0))
+        if np.array_equal(found[inner], moved[inner]) and (moved[inner] != recorded[inner]).any():
+            direction = "later" if by > 0 else "earlier"
+            return f": it is the stored plan {abs(by)} step{'s' * (abs(by) > 1)} {direction}"
+    return ""
 
 
 TOKENS = "tokens"

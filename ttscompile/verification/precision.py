@@ -83,7 +83,7 @@ def check_plans_precision(
     errors, wrong = dict[str, float](), dict[str, str]()
     for name, record in own.items():
         plan = replace(artifact.plans[name], tokens=None)  # what is recorded knows of no frames before
-        differ, few, errors[name] = replay(artifact, golden, runtime, plan, record)
+        _, differ, few, errors[name] = replay(artifact, golden, runtime, plan, record)
         if not few:
             wrong[name] = f"{name!r} in {np.count_nonzero(differ)} of {differ.size} cells"
         elif not errors[name] <= tolerance:
