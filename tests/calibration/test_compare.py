@@ -151,7 +151,7 @@ def test_an_artifact_that_predicts_fewer_steps_is_of_the_same_policy(planned: Pa
 
 
 def _point(name: str, latency: float, error: float) -> MeasuredPoint:
-    return MeasuredPoint("s", name, error, latency, (0.0, 9.0), error, (latency, latency), 0.5, 1.0)
+    return MeasuredPoint("s", name, error, latency, (0.0, 9.0), error, error, (latency, latency), 0.5, 1.0)
 
 
 def test_the_frontier_is_what_nothing_beats() -> None:
@@ -220,9 +220,11 @@ def test_bench_judges_the_plans_that_are_named(planned: Path, other_sampler: Pat
 
 def test_where_a_plan_is_far_by_number_of_the_action_and_by_call(frontier: Comparison, recording: Path) -> None:
     dense, half = (points(frontier)["this artifact", name] for name in ("dense", "half"))
-    assert len(half.by_number) == 2
+    assert len(half.by_number) == len(half.errors) == 2
+    assert np.mean(half.errors) == pytest.approx(half.error, rel=1e-4) and max(dense.errors) < 1e-6
     assert half.by_number != pytest.approx((half.distance,) * 2) and max(dense.by_number) < 1e-3
-    assert points(frontier)["five", "dense"].error is None, "which has other noise"
+    other = points(frontier)["five", "dense"]
+    assert other.error is None and other.errors == (), "which has other noise"
     distances = [one.distance for one in half.furthest]
     assert len(distances) == 3 and distances == sorted(distances, reverse=True) and distances[0] > half.distance
     assert {one.episode for one in half.furthest} <= set(frontier.episodes)

@@ -84,7 +84,7 @@ def test_a_table_breaks_no_number_where_there_is_room(width: int) -> None:
 
 
 def test_an_interval_that_one_call_cannot_give_is_unknown() -> None:
-    told: dict[str, Any] = {"error": 0.2, "quartiles_ms": (9.0, 11.0), "sparsity": 0.5, "flops": 1e9}
+    told: dict[str, Any] = {"error": 0.2, "error_p90": 0.3, "quartiles_ms": (9.0, 11.0), "sparsity": 0.5, "flops": 1e9}
     points = [
         MeasuredPoint("this artifact", name, 0.4, 10.0, interval, **told)
         for name, interval in (("one", (-1e15, 1e15)), ("many", (0.3, 0.5)))

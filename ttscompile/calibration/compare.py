@@ -131,6 +131,7 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
             distance=score.distance,
             interval=score.interval,
             error=score.error,
+            error_p90=score.error_p90,
             latency_ms=took.median,
             quartiles_ms=took.quartiles,
             sparsity=score.sparsity,
@@ -143,13 +144,17 @@ def _measured(entrants: Sequence[Entrant], threads: int, progress: Progress) -> 
 
 
 def _details(trials: Trials, score: Score) -> dict[str, Any]:
-    """``by_number`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
+    """``by_number``, ``errors`` and ``furthest`` of a ``MeasuredPoint``, whose score is of the held-out calls."""
     chunk = trials.artifact.manifest.spec.chunk
     x, y = score.answers, chunk.executed(trials.held_out.answers)
     assert x is not None  # ``judge`` made the score
     each = [pairs(x[..., n], y[..., n].astype(np.float64)) for n in range(chunk.action_dim)]
-    by_number = tuple(rooted(float(gap.mean()), float(unit.mean())) for gap, unit in each)
-    return {"by_number": by_number, "furthest": _shown(trials, score)[:-1]}
+    errors = (np.abs(x - y).mean((0, 1)) / chunk.scale).mean(0)
+    return {
+        "by_number": tuple(rooted(float(gap.mean()), float(unit.mean())) for gap, unit in each),
+        "errors": () if score.error is None else tuple(errors.tolist()),
+        "furthest": _shown(trials, score)[:-1],
+    }
 
 
 def _shown(trials: Trials, score: Score) -> tuple[FarCall, ...]:

@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     from ttscompile.measure.points import Comparison
 
 
+MOST_DRAWN = 8
+"""Plans whose furthest calls are drawn."""
+
+
 @dataclass(frozen=True)
 class Way:
     """How a compiled policy runs."""
@@ -208,9 +212,8 @@ def draw_comparison(found: Comparison, directory: Path, picture: Path) -> str:
     """Draw it, and beside it the calls that are furthest from the original; says so."""
     title = f"{directory.resolve().name}: {found.calls} held-out calls, {_threads(found)}\n{one_line(fingerprint())}"
     write_picture(plot_frontier(found.points, found.efficient(), title), picture)
-    shown = [
-        (f"{p.series}: {p.name}, {one.told}", one) for p in found.points[1:9] or found.points for one in p.furthest
-    ]
+    plans = found.points[1 : 1 + MOST_DRAWN] or found.points  # the first is the original
+    shown = [(f"{p.series}: {p.name}, {one.told}", one) for p in plans for one in p.furthest]
     write_picture(plot_calls(shown), calls := picture.with_stem(f"{picture.stem}-calls"))
     return f"wrote {picture} and {calls}"
 
@@ -222,7 +225,8 @@ def _threads(found: Comparison) -> str:
 def print_comparison(found: Comparison, output: Console) -> None:
     """The comparison as a table, and what is compared."""
     efficient = found.efficient()
-    made = table("", "plan", "distance", "95 %", "error", "ms a call", "quartiles", "GFLOP", "reused", "frontier")
+    scored = ("", "plan", "distance", "95 %", "error", "90th pct.")
+    made = table(*scored, "ms a call", "quartiles", "GFLOP", "reused", "frontier")
     for p in found.points:
         made.add_row(
             p.series,
@@ -230,6 +234,7 @@ def print_comparison(found: Comparison, output: Console) -> None:
             f"{p.distance:.3f}",
             "..".join(f"{one:.3f}" for one in p.interval) if max(p.interval) < LARGEST else "unknown",
             "" if p.error is None else f"{p.error:.4g}",
+            "" if p.error_p90 is None else f"{p.error_p90:.4g}",
             ms(p.latency_ms, 4),
             "..".join(ms(quartile, 4) for quartile in p.quartiles_ms),
             f"{p.flops / 1e9:.3f}",
@@ -237,10 +242,11 @@ def print_comparison(found: Comparison, output: Console) -> None:
             "yes" if p in efficient else "",
         )
     output.print(made)
-    apart = table("", "plan", "distance by number of the action", "furthest calls", "outside")
+    apart = table("", "plan", "distance by number of the action", "error", "furthest calls", "outside")
     for p in found.points:
-        by_number, outside = (", ".join(f"{one:.3g}" for one in each) for each in (p.by_number, p.outside))
-        apart.add_row(p.series, p.name, by_number, "; ".join(one.told for one in p.furthest), outside)
+        listed = (p.by_number, p.errors, p.outside)
+        by_number, errors, outside = (", ".join(f"{one:.3g}" for one in each) for each in listed)
+        apart.add_row(p.series, p.name, by_number, errors, "; ".join(one.told for one in p.furthest), outside)
     output.print(apart)
     say(
         output,

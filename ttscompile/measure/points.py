@@ -213,9 +213,11 @@ class MeasuredPoint(Point):
         interval: 95 % interval of the distance.
         error: mean absolute difference of the executed actions from the original's with the same noise, in their units;
             None of another sampler or start, which takes other noise.
+        error_p90: 90th percentile of that over the calls.
         quartiles_ms: first and third quartile of the latency.
         sparsity: share of the cells that are reused, mean over the calls.
         by_number: the distance of each number of the action alone.
+        errors: the error of each number of the action, in its units; empty where there is none.
         outside: how far the observations are from what was recorded (``core.envelope``), of half of the calls, of nine
             tenths and of all at most; empty of a plan without a correction.
         furthest: the calls with the largest distance, the largest first.
@@ -223,10 +225,12 @@ class MeasuredPoint(Point):
 
     interval: tuple[float, float]
     error: float | None
+    error_p90: float | None
     quartiles_ms: tuple[float, float]
     sparsity: float
     flops: float
     by_number: tuple[float, ...] = ()
+    errors: tuple[float, ...] = ()
     outside: tuple[float, ...] = ()
     furthest: tuple[FarCall, ...] = field(default=(), compare=False)
 
