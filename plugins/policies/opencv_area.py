@@ -114,11 +114,11 @@ class _Between(nn.Module):
         _keep(self, up=up, down=down, left=columns.first, right=columns.second)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        (high, low), (left, right) = self.places
+        (upper, lower), (left, right) = self.places
         # Sums of the first kind are exact in float32, and products of the second are not.
         wide = (_taken(pixels, left, -1) * self.left + _taken(pixels, right, -1) * self.right) / 2**4
         rows, down = wide.floor().to(torch.float64), self.down.to(torch.float64)
-        first, second = _taken(rows, high, -2) * self.up.to(torch.float64), _taken(rows, low, -2) * down
+        first, second = _taken(rows, upper, -2) * self.up.to(torch.float64), _taken(rows, lower, -2) * down
         whole = (first / 2**16).floor() + (second / 2**16).floor()
         return ((whole + 2) / 4).floor().clamp(0, 255).to(torch.float32)
 
@@ -158,7 +158,7 @@ def _area_pairs(before: int, after: int) -> _Pairs:
     share = ((new + 1) - (low + 1) * back).astype(np.float32)
     share = np.where(share <= 0, 0, share - np.floor(share))
     share = np.where(low >= before - 1, 0, share)
-    return _whole(low, share, before)
+    return _rounded(low, share, before)
 
 
 def _linear_pairs(before: int, after: int, inside: bool = False) -> _Pairs:
@@ -167,10 +167,10 @@ def _linear_pairs(before: int, after: int, inside: bool = False) -> _Pairs:
     low = np.floor(at).astype(np.int64)
     share = at - low.astype(np.float32)
     share = np.where((low < 0) | (low >= before - 1), 0, share) if inside else share
-    return _whole(low, share, before)
+    return _rounded(low, share, before)
 
 
-def _whole(low: npt.NDArray[np.int64], share: npt.NDArray[np.float32], before: int) -> _Pairs:
+def _rounded(low: npt.NDArray[np.int64], share: npt.NDArray[np.float32], before: int) -> _Pairs:
     """``share`` is of the second of two neighbours; those that are not there are the nearest ones that are."""
     first, second = (np.rint(each.astype(np.float32) * 2**_BITS) for each in (np.float32(1) - share, share))
     near, far = (np.clip(each, 0, before - 1) for each in (low, low + 1))

@@ -238,8 +238,8 @@ class Worker:
             args |= {"outside": True} if far else {}
             frames = getattr(report, "frames", None)
             args |= tokens_of(frames)
-            if frames is not None and (known := frames.scenes + frames.scenes_remembered):
-                args |= {"scenes": frames.scenes, "scenes known": known - frames.scenes}
+            if frames is not None and frames.scenes + frames.scenes_remembered:
+                args |= {"scenes": frames.scenes, "scenes known": frames.scenes_remembered}
             if self._seeing and frames is not None:
                 args |= {"frames": frames.computed, "frames known": frames.remembered, "hidden ms": frames.saved}
             self._trace.call(job.started, now, args, None if report is None else report.timings)

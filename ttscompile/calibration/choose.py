@@ -22,7 +22,8 @@ TIMED_LONG = 200
 """Calls of a plan that may be the default by a deadline: their 99th percentile has to keep it."""
 
 SMALL = 0.05
-"""Of the artifact's files: a spare plan takes at most so much. Push-T's takes 1.6 %, of a small network a tenth."""
+"""Share of the artifact's files that a spare plan takes at most: one of Push-T's takes 1.6 %, and one of a network that
+is small beside its corrections may take a tenth."""
 
 
 @dataclass(frozen=True)
@@ -165,12 +166,10 @@ class _Entrants:
             found.append(fastest(left, self.distances))
             most = min(self.distances[found[-1]], self.distances[found[-1]] / ALIKE)  # an estimate may be below 0
             left = {name: took for name, took in left.items() if self.distances[name] < most}
-        known, spare = set(map(_base, named)), dict[str, Plan]()
-        for plan, name in ((self.plans[one], one) for one in map(_base, found) if one in allowed and one not in known):
-            arrays = {} if plan.correction is None else correction_arrays(name, plan.correction)
-            if sum(one.nbytes for one in arrays.values()) <= SMALL * self._trials.artifact.bytes:
-                spare[name] = plan
-        return spare
+        known = set(map(_base, named))
+        spare = {name: self.plans[name] for name in map(_base, found) if name in allowed and name not in known}
+        most = SMALL * self._trials.artifact.bytes
+        return {name: plan for name, plan in spare.items() if _bytes(name, plan) <= most}
 
     def rows(self, named: dict[str, str], allowed: Sequence[str], spare: Iterable[str]) -> tuple[dict[str, Any], ...]:
         """See ``Frontier.tried``, given the names that plans get, and which may be taken."""
@@ -196,6 +195,12 @@ class _Entrants:
 def _base(name: str) -> str:
     """The plan that a variant of ``_Entrants.plans`` is of."""
     return name.partition("@")[0].partition(",")[0]
+
+
+def _bytes(name: str, plan: Plan) -> int:
+    """That a plan's correction takes."""
+    arrays = {} if plan.correction is None else correction_arrays(name, plan.correction)
+    return sum(one.nbytes for one in arrays.values())
 
 
 def weights_read(artifact: Artifact, plan: Plan) -> int:

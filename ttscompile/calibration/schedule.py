@@ -61,11 +61,16 @@ def search_plan(
     return search.found(), number, TIME_LIMIT if clock.cut else FINISHED
 
 
+def intervals_of(name: str) -> str:
+    """Where the state keeps how many intervals of a search are done."""
+    return f"{name} intervals"
+
+
 def resumed_search(
     trials: Trials, search: Search, clock: Clock, most: int | None, name: str = "search"
 ) -> tuple[Found, int, str]:
     """``search_plan`` from where the state is; saved after every interval, under a name."""
-    state, bar, done_so_far = trials.state, trials.bar, f"{name} intervals"
+    state, bar, done_so_far = trials.state, trials.bar, intervals_of(name)
     first = int(state.progress.get(done_so_far, 0))
     count = search.intervals if most is None else min(most, search.intervals)
     if first:

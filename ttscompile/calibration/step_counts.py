@@ -98,12 +98,12 @@ class SpacedSchedules:
     def knows(self, full_steps: int) -> bool:
         """Whether one of the family is known, which is the first that ``best`` looks at: no time is needed for it."""
         first = spacings(self._whole.steps, full_steps, FEWER_CROWDINGS[:1])[0]
-        return ",".join(map(str, first)) in self._state.progress.get(self._key, {})
+        return _listed(first) in self._state.progress.get(self._key, {})
 
     def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]]) -> Errors | None:
         """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
         known = self._state.progress.setdefault(self._key, {})
-        key = ",".join(map(str, steps))
+        key = _listed(steps)
         if key not in known:
             # All plans together are judged on fewer calls than one is compared on: that takes no longer.
             if not self._clock.has(2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps))):
@@ -115,6 +115,10 @@ class SpacedSchedules:
         with self._state.reading():
             normalised, units = known[key]
             return Errors(float(normalised), float(units))
+
+
+def _listed(steps: tuple[int, ...]) -> str:
+    return ",".join(map(str, steps))
 
 
 def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: int) -> Goal:

@@ -213,8 +213,9 @@ def told_spare(manifest: Manifest) -> tuple[str, ...]:
 def plan_table(artifact: Artifact) -> Table:
     """Every plan but spare ones: what it computes, its sparsity, its cost."""
     manifest, rows = artifact.manifest, list[tuple[str, ...]]()
+    left_out = spare(manifest)
     for name, own in plans_of(manifest).items():
-        if name in spare(manifest):
+        if name in left_out:
             continue
         told = f"{name} (default)" if name == manifest.default_plan else marked(name)
         saved = (artifact.plans[name].in_words(), own.kind, share(own.sparsity), share(own.flops_sparsity))

@@ -34,7 +34,7 @@ from ..budget import median_ms
 from ..clock import Clock
 from ..judge import Score, judge, other_noise, other_observations
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
-from ..schedule import open_search, resumed_search
+from ..schedule import intervals_of, open_search, resumed_search
 from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules
 from ..task import Found, Task
 from ..trials import LEARNED, Trials
@@ -97,7 +97,7 @@ class Loops(Proposer):
             if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
-            if number and clock.left() <= 0 and f"crowded, {loop}" not in trials.state.progress:
+            if number and _over(clock, trials, f"crowded, {loop}"):
                 clock.cut = True
                 self._left_out.append(f"{loop} for want of time")
                 continue
@@ -145,18 +145,17 @@ class Loops(Proposer):
         first = replace(own.runner.select(calls, range(few)), late=late) if small else calls
         task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
-        # What the state has found by an interrupted build is taken even where the time is over.
-        if small and (clock.left() > 0 or any(_search(loop, count) in own.state.progress for count in counts)):
+        if small and any(not _over(clock, own, intervals_of(_search(loop, count))) for count in counts):
             task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small=small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         reached = False  # what is wanted; then one number of steps more is tried
         for number, count in enumerate(counts):
-            if number and clock.left() <= 0 and _search(loop, count) not in own.state.progress:
+            if number and _over(clock, own, intervals_of(_search(loop, count))):
                 clock.cut = True
                 break
             share = _ending(clock, clock.left() / (len(counts) - number))
             search = open_search("tts", replace(task, clock=share, budget=count * own.runner.model.blocks))
-            found = resumed_search(own, search, share, None, f"search, {loop}, {count} steps")[0]
+            found = resumed_search(own, search, share, None, _search(loop, count))[0]
             yield from self._judged(own, self._proposal(task, loop, count, found), cost.of(count))
             before, reached = reached, self._reached(loop, count, wanted)
             if before or (reached and wanted < self._bound):
@@ -288,8 +287,13 @@ def _name(loop: str, count: int) -> str:
 
 
 def _search(loop: str, count: int) -> str:
-    """The name under which ``schedule.resumed_search`` keeps how far a search of so many steps is."""
-    return f"search, {loop}, {count} steps intervals"
+    """The name of a search of so many steps."""
+    return f"search, {loop}, {count} steps"
+
+
+def _over(clock: Clock, trials: Trials, begun: str) -> bool:
+    """Whether there is no time to begin this. What an interrupted build has begun is in the state, and read again."""
+    return clock.left() <= 0 and begun not in trials.state.progress
 
 
 def _ending(clock: Clock, seconds: float) -> Clock:
