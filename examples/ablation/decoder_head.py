@@ -59,13 +59,11 @@ class DecoderHead(Pass[Program, Program]):
         width: theirs is 512, beside policies of width 256.
         inner: of the feed-forward; theirs is 1024.
         heads: of the attention, as theirs.
-        scale: of the first numbers of the last layer, times theirs.
     """
 
     width: int = 128
     inner: int = 256
     heads: int = 8
-    scale: float = 1.0
 
     def call(self, program: Program) -> PassResult[Program]:
         pieces, steps, blocks = program.pieces, program.spec.sampler.steps, len(program.blocks)
@@ -105,7 +103,6 @@ class DecoderHead(Pass[Program, Program]):
             joint = 3 * d if name.startswith("cross") else 0  # torch draws the three projections as one matrix
             found[f"pruner.{name}.weight"] = xavier(rows, columns, joint) if value is None else value
             found[f"pruner.{name}.bias"] = np.zeros(rows, np.float32)
-        found["pruner.head.weight"] *= np.float32(self.scale)
         for i in (1, 2, 3):
             found[f"pruner.norm{i}.weight"], found[f"pruner.norm{i}.bias"] = (
                 make(d, np.float32) for make in (np.ones, np.zeros)
@@ -261,11 +258,10 @@ def _tokens(type_: TensorType) -> tuple[int, int]:
 @click.argument("directory", type=click.Path(path_type=Path))
 @click.option("--width", default=DecoderHead.width)
 @click.option("--inner", default=DecoderHead.inner, help="Of the feed-forward.")
-@click.option("--scale", default=DecoderHead.scale, help="Of the first numbers of the last layer, times theirs.")
-def main(checkpoint: Path, directory: Path, width: int, inner: int, scale: float) -> None:
+def main(checkpoint: Path, directory: Path, width: int, inner: int) -> None:
     """Write the artifact of CHECKPOINT, in its own loop, with the paper's head to DIRECTORY."""
     module, spec = load_checkpoint_policy(checkpoint)
-    made = DecoderHead(width=width, inner=inner, scale=scale)(transform(module, spec))
+    made = DecoderHead(width=width, inner=inner)(transform(module, spec))
     program = made.program
     write_artifact(program, lower_program(program), directory, golden=record_original(module, program))
     click.echo(f"{directory}: its head has {made.notes[0]}")
