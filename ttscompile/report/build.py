@@ -149,12 +149,13 @@ def _calls(manifest: Manifest, judged: JudgedPlan | None) -> Section:
     rows, titles = list[tuple[str, ...]](), list[str]()
     for one in judged.shown:
         place = "in the middle" if one is judged.shown[-1] else "furthest"
-        at = "" if hertz is None else f"{one.call * (chunk.stop - chunk.start) / hertz:.1f} s"
+        at = [] if hertz is None else [f"{one.call * (chunk.stop - chunk.start) / hertz:.1f} s"]
         off = np.abs(one.actions[1, 0] - one.actions[0, 0]).max(0)
         numbers = ", ".join(f"{off[n]:.3g} in number {n}" for n in one.numbers[:MOST_NUMBERS])
-        rows.append((place, f"{plain(one.name)}, call {one.call}", at, f"{one.distance:.3f}", numbers))
+        rows.append((place, f"{plain(one.name)}, call {one.call}", *at, f"{one.distance:.3f}", numbers))
         titles.append(f"{place}: {plain(one.name, 30)}, call {one.call}, distance {one.distance:.3f}")
-    head = ("", "recorded call", "time in its episode", "distance", "largest difference of the actions")
+    when = [] if hertz is None else ["time in its episode"]
+    head = ("", "recorded call", *when, "distance", "largest difference of the actions")
     caption = "What is executed, a row for each call: the numbers of the action that differ most, in their units."
     drawn = Picture(encoded(plot_calls([*zip(titles, judged.shown, strict=True)])), caption)
     return Section(title, (told, *judged.warnings), (Table(head, tuple(rows)),), (drawn,))
