@@ -20,10 +20,10 @@ from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.eager import eager_policy
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.policies.lerobot.multi_task_dit import Network, with_inputs
 from ttscompile.policies.lerobot.processors import Normalizer, Statistics, read_processors
 from ttscompile.policies.networks.clip import TextConfig
+from ttscompile.policies.networks.image_geometry import ResizeCrop
 
 from .lerobot_tiny import DA, DS, SIDE, TEXT, TO, VISION, change_json, dit_config, save_policy
 from .originals import assert_agreement_on_random_plans

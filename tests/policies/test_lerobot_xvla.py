@@ -12,11 +12,14 @@ from safetensors.torch import load_file, save_file
 
 from tests.families.scenes import without_scene
 from tests.once import Once
+from tests.rounding import assert_equal_but_for_rounding
+from tests.samplers.integration import NOISE, by_table, velocity
 from ttscompile.errors import TtscompileError
 from ttscompile.frontends import load_checkpoint_policy
 from ttscompile.frontends.families import AS_SAVED, LoadOptions
 from ttscompile.passes.split_frames import SplitFrames
 from ttscompile.policies.lerobot.files import files_beside
+from ttscompile.policies.lerobot.xvla import remixed_table
 from ttscompile.policies.networks.internvl import MEAN
 
 from . import xvlas
@@ -188,3 +191,13 @@ def test_steps_in_another_order_and_steps_of_a_robot(directory: Path) -> None:
     steps = json.loads(path.read_text())["steps"]
     change_json(path, steps=[*steps, {"registry_name": "xvla_rotation_6d_to_axis_angle", "config": {}}])
     assert_not_read(directory, "'xvla_rotation_6d_to_axis_angle' is not known .* outside of the policy")
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_predicted_actions_are_mixed_with_the_first_noise(steps: int) -> None:
+    """As X-VLA does it: what is predicted is not the velocity."""
+    table, clean = remixed_table(steps), np.zeros_like(NOISE)
+    for i in range(steps, 0, -1):
+        clean = velocity(i / steps * NOISE + (1 - i / steps) * clean, i / steps)
+    assert (table.name, table.steps, table.memories, table.bound) == ("remix", steps, 1, None)
+    assert_equal_but_for_rounding(by_table(table, NOISE, velocity), clean, terms=table.steps)

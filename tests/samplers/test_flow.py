@@ -11,7 +11,6 @@ from tests.rounding import assert_equal_but_for_rounding
 from tests.samplers.integration import NOISE, by_table, euler, rk4, velocity
 from ttscompile import SamplerTable, flow_matching_table
 from ttscompile.errors import SpecError
-from ttscompile.samplers.flow import remixed_table
 
 
 @pytest.mark.parametrize(("start", "end"), [(0.0, 1.0), (1.0, 0.0), (0.2, 0.9)])
@@ -44,16 +43,6 @@ def test_a_bound_of_the_last_step_alone_is_a_bound_of_the_finished_sample(steps:
     assert_equal_but_for_rounding(by_table(table, NOISE, velocity), expected, terms=2 * steps)
     if steps > 1:
         assert np.abs(by_table(bounded, NOISE, velocity) - expected).max() > 0.01
-
-
-@pytest.mark.parametrize("steps", [1, 2, 7])
-def test_predicted_actions_are_mixed_with_the_first_noise(steps: int) -> None:
-    """As X-VLA does it: what is predicted is not the velocity."""
-    table, clean = remixed_table(steps), np.zeros_like(NOISE)
-    for i in range(steps, 0, -1):
-        clean = velocity(i / steps * NOISE + (1 - i / steps) * clean, i / steps)
-    assert (table.name, table.steps, table.memories, table.bound) == ("remix", steps, 1, None)
-    assert_equal_but_for_rounding(by_table(table, NOISE, velocity), clean, terms=table.steps)
 
 
 def test_rk4_is_of_fourth_order() -> None:

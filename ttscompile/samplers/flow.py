@@ -73,29 +73,6 @@ def flow_matching_table(
     return METHODS[method].table(times, timestep_scale, clip)
 
 
-def remixed_table(steps: int) -> SamplerTable:
-    """The denoising loop of X-VLA, whose network predicts the actions themselves, at times from 1 to 0 in equal steps.
-
-    Each sample is the last prediction mixed with the noise that the call began with, which is the memory::
-
-        next = (1 - later) out + later noise
-    """
-    count = integer(steps, "steps", SpecError, 1)
-    times, first = np.arange(count, -1, -1) / count, np.arange(count) == 0
-    later, to_memory = times[1:], np.zeros((count, 1, 4))
-    to_memory[first, 0, 1] = to_memory[~first, 0, 3] = 1
-    return deterministic_table(
-        "remix",
-        times[:-1],
-        None,
-        out_to_x0=np.ones(count),
-        sample_to_next=np.where(first, later, 0),  # at first the sample is the noise
-        out_to_next=1 - later,
-        memory_to_next=np.where(first, 0, later)[:, None],
-        to_memory=to_memory,
-    )
-
-
 def refuse_bound(clip: float | None, method: str) -> None:
     """Raise SpecError for a bound that a method of several evaluations a step cannot keep."""
     if clip is not None:

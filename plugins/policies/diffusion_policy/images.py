@@ -12,10 +12,10 @@ import torch
 from torch import nn
 
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
 
+from ..networks.image_geometry import ResizeCrop
 from ..networks.resnet import CHANNELS, DEPTHS, Norm, group_norm, resnet
 from .parts import MOST_PIXELS, Observed, Weights, image_normalizer
 

@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.settings import Settings
 
+from ..networks.image_geometry import ResizeCrop
 from .images import COLOURS
 from .parts import MOST_PIXELS
 

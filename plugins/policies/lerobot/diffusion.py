@@ -22,12 +22,12 @@ from ttscompile.core.spec import PolicySpec
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings, is_shape
 
 from ..diffusion_policy.hybrid import SpatialSoftmax
 from ..networks.conditional_unet1d import ConditionalUnet1D, UNetConfig
+from ..networks.image_geometry import ResizeCrop
 from ..networks.resnet import DEPTHS, SHRINKS, Norm, group_norm, resnet
 from .config import ENVIRONMENT, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config
 from .policy import Measured, diffusion_loops, policy_spec, read_weights

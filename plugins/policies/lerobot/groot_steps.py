@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from ttscompile.core.poses import NUMBERS, Pose
 from ttscompile.core.tokenizer import TASK
 from ttscompile.errors import CheckpointError
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.settings import Settings
 
+from ..networks.image_geometry import ResizeCrop
 from . import processors as lerobot
 from .config import ACTION, MOST_LETTERS, MOST_PIXELS, STATE
 

@@ -20,7 +20,6 @@ from ttscompile.core.spec import Instruction, PolicySpec, SamplerTable
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.loops import Loops, loops_of
 from ttscompile.frontends.saved_weights import require_weights
 from ttscompile.frontends.settings import Settings
@@ -28,6 +27,7 @@ from ttscompile.samplers.flow import METHODS, flow_matching_table
 
 from ..instruction import NO_TASK, encoder_folders, find_encoder, task_tokens
 from ..networks.clip import TextConfig, VisionConfig, encoder_config
+from ..networks.image_geometry import ResizeCrop
 from ..networks.multi_task_dit import DiffusionTransformer, DiTConfig, ObservationEncoder
 from . import policy as lerobot
 from .config import CONFIG, MOST, MOST_PIXELS, STATE, LeRobotConfig, read_lerobot_config

@@ -9,12 +9,12 @@ from torch import nn
 from ttscompile.core.spec import ChunkSpec, ObservationSpec, PolicySpec, Relative
 from ttscompile.errors import CheckpointError, SpecError
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.loops import Loops
 from ttscompile.frontends.saved_weights import as_float32, left_out, read_tensors, require_memory
 from ttscompile.frontends.scheduler import MOST_STEPS, configured_loops
 from ttscompile.frontends.settings import Settings
 
+from ..networks.image_geometry import ResizeCrop
 from .config import ACTION, CONFIG, STATE, WEIGHTS, LeRobotConfig
 from .lora import find_base, merged, read_adapter
 from .processors import Normalizer, Processors

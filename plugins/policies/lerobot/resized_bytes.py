@@ -17,8 +17,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from ttscompile.frontends.image_geometry import ResizeCrop, resize_matrix
-
+from ..networks.image_geometry import ResizeCrop, resize_matrix
 from ..networks.internvl import Colours
 
 Filter = Literal["pillow", "torchvision", "card"]

@@ -19,13 +19,13 @@ from ttscompile.core.tokenizer import Tokenizer
 from ttscompile.errors import CheckpointError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
-from ttscompile.frontends.image_geometry import ResizeCrop
 from ttscompile.frontends.saved_weights import filled, renamed
 from ttscompile.frontends.settings import Settings
 
 from ..instruction import encoder_folders, task_tokens, told_after
 from ..networks.clip import TowerConfig
 from ..networks.groot import Denoiser, Groot, GrootConfig, Prefix
+from ..networks.image_geometry import ResizeCrop
 from ..networks.internvl import Prompt
 from ..networks.qwen3_vl import Qwen3VLConfig, rebuilt_weights
 from . import qwen3_vl as qwen, vla

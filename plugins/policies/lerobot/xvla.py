@@ -9,16 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ttscompile.core.coercion import integer
 from ttscompile.core.spec import PolicySpec, SamplerTable
 from ttscompile.errors import SpecError
 from ttscompile.frontends.encoded import EncodedDenoiser
 from ttscompile.frontends.families import LoadOptions
 from ttscompile.frontends.saved_weights import filled, renamed, separated
 from ttscompile.frontends.settings import Settings
-from ttscompile.samplers.flow import remixed_table
+from ttscompile.samplers.flow import deterministic_table
 
 from ..instruction import encoder_folders, find_encoder, task_tokens
 from ..networks.clip import TowerConfig
@@ -220,6 +222,29 @@ def _sampler(settings: Settings, options: LoadOptions) -> SamplerTable:
     if options.sampler is not None:
         raise SpecError(f"sampler {options.sampler!r}: the loop of xvla is its own. Leave it out; steps may be others.")
     return remixed_table(integration_steps(settings, options, "num_denoising_steps", 10))
+
+
+def remixed_table(steps: int) -> SamplerTable:
+    """The denoising loop of X-VLA, whose network predicts the actions themselves, at times from 1 to 0 in equal steps.
+
+    Each sample is the last prediction mixed with the noise that the call began with, which is the memory::
+
+        next = (1 - later) out + later noise
+    """
+    count = integer(steps, "steps", SpecError, 1)
+    times, first = np.arange(count, -1, -1) / count, np.arange(count) == 0
+    later, to_memory = times[1:], np.zeros((count, 1, 4))
+    to_memory[first, 0, 1] = to_memory[~first, 0, 3] = 1
+    return deterministic_table(
+        "remix",
+        times[:-1],
+        None,
+        out_to_x0=np.ones(count),
+        sample_to_next=np.where(first, later, 0),  # at first the sample is the noise
+        out_to_next=1 - later,
+        memory_to_next=np.where(first, 0, later)[:, None],
+        to_memory=to_memory,
+    )
 
 
 def _weights(shared: LeRobotConfig, options: LoadOptions, network: XVLA, domain: int) -> dict[str, Tensor]:

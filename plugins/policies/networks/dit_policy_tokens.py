@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ttscompile.frontends.image_geometry import ResizeCrop
-
+from .image_geometry import ResizeCrop
 from .resnet import CHANNELS, Norm, group_norm, resnet
 
 CAMERA, STATE = "cam{}", "state"

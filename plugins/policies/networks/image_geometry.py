@@ -4,7 +4,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from ..errors import CheckpointError
+from ttscompile.errors import CheckpointError
 
 
 class ResizeCrop(nn.Module):
