@@ -8,7 +8,7 @@ import numpy.typing as npt
 import torch
 
 from ttscompile.ir.evaluate import evaluator
-from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType, backward_slice
+from ttscompile.ir.graph import Argument, Enum, Graph, Node, Ref, TensorType, backward_slice, copied
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Phase, mapped
 
@@ -126,7 +126,7 @@ def fold_constants(graph: Graph, weights: Weights) -> Graph:
         new = f"{old}.constant"
         constants[new] = constants.pop(old)
         weights[new] = weights[old]  # which another graph may read as a constant
-        outputs.append(Node(old, "aten.clone.default", (Ref(new),), (), (types[old],), "constant output"))
+        outputs.append(replace(copied(old, new, types[old]), source="constant output"))
     return replace(graph, constants=constants, nodes=(*outputs, *rest))
 
 

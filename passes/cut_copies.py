@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ttscompile.ir.graph import GETITEM, Argument, Batch, Node, Ref, TensorType
+from ttscompile.ir.graph import GETITEM, Argument, Batch, Node, Ref, TensorType, reshaped
 from ttscompile.ir.program import Captured
 
 from .base import Pass, PassResult
 
-_RESHAPE = "aten.reshape.default"
 _SPLITS = ("aten.split.Tensor", "aten.split_with_sizes.default")
 
 
@@ -30,23 +29,19 @@ class CutCopies(Pass[Captured, Captured]):
     def call(self, program: Captured) -> PassResult[Captured]:
         graph = program.denoiser
         types, producers = graph.types(), graph.producers()
-        nodes: list[Node] = []
+        cuts: dict[str, list[Node]] = {}
         made: set[str] = set()
-        cut = 0
         for node in graph.nodes:
             found = _slice(node, types) if node.op == "aten.slice.Tensor" else _item(node, producers, types)
-            if found is None:
-                nodes.append(node)
-                continue
-            source, axis, start, stop = found
-            cut += 1
-            nodes += _cut(node, types[source], source, axis, start, stop, made)
-        if not cut:
+            if found is not None:
+                cuts[node.name] = _cut(node, types[found[0]], *found, made)
+        if not cuts:
             return PassResult(program)
+        nodes = graph.replaced(cuts).nodes
         read = {name for node in nodes for name in node.refs()} | set(graph.outputs)
         kept = tuple(n for n in nodes if n.op not in _SPLITS or n.name in read)
         new = replace(program, denoiser=replace(graph, nodes=kept))
-        return PassResult(new, (f"{cut} cuts of a multiple of the batch",))
+        return PassResult(new, (f"{len(cuts)} cuts of a multiple of the batch",))
 
 
 _Found = tuple[str, int, int, int]
@@ -72,13 +67,13 @@ def _multiple(size: Argument, of: Batch) -> int | None:
 def _slice(node: Node, types: Mapping[str, TensorType]) -> _Found | None:
     source = node.args[0]
     assert isinstance(source, Ref)
-    axis = _axis(types[source.name], node.args[1] if len(node.args) > 1 else 0)
-    if axis is None or (len(node.args) > 4 and node.args[4] != 1):
+    axis = _axis(types[source.name], node.argument(1, 0))
+    if axis is None or node.argument(4, 1) != 1:
         return None
     whole = types[source.name].shape[axis]
     assert isinstance(whole, Batch)
-    start = _multiple(node.args[2] if len(node.args) > 2 and node.args[2] is not None else 0, whole)
-    stop = _multiple(node.args[3] if len(node.args) > 3 else None, whole)
+    first = node.argument(2)
+    start, stop = _multiple(0 if first is None else first, whole), _multiple(node.argument(3), whole)
     if start is None or stop is None or (start, stop) == (0, whole.multiple):
         return None
     return source.name, axis, start, stop
@@ -91,7 +86,7 @@ def _item(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorT
     if split is None or split.op not in _SPLITS or not isinstance(split.args[0], Ref):
         return None
     source = split.args[0].name
-    axis = _axis(types[source], split.args[2] if len(split.args) > 2 else 0)
+    axis = _axis(types[source], split.argument(2, 0))
     if axis is None:
         return None
     multiples = [size.multiple for part in split.types if isinstance(size := part.shape[axis], Batch)]
@@ -104,13 +99,13 @@ def _item(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorT
 def _cut(node: Node, type_: TensorType, source: str, axis: int, start: int, stop: int, made: set[str]) -> list[Node]:
     whole = type_.shape[axis]
     assert isinstance(whole, Batch)
-    shape = (*type_.shape[:axis], whole.multiple, Batch(), *type_.shape[axis + 1 :])
+    of_copies = type_.with_axis(axis, whole.multiple, Batch())
     copies, nodes = f"{source}.copies{axis}", []
     if copies not in made:
         made.add(copies)
-        nodes.append(Node(copies, _RESHAPE, (Ref(source), shape), (), (replace(type_, shape=shape),), node.source))
+        nodes.append(reshaped(copies, source, of_copies, node.source))
     if stop - start == 1:
         return [*nodes, Node(node.name, "aten.select.int", (Ref(copies), axis, start), (), node.types, node.source)]
-    some = replace(type_, shape=(*shape[:axis], stop - start, *shape[axis + 1 :]))
+    some = of_copies.with_axis(axis, stop - start)
     part = Node(f"{node.name}.part", "aten.slice.Tensor", (Ref(copies), axis, start, stop), (), (some,), node.source)
-    return [*nodes, part, Node(node.name, _RESHAPE, (Ref(part.name), node.type.shape), (), node.types, node.source)]
+    return [*nodes, part, reshaped(node.name, part.name, node.type, node.source)]

@@ -78,9 +78,8 @@ def find_residual_blocks(graph: Graph, sample: str) -> BlockTable:
     loop = reachable_from(graph, [sample])
     links, declined = _links(graph, points, loop)
     if not links:
-        producers = graph.producers()
-        end = producers.get(points[-2] if len(points) > 1 else points[-1])
-        where = f"%{end.name} = {end.op} ({end.source or 'source unknown'})" if end else f"%{points[-1]}"
+        end = graph.producers().get(points[-2] if len(points) > 1 else points[-1])
+        where = f"%{end.name} = {end.op} ({end.place})" if end else f"%{points[-1]}"
         raise NoResidualBlocksError(
             "no residual block found: between the sample and the output no value a is updated as a + f(a)."
             f" The search walked {len(points)} dominators and ended at {where}."
@@ -114,7 +113,7 @@ def _links(graph: Graph, points: Sequence[str], loop: set[str]) -> tuple[list[_L
         if node.op != _ADD or node.name not in loop:
             continue
         operands = [a.name for a in node.args if isinstance(a, Ref)]
-        where = f"%{node.name} ({node.source or 'source unknown'})"
+        where = f"%{node.name} ({node.place})"
         streams = [o for o in operands if o in on_path and types[o] == node.type]
         if node.name not in on_path:
             if any(types[o] == node.type and o in loop for o in operands) and len(set(operands) & loop) == 2:
@@ -143,8 +142,7 @@ def _main_stream(graph: Graph, links: list[_Link], declined: list[str]) -> list[
     types = graph.types()
     work: Counter[TensorType] = Counter()
     for link in links:
-        flops = sum(node_flops(n, types) for n in between(graph, link.stream, link.residual))
-        work[types[link.result]] += 1 + flops
+        work[types[link.result]] += 1 + sum(node_flops(n, types) for n in between(graph, link.stream, link.residual))
     main = work.most_common(1)[0][0]
     others = [link.result for link in links if types[link.result] != main]
     declined += [f"%{result}: a residual of {types[result]}, beside the main stream of {main}" for result in others]
@@ -177,10 +175,11 @@ def _chain(graph: Graph, points: Sequence[str], links: list[_Link], declined: li
         if link.stream == cursor:
             add(cursor, link.result, link.residual)
         else:
-            gap = between(graph, cursor, link.stream)
+            first, *others = between(graph, cursor, link.stream)
+            more = f" and {len(others)} more" if others else ""
+            what = f"%{first.name} = {first.op} ({first.place}){more}"
             hides = _hides_residuals(graph, cursor, link.stream, stream_type)
-            changed = f"the residual stream is changed by {_describe(gap)} before the addition"
-            add(cursor, link.result, None, changed, hides)
+            add(cursor, link.result, None, f"the residual stream is changed by {what} before the addition", hides)
             declined.append(f"%{link.result}: merged with what comes before it; {blocks[-1].reason}")
         cursor = link.result
     if late != cursor and _hides_residuals(graph, cursor, late, stream_type):
@@ -198,12 +197,6 @@ def _hides_residuals(graph: Graph, start: str, stop: str, stream_type: TensorTyp
         and sum(types[o] == stream_type and o in names for o in dict.fromkeys(node.refs())) >= 2
         for node in inside
     )
-
-
-def _describe(nodes: Sequence[Node]) -> str:
-    first = nodes[0]
-    more = f" and {len(nodes) - 1} more" if len(nodes) > 1 else ""
-    return f"%{first.name} = {first.op} ({first.source or 'source unknown'}){more}"
 
 
 def _kind(graph: Graph, nodes: Sequence[Node], stream: str, hides: bool, loop: set[str]) -> str:

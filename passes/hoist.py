@@ -12,7 +12,7 @@ from ttscompile.core.spec import ORIGINAL, SamplerTable
 from ttscompile.ir.binding import bindings, input_bindings, numbering
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import graph_flops
-from ttscompile.ir.graph import Graph, Node, Ref, backward_slice
+from ttscompile.ir.graph import Graph, backward_slice, copied
 from ttscompile.ir.program import Binding, Cut, Pieces, Program, mapped
 from ttscompile.ir.rows import crossing_inputs, unfold
 
@@ -96,8 +96,7 @@ def _sink(piece: Graph, prologue: Graph, known: Mapping[str, Binding]) -> Graph:
 def _name_inputs(prologue: Graph) -> tuple[Graph, dict[str, str]]:
     """Read every input through a node of its own, so that whatever the loop needs is the result of some node."""
     renamed = {name: f"{name}.value" for name in prologue.inputs}
-    inputs = prologue.inputs.items()
-    copies = [Node(renamed[name], "aten.clone.default", (Ref(name),), (), (type_,)) for name, type_ in inputs]
+    copies = [copied(renamed[name], name, type_) for name, type_ in prologue.inputs.items()]
     reading = prologue.renamed(renamed)
     return replace(reading, inputs=prologue.inputs, nodes=(*copies, *reading.nodes)), renamed
 

@@ -148,8 +148,7 @@ def _features(program: Program) -> tuple[Graph, tuple[str, ...]]:
     The last value that everything the loop gets from the observation goes through and that some arithmetic has
     produced is the output of the policy's condition encoder; without one the observations themselves are read.
     """
-    pieces = program.pieces
-    graph = pieces.condition
+    graph = program.pieces.condition
     types, producers = graph.types(), graph.producers()
     arithmetic = {n.name for n in graph.nodes if node_flops(n, types)}
     observed = [key for key in graph.inputs if key != COMMITTED]  # a plan does not depend on a prefix

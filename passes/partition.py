@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 from ttscompile.ir.binding import numbering, one_step_at_a_time
-from ttscompile.ir.dataflow import reachable_from
-from ttscompile.ir.graph import Graph, Node, Ref, backward_slice
+from ttscompile.ir.dataflow import reachable_from, read_from_outside
+from ttscompile.ir.graph import Graph, Node, Ref, backward_slice, copied
 from ttscompile.ir.pieces import LoopPiece
 from ttscompile.ir.program import Block, Captured, Cut, Loop
 
@@ -31,17 +31,9 @@ class Partition(Pass[Captured, Cut]):
 
     def call(self, program: Captured) -> PassResult[Cut]:
         graph, spec, blocks = program.denoiser, program.spec, self.blocks
-        types = graph.types()
-        reached = reachable_from(graph, [spec.sample_argument])
+        types, reached = graph.types(), reachable_from(graph, [spec.sample_argument])
         # What a loop node reads from outside the loop; constants belong to the pieces themselves.
-        own = reached | numbering(graph) | one_step_at_a_time(graph, spec)
-        outside = {
-            name: types[name]
-            for node in graph.nodes
-            if node.name in own
-            for name in node.refs()
-            if name not in own and name not in graph.constants
-        }
+        outside = read_from_outside(graph, reached | numbering(graph) | one_step_at_a_time(graph, spec))
 
         def outline(start: str, result: str) -> LoopPiece:
             piece = backward_slice(graph, (result,), {start: types[start], **outside})
@@ -70,9 +62,8 @@ def _own_output(piece: Graph) -> Graph:
     (output,) = piece.outputs
     if output not in piece.inputs and output not in piece.constants:
         return piece
-    type_ = piece.types()[output]
-    clone = Node(f"{output}.copy", "aten.clone.default", (Ref(output),), (), (type_,))
-    return replace(piece, nodes=(*piece.nodes, clone), outputs=(clone.name,))
+    copy = copied(f"{output}.copy", output, piece.types()[output])
+    return replace(piece, nodes=(*piece.nodes, copy), outputs=(copy.name,))
 
 
 def _difference(piece: LoopPiece) -> LoopPiece:

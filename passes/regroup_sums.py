@@ -44,10 +44,10 @@ class RegroupSums(Pass[Captured, Captured]):
             if len(streams) != 1 or len(branches) < 2 or any(t not in loop or types[t] != node.type for t in branches):
                 continue
             new[node.name] = _regrouped(node, streams[0], branches)
-            notes.append(f"%{node.name} ({node.source or 'source unknown'}): {len(branches)} branches in parallel")
+            notes.append(f"%{node.name} ({node.place}): {len(branches)} branches in parallel")
         if not new:
             return PassResult(program)
-        regrouped = replace(graph, nodes=tuple(n for node in graph.nodes for n in new.get(node.name, [node])))
+        regrouped = graph.replaced(new)
         live = reaching(regrouped, graph.outputs)  # without the sums that were inside
         regrouped = replace(regrouped, nodes=tuple(n for n in regrouped.nodes if n.name in live))
         return PassResult(replace(program, denoiser=regrouped), tuple(notes))

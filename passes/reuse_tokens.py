@@ -8,7 +8,7 @@ import torch
 
 from ttscompile.ir import pieces as names
 from ttscompile.ir.evaluate import evaluator
-from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, backward_slice
+from ttscompile.ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice, copied
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Program
 from ttscompile.ir.tokens import ATTENTION, TokenStream, find_tokens
@@ -94,10 +94,15 @@ def _rowless(batch: Batch) -> int:
     return batch.multiple
 
 
+def _of_some(type_: TensorType, axis: int) -> TensorType:
+    """The type of a value with the rows of some tokens alone."""
+    return type_.resized(_rowless).with_axis(axis, Batch())
+
+
 def _pixels_graph(tower: Graph, stream: TokenStream) -> Graph:
     """The row to what patches are cut from, under a name of its own."""
-    graph, type_ = backward_slice(tower, (stream.pixels,), {}), tower.types()[stream.pixels]
-    copy = Node(names.PIXELS, "aten.clone.default", (Ref(stream.pixels),), (), (type_,))
+    graph = backward_slice(tower, (stream.pixels,), {})
+    copy = copied(names.PIXELS, stream.pixels, tower.types()[stream.pixels])
     return replace(graph, inputs=tower.inputs, nodes=(*graph.nodes, copy), outputs=(names.PIXELS,))
 
 
@@ -129,7 +134,7 @@ class _Changed:
         sizes = {names.INDEX: 1, names.PLACES: 2, names.ROWS: 2}
         numbers = {name: TensorType((Batch(size),), "int64") for name, size in sizes.items()}
         pixels = types[stream.pixels].resized(_rowless)
-        self.nodes.append(Node(stream.pixels, "aten.clone.default", (Ref(names.PIXELS),), (), (pixels,)))
+        self.nodes.append(copied(stream.pixels, names.PIXELS, pixels))
         for node in own.nodes:
             if node.name in axes and node.name != stream.entry:
                 self._changed(node)
@@ -145,22 +150,16 @@ class _Changed:
         given = {names.PIXELS: pixels, **numbers, **self.inputs}
         return Graph(given, own.constants, tuple(self.nodes), (*own.outputs, *self.outputs))
 
-    def _part(self, type_: TensorType, axis: int) -> TensorType:
-        """The type of a value with the rows of some tokens alone."""
-        sizes: list[Size] = list(type_.resized(_rowless).shape)
-        sizes[axis] = Batch()
-        return replace(type_, shape=tuple(sizes))
-
     def _gather(self, name: str, axis: int) -> Ref:
         if not any(node.name == f"{name}.changed" for node in self.nodes):
             args = (Ref(name), axis, Ref(names.INDEX))
-            type_ = self._part(self.types[name], axis)
+            type_ = _of_some(self.types[name], axis)
             self.nodes.append(Node(f"{name}.changed", "aten.index_select.default", args, (), (type_,)))
         return Ref(f"{name}.changed")
 
     def _changed(self, node: Node) -> None:
         axes, axis = self.stream.axes, self.stream.axes[node.name]
-        types = tuple(self._part(type_, axis) for type_ in node.types)
+        types = tuple(_of_some(type_, axis) for type_ in node.types)
         elementwise, behind = operation(node.op).elementwise, len(node.type.shape) - axis
 
         def operand(place: int, argument: Argument) -> Argument:

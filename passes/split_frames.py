@@ -12,7 +12,7 @@ from ttscompile.core.spec import COMMITTED, ObservationSpec
 from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.evaluate import evaluator
 from ttscompile.ir.flops import graph_flops, node_flops, once_flops
-from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType, backward_slice
+from ttscompile.ir.graph import Batch, Graph, Node, Ref, TensorType, backward_slice, copied, reshaped
 from ttscompile.ir.operations import Movement, operation
 from ttscompile.ir.program import Program
 
@@ -143,8 +143,7 @@ class _Tower:
 
 def _is_frame(spec: ObservationSpec) -> bool:
     """Whether an observation is one picture, or an instruction: what may well be the same in the next call."""
-    axes = len(spec.shape) - (spec.frames is not None)
-    return (spec.frames or 1) == 1 and (axes >= 3 or not spec.dtype.startswith("float"))
+    return (spec.frames or 1) == 1 and (len(spec.one_frame.shape) >= 3 or not spec.dtype.startswith("float"))
 
 
 def _parted(graph: Graph, changing: Collection[str]) -> tuple[Graph, Graph]:
@@ -257,7 +256,7 @@ def _of_rows(graph: Graph, rows: int, exits: Collection[str]) -> Graph:
 
     nodes = tuple(node.resized(size) for node in graph.nodes)
     types = {node.name: node.type for node in nodes}
-    out = tuple(Node(_crossing(n), "aten.clone.default", (Ref(n),), (), (types[n],)) for n in exits)
+    out = tuple(copied(_crossing(n), n, types[n]) for n in exits)
     inputs = {name: type_.resized(size) for name, type_ in graph.inputs.items()}
     return Graph(inputs, graph.constants, (*nodes, *out), tuple(map(_crossing, exits)))
 
@@ -278,12 +277,11 @@ def _rows_graph(graph: Graph, groups: list[list[_Tower]]) -> Graph:
                 (_, *row), m, parts = types[entry].shape, group[0].rows, list[Ref]()
                 for one in (tower.entries[place] for tower in group):
                     kind, part = replace(types[entry], shape=(Batch(), m, *row)), f"{one}.of_stream"
-                    nodes.append(Node(part, "aten.reshape.default", (Ref(one), kind.shape), (), (kind,)))
+                    nodes.append(reshaped(part, one, kind))
                     parts.append(Ref(part))
                 kind, whole = replace(kind, shape=(Batch(), len(group) * m, *row)), f"{name}.of_stream"
                 nodes.append(Node(whole, "aten.cat.default", (tuple(parts), 1), (), (kind,)))
-                kind = replace(kind, shape=(Batch(len(group) * m), *row))
-                nodes.append(Node(name, "aten.reshape.default", (Ref(whole), kind.shape), (), (kind,)))
+                nodes.append(reshaped(name, whole, replace(kind, shape=(Batch(len(group) * m), *row))))
     observed = {name: kind for name, kind in graph.inputs.items() if name != COMMITTED}
     return Graph(observed, own.constants, tuple(nodes), tuple(name for g in groups for name in _together(g)))
 
@@ -294,17 +292,16 @@ def _rest(graph: Graph, groups: list[list[_Tower]]) -> Graph:
         first, count = group[0], len(group)
         for place, name in enumerate(first.exits):
             kind, crossing = types[name], _crossing(name)
-            inputs[crossing] = replace(kind, shape=(Batch(count * first.rows), *kind.shape[1:]))
+            inputs[crossing] = kind.with_axis(0, Batch(count * first.rows))
             if count == 1:
-                nodes.append(Node(name, "aten.clone.default", (Ref(crossing),), (), (kind,)))
+                nodes.append(copied(name, crossing, kind))
                 continue
-            apart = replace(kind, shape=(Batch(), count, first.rows, *kind.shape[1:]))
-            nodes.append(Node(f"{crossing}.apart", "aten.reshape.default", (Ref(crossing), apart.shape), (), (apart,)))
-            own = replace(kind, shape=(Batch(), first.rows, *kind.shape[1:]))
+            apart, own = f"{crossing}.apart", kind.with_axis(0, Batch(), first.rows)
+            nodes.append(reshaped(apart, crossing, kind.with_axis(0, Batch(), count, first.rows)))
             for i, name in enumerate(tower.exits[place] for tower in group):
-                which, part = (Ref(f"{crossing}.apart"), 1, i), f"{name}.of_stream"
-                nodes.append(Node(part, "aten.select.int", which, (), (own,)))
-                nodes.append(Node(name, "aten.reshape.default", (Ref(part), kind.shape), (), (kind,)))
+                part = f"{name}.of_stream"
+                nodes.append(Node(part, "aten.select.int", (Ref(apart), 1, i), (), (own,)))
+                nodes.append(reshaped(name, part, kind))
     made = {node.name for node in nodes}
     whole = replace(graph, inputs=inputs, nodes=(*nodes, *(n for n in graph.nodes if n.name not in made)))
     return replace(backward_slice(whole, graph.outputs, {}), inputs=inputs)

@@ -8,7 +8,7 @@ from itertools import accumulate, groupby
 from ttscompile.ir.binding import bindings, input_bindings, join
 from ttscompile.ir.dataflow import reachable_from
 from ttscompile.ir.graph import Argument, Graph, Node, Ref, TensorType
-from ttscompile.ir.operations import Movement, axis_after, operation
+from ttscompile.ir.operations import Movement, axis_after, joined_axis, operation
 from ttscompile.ir.program import Binding, Captured, Cut
 
 from .base import Pass, PassResult
@@ -85,7 +85,7 @@ class _Splitter:
             for name in operands:
                 if name not in self.whole and self.bindings[name] is Binding.STEP:
                     self.notes.append(
-                        f"declined to split further at %{node.name} = {node.op} ({node.source or 'source unknown'}):"
+                        f"declined to split further at %{node.name} = {node.op} ({node.place}):"
                         " it is not token-wise, or no rule knows it"
                     )
                 self._need(name)
@@ -129,7 +129,7 @@ class _Splitter:
             name = group[0][0]
             if len(group) > 1:
                 args = (tuple(Ref(part) for part, _ in group), axis)
-                name = self.emit(node, i, args, (_resized(node.type, axis, size),))
+                name = self.emit(node, i, args, (node.type.with_axis(axis, size),))
             grouped.append(name)
         self.parts[node.name] = _Parts(axis, tuple(grouped), tuple(sizes))
         self.split_at.append(node.name)
@@ -137,16 +137,11 @@ class _Splitter:
 
     def slice_part(self, node: Node, name: str, axis: int, start: int, size: int, index: int) -> str:
         """Rows ``start .. start + size`` of an operand that is not split."""
-        type_ = _resized(self.types[name], axis, size)
+        type_ = self.types[name].with_axis(axis, size)
         part = f"{node.name}.slice{index}"
-        args = (Ref(name), axis, start, start + size)
-        self.nodes.append(Node(part, _SLICE, args, (), (type_,), node.source))
+        self.nodes.append(Node(part, _SLICE, (Ref(name), axis, start, start + size), (), (type_,), node.source))
         self.types[part], self.bindings[part] = type_, self.bindings[name]
         return part
-
-
-def _resized(type_: TensorType, axis: int, size: int) -> TensorType:
-    return replace(type_, shape=(*type_.shape[:axis], size, *type_.shape[axis + 1 :]))
 
 
 def _parts(splitter: _Splitter, node: Node) -> _Parts | None:
@@ -170,7 +165,7 @@ def _per_part(splitter: _Splitter, node: Node, source: _Parts, axis: int, shaped
     """Emit ``node`` once a part; if it is ``shaped``, with the shape of the part as its second argument."""
     names = []
     for i, (name, size) in enumerate(zip(source.names, source.sizes, strict=True)):
-        types = tuple(_resized(type_, axis, size) for type_ in node.types)
+        types = tuple(type_.with_axis(axis, size) for type_ in node.types)
         args = (Ref(name), types[0].shape) if shaped else (Ref(name), *node.args[1:])
         names.append(splitter.emit(node, i, args, types))
     return _Parts(axis, tuple(names), source.sizes)
@@ -197,7 +192,7 @@ def _elementwise(splitter: _Splitter, node: Node) -> _Parts | None:
                     index = i * len(node.args) + position
                     argument = Ref(splitter.slice_part(node, argument.name, own, sum(sizes[:i]), size, index))
             args.append(argument)
-        names.append(splitter.emit(node, i, tuple(args), (_resized(node.type, axis, size),)))
+        names.append(splitter.emit(node, i, tuple(args), (node.type.with_axis(axis, size),)))
     return _Parts(axis, tuple(names), sizes)
 
 
@@ -221,19 +216,15 @@ class SplitFeatures(Pass[Cut, Cut]):
     def call(self, program: Cut) -> PassResult[Cut]:
         prologue, spec = program.prologue, program.spec
         known, producers, types = bindings(prologue, input_bindings(spec)), prologue.producers(), prologue.types()
-        nodes: list[Node] = []
-        split = 0
+        sums: dict[str, list[Node]] = {}
         for node in prologue.nodes:
-            parts = _features(node, producers, types) if node.op == _LINEAR else []
-            if len({known[part] for part in parts}) < 2:
-                nodes.append(node)
-                continue
-            nodes += _sum(node, parts, types)
-            split += 1
-        if not split:
+            parts = _features(node, producers, types)
+            if len({known[part] for part in parts}) > 1:
+                sums[node.name] = _sum(node, parts, types)
+        if not sums:
             return PassResult(program)
-        note = f"{split} linear layers of features with different binding times became sums"
-        return PassResult(replace(program, prologue=replace(prologue, nodes=tuple(nodes))), (note,))
+        note = f"{len(sums)} linear layers of features with different binding times became sums"
+        return PassResult(replace(program, prologue=prologue.replaced(sums)), (note,))
 
 
 class SplitStem(Pass[Captured, Captured]):
@@ -258,17 +249,15 @@ class SplitStem(Pass[Captured, Captured]):
     def call(self, program: Captured) -> PassResult[Captured]:
         graph = program.denoiser
         loop, producers = reachable_from(graph, [program.spec.sample_argument]), graph.producers()
-        nodes, notes, types = list[Node](), list[str](), graph.types()
+        sums, notes, types = dict[str, list[Node]](), list[str](), graph.types()
         for node in graph.nodes:
-            parts = _features(node, producers, types) if node.op == _LINEAR else []
+            parts = _features(node, producers, types)
             moving = [i for i, part in enumerate(parts) if part in loop]
-            if len(parts) < 2 or len(moving) != 1 or list(node.refs())[1] not in graph.constants:
-                nodes.append(node)
-                continue
-            own = [part if part in loop else _narrow(part, producers, types) for part in parts]
-            nodes += _sum(node, own, types, *moving)
-            notes.append(f"%{node.name} ({node.source or 'source unknown'}): one of {len(parts)} parts is in the loop")
-        split = replace(program, denoiser=replace(graph, nodes=tuple(nodes))) if notes else program
+            if len(parts) > 1 and len(moving) == 1 and list(node.refs())[1] in graph.constants:
+                own = [part if part in loop else _narrow(part, producers, types) for part in parts]
+                sums[node.name] = _sum(node, own, types, *moving)
+                notes.append(f"%{node.name} ({node.place}): one of {len(parts)} parts is in the loop")
+        split = replace(program, denoiser=graph.replaced(sums)) if sums else program
         return PassResult(split, tuple(notes))
 
 
@@ -283,7 +272,9 @@ def _narrow(part: str, producers: Mapping[str, Node], types: Mapping[str, Tensor
 
 
 def _features(node: Node, producers: Mapping[str, Node], types: Mapping[str, TensorType]) -> list[str]:
-    """The features that a linear layer reads, if they are concatenated along its last axis; else none."""
+    """The features that a node reads, if it is a linear layer and they are concatenated along its last axis."""
+    if node.op != _LINEAR:
+        return []
     source, weight = node.args[0], node.args[1]
     cat = producers.get(source.name) if isinstance(source, Ref) else None
     if cat is None or cat.op != _CAT or not isinstance(weight, Ref) or len(types[weight.name].shape) != 2:
@@ -298,11 +289,9 @@ def _joined(cat: Node, types: Mapping[str, TensorType]) -> tuple[list[str], int]
 
     Nothing if one part has another dtype: apart it would be computed with in its own.
     """
-    operands, axis = cat.args[0], cat.args[1] if len(cat.args) > 1 else 0
-    assert isinstance(operands, tuple) and isinstance(axis, int)
-    names = [operand.name for operand in operands if isinstance(operand, Ref)]
+    names = list(cat.refs())
     alike = all(types[name].dtype == cat.type.dtype for name in names)
-    return names if alike else [], axis % len(cat.type.shape)
+    return names if alike else [], joined_axis(cat)
 
 
 def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType], first: int = 0) -> list[Node]:
@@ -320,7 +309,7 @@ def _sum(node: Node, parts: list[str], types: Mapping[str, TensorType], first: i
     for place, index in enumerate(order):
         part, size = parts[index], _width(types[parts[index]])
         cut = (weight, 1, ends[index] - size, ends[index])
-        columns = emit(f"{node.name}.columns{index}", _SLICE, cut, _resized(matrix, 1, size))
+        columns = emit(f"{node.name}.columns{index}", _SLICE, cut, matrix.with_axis(1, size))
         made = TensorType((*types[part].shape[:-1], matrix.shape[0]), node.type.dtype)
         args = (Ref(part), columns, *(() if place else node.args[2:]))  # the bias once
         linear = emit(f"{node.name}.part{index}", _LINEAR, args, made)

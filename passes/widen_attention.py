@@ -70,7 +70,7 @@ def _with_head(type_: TensorType) -> TensorType:
 
 def _with_rows(node: Node, types: dict[str, TensorType], made: dict[object, Argument]) -> list[Node]:
     """The attention on a mask of ``[.., T, S]``, and the nodes that make that; ``made`` has those of others."""
-    mask = node.args[_MASK] if len(node.args) > _MASK else dict(node.kwargs).get("attn_mask")
+    mask = node.argument(_MASK, dict(node.kwargs).get("attn_mask"))
     if not isinstance(mask, Ref):
         return [node]
     query, key = node.args[:2]

@@ -41,9 +41,8 @@ class WriteSums(Pass[Captured, Captured]):
                 new[node.name] = _written(node, stream)
         if not new:
             return PassResult(program)
-        nodes = tuple(one for node in graph.nodes for one in new.get(node.name, [node]))
         notes = tuple(f"%{name} is an addition" for name in new)
-        return PassResult(replace(program, denoiser=replace(graph, nodes=nodes)), notes)
+        return PassResult(replace(program, denoiser=graph.replaced(new)), notes)
 
 
 def _added(node: Node) -> tuple[Argument, ...]:

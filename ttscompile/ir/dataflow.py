@@ -1,8 +1,8 @@
 """Analyses of a graph: what depends on what, and through which values every path must go."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
-from .graph import Graph, Node
+from .graph import Graph, Node, TensorType
 
 
 def reachable_from(graph: Graph, sources: Iterable[str]) -> set[str]:
@@ -27,6 +27,13 @@ def between(graph: Graph, start: str, stop: str) -> list[Node]:
     """Nodes on some path from ``start`` (excluded) to ``stop`` (included), in order."""
     forward, backward = reachable_from(graph, [start]), reaching(graph, [stop])
     return [n for n in graph.nodes if n.name in forward and n.name in backward and n.name != start]
+
+
+def read_from_outside(graph: Graph, inside: Container[str]) -> dict[str, TensorType]:
+    """Values that the nodes of these names read of others, and their types; without constants."""
+    types, nodes = graph.types(), (node for node in graph.nodes if node.name in inside)
+    read = (name for node in nodes for name in node.refs())
+    return {name: types[name] for name in read if name not in inside and name not in graph.constants}
 
 
 def dominators(graph: Graph, sources: Iterable[str], sinks: Iterable[str]) -> list[str]:

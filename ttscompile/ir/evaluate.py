@@ -258,8 +258,7 @@ def _dropout_is_off(node: Node) -> bool:
     if row is None or row.dropout is None:
         return False
     position, name = row.dropout
-    value = node.args[position] if len(node.args) > position else dict(node.kwargs).get(name, 0)
-    return value in (0, 0.0, False)
+    return node.argument(position, dict(node.kwargs).get(name, 0)) in (0, 0.0, False)
 
 
 def _where(node: Node) -> str:

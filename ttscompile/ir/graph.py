@@ -9,7 +9,7 @@ A ``Graph`` is immutable and knows no torch. The batch size is the only symbolic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias, Union
 
@@ -65,6 +65,10 @@ class TensorType:
         """With others in the place of the symbolic sizes."""
         return replace(self, shape=tuple(size(n) if isinstance(n, Batch) else n for n in self.shape))
 
+    def with_axis(self, axis: int, *sizes: Size) -> TensorType:
+        """With one axis, or several, of these sizes in the place of the one that is there."""
+        return replace(self, shape=(*self.shape[:axis], *sizes, *self.shape[axis + 1 :]))
+
     def __str__(self) -> str:
         return f"{self.dtype}[{', '.join(map(str, self.shape))}]"
 
@@ -97,6 +101,15 @@ class Node:
     def type(self) -> TensorType:
         """Type of the only result."""
         return self.types[0]
+
+    @property
+    def place(self) -> str:
+        """Its source for a message, also where that is not known."""
+        return self.source or "source unknown"
+
+    def argument(self, position: int, missing: Argument = None) -> Argument:
+        """The positional argument; ``missing`` where there are fewer."""
+        return self.args[position] if position < len(self.args) else missing
 
     def refs(self) -> Iterator[str]:
         """Names of the values that it reads, with repetitions, in order."""
@@ -178,12 +191,26 @@ class Graph:
         nodes = (replace(node.mapped(leaf), types=tuple(map(kind, node.types))) for node in self.nodes)
         return Graph(inputs, constants, tuple(nodes), self.outputs)
 
+    def replaced(self, nodes: Mapping[str, Sequence[Node]]) -> Graph:
+        """The same values, with these nodes in the place of those that had made them."""
+        return replace(self, nodes=tuple(new for node in self.nodes for new in nodes.get(node.name, [node])))
+
     def __str__(self) -> str:
         lines = ["inputs    " + ", ".join(f"%{n} : {t}" for n, t in self.inputs.items())]
         lines += ["constants " + ", ".join(f"%{n} : {t}" for n, t in self.constants.items())]
         lines += ["  " + str(node) for node in self.nodes]
         lines += ["outputs   " + ", ".join(f"%{n}" for n in self.outputs)]
         return "\n".join(lines)
+
+
+def copied(name: str, value: str, type_: TensorType) -> Node:
+    """What gives a value another name."""
+    return Node(name, "aten.clone.default", (Ref(value),), (), (type_,))
+
+
+def reshaped(name: str, value: str, type_: TensorType, source: str = "") -> Node:
+    """What gives the numbers of a value, in their order, the shape of this type."""
+    return Node(name, "aten.reshape.default", (Ref(value), type_.shape), (), (type_,), source)
 
 
 def backward_slice(graph: Graph, outputs: tuple[str, ...], stops: Mapping[str, TensorType]) -> Graph:

@@ -27,7 +27,7 @@ import numpy.typing as npt
 import torch
 
 from .evaluate import evaluate
-from .graph import Argument, Batch, Graph, Node, Ref, TensorType, backward_slice
+from .graph import Batch, Graph, Node, Ref, TensorType, backward_slice
 from .operations import Linear, operation
 from .program import Pieces
 
@@ -170,18 +170,19 @@ def _split_at_norm(tail: Graph, stream: str) -> tuple[Node, Graph]:
 
 def _norm_arguments(norm: Node, weights: Weights, width: int) -> tuple[Wide, Wide, float]:
     """Scale ``[W]``, shift ``[W]`` and epsilon."""
-    shape, scale, shift, eps = (*norm.args[1:5], *(None, None, 1e-5)[len(norm.args) - 2 :])[:4]
-    if shape != (width,) or norm.kwargs or not isinstance(eps, float):
+    eps = norm.argument(4, 1e-5)
+    if norm.argument(1) != (width,) or norm.kwargs or not isinstance(eps, float):
         raise _Declined(f"{norm} is not over the {width} numbers of a token")
 
-    def value(argument: Argument, without: float) -> Wide:
+    def value(position: int, without: float) -> Wide:
+        argument = norm.argument(position)
         if isinstance(argument, Ref) and argument.name in weights:
             return np.asarray(weights[argument.name], np.float64)
         if argument is None:
             return np.full(width, without)
         raise _Declined(f"{norm} takes what is no constant")
 
-    return value(scale, 1.0), value(shift, 0.0), eps
+    return value(2, 1.0), value(3, 0.0), eps
 
 
 def _wide(graph: Graph) -> Graph:

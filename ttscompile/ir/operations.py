@@ -88,7 +88,7 @@ def axes_along(node: Node, rank: int) -> frozenset[int]:
     if row.along is None:
         return frozenset()
     missing = 0 if row.movement is Movement.PART else ()
-    axes = node.args[row.along] if len(node.args) > row.along else dict(node.kwargs).get("dim", missing)
+    axes = node.argument(row.along, dict(node.kwargs).get("dim", missing))
     several = axes if isinstance(axes, tuple) else (axes,)
     return frozenset(a % max(rank, 1) for a in several if isinstance(a, int)) or frozenset(range(rank))
 
@@ -112,6 +112,13 @@ def axis_after(node: Node, axis: int, types: Types) -> int | None:
         # Select and mean may take away the axes that they work along.
         return axis - (len(after) < len(before) and sum(a < axis for a in along))
     return axis if node.op == GETITEM else None
+
+
+def joined_axis(cat: Node) -> int:
+    """The axis along which a concatenation joins its parts."""
+    axis = cat.argument(1, 0)
+    assert isinstance(axis, int)
+    return axis % len(cat.type.shape)
 
 
 def _factors(shape: Sequence[Size]) -> tuple[int, int]:

@@ -11,10 +11,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from ..errors import PassError
-from .graph import Batch, Graph, Node, Ref, Size, TensorType
-from .operations import Movement, axes_along, operation
-
-_RESHAPE, _EXPAND = "aten.reshape.default", "aten.expand.default"
+from .graph import Batch, Graph, Node, Size, TensorType, reshaped
+from .operations import Movement, axes_along, joined_axis, operation
 
 
 class _Layout(NamedTuple):
@@ -35,11 +33,11 @@ class Rows:
 
     def leave(self) -> Node:
         """The node that makes the crossing value."""
-        return Node(self.crossing, _RESHAPE, (Ref(self.name), self.unfolded.shape), (), (self.unfolded,))
+        return reshaped(self.crossing, self.name, self.unfolded)
 
     def enter(self) -> Node:
         """The node that makes the value again, where it is read."""
-        return Node(self.name, _RESHAPE, (Ref(self.crossing), self.type.shape), (), (self.type,))
+        return reshaped(self.name, self.crossing, self.type)
 
 
 def unfold(graph: Graph, names: Iterable[str]) -> dict[str, Rows]:
@@ -63,8 +61,7 @@ def _rows(name: str, type_: TensorType, layout: _Layout | None) -> Rows:
         what = f"%{name} : {type_} has several rows a stream, and it cannot be seen which."
         raise PassError(f"{what} Double the batch with torch.cat, repeat or repeat_interleave, and keep its order.")
     factors: list[Size] = [n for n in (layout.copies, Batch(), layout.rows) if n != 1]
-    shape = (*type_.shape[:axis], *factors, *type_.shape[axis + 1 :])
-    return Rows(name, type_, f"{name}.rows", replace(type_, shape=shape))
+    return Rows(name, type_, f"{name}.rows", type_.with_axis(axis, *factors))
 
 
 def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout]:
@@ -78,7 +75,7 @@ def _layouts(graph: Graph, types: Mapping[str, TensorType]) -> dict[str, _Layout
             continue
         if not read:
             size = node.type.shape[axis]
-            if isinstance(size, Batch) and (operation(node.op).filled is not None or node.op == _EXPAND):
+            if isinstance(size, Batch) and (operation(node.op).filled is not None or node.op == "aten.expand.default"):
                 alike[node.name] = _Layout(size.multiple, 1)
             continue
         layout = _made(node, axis, [types[name] for name in read], [known[name] for name in read])
@@ -105,17 +102,11 @@ def _made(node: Node, axis: int, read: Sequence[TensorType], layouts: Sequence[_
         if rest or not after or not rows:
             return None
         copies = size.multiple // rows
-    elif row.name == "cat" and _joined(node) == axis and len({layout.rows for layout in layouts}) == 1:
+    elif row.name == "cat" and joined_axis(node) == axis and len({layout.rows for layout in layouts}) == 1:
         copies = sum(layout.copies for layout in layouts)
     elif len(set(layouts)) > 1 or (kept and axis in axes_along(node, rank)):
         return None  # rows of several kinds, or rows that change places
     return _Layout(copies, rows) if copies * rows == size.multiple else None
-
-
-def _joined(node: Node) -> int:
-    axis = node.args[1] if len(node.args) > 1 else 0
-    assert isinstance(axis, int)
-    return axis % len(node.type.shape)
 
 
 def _numbers(sizes: tuple[Size, ...]) -> int:
@@ -125,13 +116,10 @@ def _numbers(sizes: tuple[Size, ...]) -> int:
 
 def crossing_inputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:
     """The graph with the inputs that are in ``rows`` as they cross."""
-    found = {name: rows[name] for name in graph.inputs if name in rows}
-    inputs = dict(
-        (found[name].crossing, found[name].unfolded) if name in found else (name, type_)
-        for name, type_ in graph.inputs.items()
-    )
-    nodes = (*(one.enter() for one in found.values()), *graph.nodes)
-    return replace(graph, inputs=inputs, nodes=nodes) if found else graph
+    found = [rows[name] for name in graph.inputs if name in rows]
+    crossing = {one.name: (one.crossing, one.unfolded) for one in found}
+    inputs = dict(crossing.get(name, (name, type_)) for name, type_ in graph.inputs.items())
+    return replace(graph, inputs=inputs, nodes=(*(one.enter() for one in found), *graph.nodes)) if found else graph
 
 
 def crossing_outputs(graph: Graph, rows: Mapping[str, Rows]) -> Graph:

@@ -11,7 +11,7 @@ from .dataflow import reachable_from
 from .evaluate import evaluator
 from .flops import graph_flops, node_flops
 from .graph import Argument, Graph, Node, Ref, TensorType, backward_slice
-from .operations import axis_after, operation
+from .operations import axis_after, joined_axis, operation
 
 LEAST_TOKENS = 16
 """Of a tower: with fewer there is hardly a part of them to compute."""
@@ -169,8 +169,6 @@ def _axis_after(node: Node, read: list[str], axes: Mapping[str, int], types: Map
         return len(result) - behind.pop() if len(behind) == 1 else None
     if node.op == _CAT:  # of channels, as where the halves of rotated queries are put beside each other
         axis = axes[read[0]]
-        dim = node.args[1] if len(node.args) > 1 else 0
-        apart = isinstance(dim, int) and dim % len(result) != axis
-        return axis if apart and len(behind) == 1 and read == list(node.refs()) else None
+        return axis if joined_axis(node) != axis and len(behind) == 1 and read == list(node.refs()) else None
     # The token's own row is to be the first factor, and nothing else.
     return axis_after(node, axes[read[0]], types) if read == list(node.refs())[:1] else None

@@ -78,8 +78,7 @@ def _verify_loop(loop: Loop, blocks: tuple[Block, ...], spec: PolicySpec) -> Non
     stream, sample = blocks[0].type, TensorType((Batch(), *spec.sample), "float32")
     for what, piece in loop.loop.items():
         flows_in, flows_out = sample if what == STEM else stream, sample if what == TAIL else stream
-        if piece.graph.inputs.get(piece.stream) != flows_in:
-            found = piece.graph.inputs.get(piece.stream)
+        if (found := piece.graph.inputs.get(piece.stream)) != flows_in:
             raise PassError(f"{what}: its stream %{piece.stream} is {found}; expected {flows_in}.")
         given = [piece.graph.types()[output] for output in piece.graph.outputs]
         if given != [flows_out]:
@@ -154,5 +153,5 @@ def _around(graph: Graph, position: int, radius: int = 2) -> str:
     lines = []
     for i in range(max(0, position - radius), min(len(graph.nodes), position + radius + 1)):
         node: Node = graph.nodes[i]
-        lines.append(f"  {'>' if i == position else ' '} {node}   # {node.source or 'source unknown'}")
+        lines.append(f"  {'>' if i == position else ' '} {node}   # {node.place}")
     return "\n".join(lines)

@@ -15,10 +15,10 @@ from onnx import ModelProto, helper
 
 from ..core.correction import HISTORY, groups_of
 from ..core.spec import PolicySpec
-from ..core.update import clips, columns, rows
+from ..core.update import clip_of, columns, rows
 from ..errors import LoweringError
 from ..ir import pieces as names
-from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, TensorType, copied
 from ..ir.idle_form import IdleForm, Weights, Wide, idle_form
 from ..ir.pieces import BASE, IDLE, PRODUCT, SHIFT, TOTAL
 from ..ir.program import Pieces, Program
@@ -71,8 +71,7 @@ def fuse_advance(tail: names.LoopPiece, stem: names.LoopPiece, spec: PolicySpec)
     following = _fresh("stem.sample", taken)
     nodes.append(Node(following, "aten.permute.default", (Ref(names.SAMPLE_NEXT), (1, 2, 0)), (), (stem.type,)))
     more, stream = _moved(stem, names.STEM, following, taken)
-    made = stem.graph.types()[stem.result]
-    nodes += [*more, Node(names.STREAM_NEXT, "aten.clone.default", (Ref(stream),), (), (made,))]
+    nodes += [*more, copied(names.STREAM_NEXT, stream, stem.graph.types()[stem.result])]
     return Graph(inputs, constants, tuple(nodes), results)
 
 
@@ -113,15 +112,14 @@ def _update(taken: set[str], turned: TensorType, spec: PolicySpec) -> list[Node]
         return nodes[-1].name
 
     parts = [names.SAMPLE, names.PREDICTION, names.HISTORY]
-    if clips(sampler):  # what the prediction says of the sample without noise
-        assert sampler.clip is not None
+    if (clip := clip_of(sampler)) is not None:  # what the prediction says of the sample without noise
         terms = [
             write("update.term", "aten.mul.Tensor", (Ref(value), Ref(column)))
             for column, value in zip(names.X0_COLUMNS, (names.SAMPLE, names.PREDICTION), strict=True)
             if getattr(sampler, column).any()
         ]
         total = terms[0] if len(terms) == 1 else write("update.sum", "aten.add.Tensor", tuple(map(Ref, terms)))
-        parts.append(write("update.denoised", "aten.clamp.default", (Ref(total), -sampler.clip, sampler.clip)))
+        parts.append(write("update.denoised", "aten.clamp.default", (Ref(total), -clip, clip)))
     if sampler.memories:
         parts.append(names.MEMORY)
     read, made = rows(sampler, horizon), columns(sampler, horizon)

@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from ..ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType
+from ..ir.graph import Argument, Batch, Graph, Node, Ref, Size, TensorType, copied
 from ..ir.operations import Movement, operation, permutation
 
 
@@ -150,7 +150,7 @@ class _Sinker:
                 continue
             computed = self.compute_name(output)
             if computed in names or computed in own:
-                self.nodes.append(Node(output, "aten.clone.default", (Ref(computed),), (), (self.types[computed],)))
+                self.nodes.append(copied(output, computed, self.types[computed]))
             else:
                 names[computed] = output
         return names

@@ -87,8 +87,7 @@ def check_runtimes(artifact: Artifact, golden: Golden, runtime: Runtime) -> Rung
         return judged(RUNTIMES, of_line, SAMPLE, VALUE, told, "Use onnxruntime, and report this: it is a defect.")
     rows = np.unique(np.linspace(0, len(golden.steps) - 1, REFERENCE_STEPS).round().astype(np.int64))
     errors = block_errors(manifest, golden, _reference_blocks(reference.backend, obs), rows)
-    kinds = tuple(block.kind for block in manifest.blocks)
-    wrong, step, where = describe_blocks(errors, golden.steps[rows], kinds)
+    wrong, step, where = describe_blocks(errors, golden.steps[rows], tuple(block.kind for block in manifest.blocks))
     found = f"in the reference runtime {where}" if wrong else "every block is the original's in both"
     told = f"onnxruntime and the reference runtime give other samples: {found}"
     remedy = "Their weights or graphs differ: convert the checkpoint again."

@@ -19,7 +19,7 @@ from ..artifact.view import View
 from ..core.correction import HISTORY, Correction, no_correction
 from ..core.lattice import PlanArray, Source
 from ..core.spec import FloatArray, Noise
-from ..core.update import bounded, clips, matrices
+from ..core.update import bounded, clip_of, matrices
 from ..ir.pieces import ADVANCE, LAYERS, PREDICTION, STEM, STEP, STREAM, TAIL, advance_context, block_name
 from ..runtimes.contexts import ContextValues
 from ..runtimes.frames import FramePieces
@@ -124,10 +124,9 @@ class Probe:
                 stream = stream + residual
             prediction = self.tail(stream, k).transpose(2, 0, 1)
             parts = [sample, prediction, history]
-            if clips(sampler):
-                assert sampler.clip is not None
+            if (clip := clip_of(sampler)) is not None:
                 denoised = sampler.sample_to_x0[k] * sample + sampler.out_to_x0[k] * prediction
-                parts.append(np.clip(denoised, -sampler.clip, sampler.clip))
+                parts.append(np.clip(denoised, -clip, clip))
             product = np.concatenate([*parts, memory], 2) @ updates[k]
             seen = np.einsum("bf,fdt->dbt", read, correction.observed[:, k])
             if k in correction.landings:
@@ -216,8 +215,7 @@ def block_errors(
         # A block may give nothing at some step, or at all: then what counts is the residual stream that it is added to.
         floor = max(1e-3 * float(norms[:, b].max()), 1e-6 * float(np.linalg.norm(stream)))
         for i, row in enumerate(rows.tolist()):
-            residual = function(b, int(golden.steps[row]), stream)
-            found = project(residual, block.type.batch_axis)
+            found = project(function(b, int(golden.steps[row]), stream), block.type.batch_axis)
             difference = float(np.linalg.norm(found.astype(np.float64) - golden.residuals[row, b]))
             errors[i, b] = difference / max(float(norms[row, b]), floor) if np.isfinite(difference) else np.inf
     return errors
@@ -263,8 +261,7 @@ def _first_layer(manifest: Manifest, golden: Golden, probe: Probe) -> tuple[str 
         return None, ""
     stream = probe_stream(0, manifest.blocks[0].type, golden.streams, float(golden.scales[0]))
     for k, expected in zip(golden.evaluated.tolist(), golden.layers, strict=True):
-        found = probe.layers(k, stream)
-        for (name, result), one in zip(found.items(), expected, strict=True):
+        for (name, result), one in zip(probe.layers(k, stream).items(), expected, strict=True):
             if not relative(project(result, None)[0], one) <= RESIDUAL:
                 return name, f". Inside it {name!r} is the first layer that differs, at step {k}"
     shown = ", ".join(map(str, golden.evaluated.tolist()))

@@ -92,8 +92,7 @@ def check_plans_precision(
     told = f"samples, normalised, differ by {each}: two calls with {precision.told} against those in fp32"
     status, remedy = PASSED, ""
     if wrong:
-        told = f"with {precision.told} plans are not what calibration stored of fp32: "
-        told += ", ".join(wrong.values())
+        told = f"with {precision.told} plans are not what calibration stored of fp32: {', '.join(wrong.values())}"
         status, remedy = FAILED, "Take plans in fp32 (plan.exact), or convert the checkpoint again and calibrate."
     details = {"errors": {name: finite(error) for name, error in errors.items()}}
     return Rung(PLANS_PRECISION, status, told, finite(max(errors.values())), tolerance, VALUE, remedy, details=details)

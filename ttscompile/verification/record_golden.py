@@ -20,7 +20,7 @@ from ..core.spec import ORIGINAL, FloatArray, Noise, PolicySpec
 from ..errors import CaptureError
 from ..frontends.eager import eager_policy
 from ..frontends.encoded import parts, sharing_copy
-from ..ir.dataflow import reachable_from
+from ..ir.dataflow import reachable_from, read_from_outside
 from ..ir.evaluate import evaluator
 from ..ir.graph import Graph, backward_slice
 from ..ir.layers import layers
@@ -254,8 +254,7 @@ def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
     nodes = tuple(node.renamed(lambda name: places.get(name, name)) for node in graph.nodes)
     probes = {places[block.stream]: block.type for block in blocks}
     outputs = tuple(block.result if block.residual is None else block.residual for block in blocks)
-    types = graph.types()
-    like, inner = blocks[0].type, types[blocks[0].stream]
+    like, inner = blocks[0].type, graph.types()[blocks[0].stream]
     if like == inner:
         return Graph({**graph.inputs, **probes}, graph.constants, nodes, outputs)
     # A doubled batch: the residual stream has an axis of streams between blocks, not inside the graph (``ir.rows``).
@@ -271,16 +270,9 @@ def _opened(graph: Graph, blocks: tuple[Block, ...]) -> Graph:
 
 def _split(graph: Graph, varying: list[str]) -> tuple[Graph, Graph]:
     """What depends on observations alone, once, and what depends on these inputs or on a probe, for every step."""
-    types = graph.types()
     starts = [*varying, *(name for name in graph.inputs if name.startswith(PROBE))]
-    loop = reachable_from(graph, starts)
-    before = {
-        name: types[name]
-        for node in graph.nodes
-        if node.name in loop
-        for name in node.refs()
-        if name not in loop and name not in graph.constants and name not in graph.inputs
-    }
+    read = read_from_outside(graph, reachable_from(graph, starts))
+    before = {name: type_ for name, type_ in read.items() if name not in graph.inputs}
     once = backward_slice(graph, tuple(before), {})
     # All observations, read or not: they say how many streams there are.
     once = replace(once, inputs={name: type_ for name, type_ in graph.inputs.items() if name not in starts})

@@ -47,13 +47,9 @@ Progress = Callable[[str], None]
 def choose(episodes: Sequence[Episode], calls: int) -> list[Episode]:
     """Whole episodes, spread over the recordings, until they hold this many calls; at least one."""
     order = np.random.default_rng(0).permutation(len(episodes))
-    chosen, total = list[int](), 0
-    for number in order.tolist():
-        if total >= calls:
-            break
-        chosen.append(number)
-        total += episodes[number].calls
-    return [episodes[number] for number in sorted(chosen)]
+    together = np.cumsum([episodes[number].calls for number in order])
+    enough = order[: np.searchsorted(together, calls) + 1]
+    return [episodes[number] for number in sorted(enough.tolist())]
 
 
 def check_episodes(artifact: Artifact, policy: CompiledPolicy, episodes: Sequence[Episode], told: Progress) -> Rung:
