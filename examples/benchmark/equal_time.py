@@ -68,7 +68,7 @@ def pace_of(trials: Trials, latency_ms: float, threads: int) -> Pace:
     Raises:
         CalibrationError: step 0 alone takes longer, or all steps do not.
     """
-    goal = measure_budget(trials.artifact, trials.base, goal_of(latency_ms=latency_ms, threads=threads), False)
+    goal = measure_budget(trials, goal_of(latency_ms=latency_ms, threads=threads), False)
     return Pace(trials, goal.cells // len(trials.runner.view.manifest.blocks), threads, f"{latency_ms:g}ms")
 
 

@@ -1,5 +1,6 @@
 """Budgets: in which terms they can be given, what they come to, and when they are refused."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,16 @@ from ttscompile.calibration.pipeline import CalibrationResult, calibrate
 from ttscompile.calibration.progress import Bar
 from ttscompile.calibration.state import FILE, StateFile
 from ttscompile.calibration.step_counts import SpacedSchedules, budget_of_error
+from ttscompile.calibration.trials import Trials
 from ttscompile.calibration.whole_steps import Errors, WholeSteps
 from ttscompile.core.lattice import Source
+from ttscompile.core.plan import Plan
 from ttscompile.errors import CalibrationError, CalibrationFailedError
+from ttscompile.measure.timer import Times
 
 from . import policies
 from .killed import killed
+from .proposers.trying import trials_of
 
 STEPS, BLOCKS = 10, 6
 
@@ -99,40 +104,40 @@ def test_a_target_of_flops_is_kept_and_recorded(artifact: Path, recording: Path)
     assert one_more < 0.5  # another whole step would not fit
 
 
-def measured(directory: Path, goal: Goal, pruned: bool) -> Goal:
-    artifact = load_artifact(directory)
-    return measure_budget(artifact, artifact.plans["dense"], goal, pruned)
+def measured(directory: Path, recording: Path, goal: Goal, pruned: bool) -> Goal:
+    return measure_budget(trials_of(directory, [recording]), goal, pruned)
 
 
-def _timed(monkeypatch: pytest.MonkeyPatch, step_ms: float) -> list[str]:
-    """Calls take ``step_ms`` for each computed step, and no time; what was timed."""
-    asked: list[str] = []
+def _timed(monkeypatch: pytest.MonkeyPatch, step_ms: float) -> list[Plan]:
+    """Calls take ``step_ms`` for each computed step; what was timed."""
+    asked: list[Plan] = []
 
-    def median_ms(call: Any) -> float:
-        call()
-        policy = next(cell.cell_contents for cell in call.__closure__ if hasattr(cell.cell_contents, "last_report"))
-        asked.append(policy.last_report.plan_name)
-        return float(step_ms * np.count_nonzero(policy.last_report.plan == Source.COMPUTE) / BLOCKS)
+    def timed(entrants: Sequence[tuple[Trials, Plan]], threads: int) -> list[Times]:
+        ((_, plan),) = entrants
+        asked.append(plan)
+        return [Times((float(step_ms * np.count_nonzero(plan.cells == Source.COMPUTE) / BLOCKS),))]
 
-    monkeypatch.setattr(budgets, "median_ms", median_ms)
+    monkeypatch.setattr(budgets, "timed", timed)
     monkeypatch.setattr(budgets, "_pruner_ms", lambda *_: 0.5)
     return asked
 
 
 @pytest.mark.parametrize(("limit", "full"), [(1.0, 1), (3.4, 3), (9.9, 9)])
 def test_a_latency_is_as_many_whole_steps_as_fit(
-    compiled: Path, monkeypatch: pytest.MonkeyPatch, limit: float, full: int
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, limit: float, full: int
 ) -> None:
     asked = _timed(monkeypatch, 1.0)
-    budget = measured(compiled, Goal("latency_ms", limit), pruned=False)
+    budget = measured(artifact, recording, Goal("latency_ms", limit), pruned=False)
     assert budget.cells == full * BLOCKS
     assert budget.measured["measured_ms"][str(full)] == full
     assert len(asked) <= 6
 
 
-def test_what_the_loop_waits_for_the_pruner_counts(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_loop_waits_for_the_pruner_counts(
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _timed(monkeypatch, 1.0)
-    budget = measured(compiled, Goal("latency_ms", 3.4), pruned=True)
+    budget = measured(artifact, recording, Goal("latency_ms", 3.4), pruned=True)
     assert budget.cells == 2 * BLOCKS
 
 
@@ -140,11 +145,11 @@ def test_what_the_loop_waits_for_the_pruner_counts(compiled: Path, monkeypatch: 
     ("limit", "message"), [(0.9, "a call that computes step 0 alone takes 1 ms"), (10.0, "is met by the dense policy")]
 )
 def test_a_latency_out_of_reach_is_refused(
-    compiled: Path, monkeypatch: pytest.MonkeyPatch, limit: float, message: str
+    artifact: Path, recording: Path, monkeypatch: pytest.MonkeyPatch, limit: float, message: str
 ) -> None:
     _timed(monkeypatch, 1.0)
     with pytest.raises(CalibrationError, match=message):
-        measured(compiled, Goal("latency_ms", limit), pruned=False)
+        measured(artifact, recording, Goal("latency_ms", limit), pruned=False)
 
 
 def test_the_real_clock_finds_that_nothing_takes_no_time(artifact: Path, recording: Path) -> None:

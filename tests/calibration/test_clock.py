@@ -48,8 +48,21 @@ def test_what_takes_too_long_is_cut_and_says_so(monkeypatch: pytest.MonkeyPatch)
     for part in clock.in_time(range(5)):
         done.append(part)
         machine.go_on(6.0, 3.0)
-    assert done == [0, 1, 2] and clock.cut
+    assert done == [0, 1, 2] and clock.left_out
     roomy = Clock(16.0)
     for _ in roomy.in_time(range(5)):
         machine.go_on(6.0, 3.0)
-    assert not roomy.cut
+    assert not roomy.left_out
+
+
+def test_a_search_ends_early_enough_for_what_has_to_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever share of the time it has; and says what it left out."""
+    machine = Machine(monkeypatch, threads=1)
+    clock = Clock(100.0)
+    share = clock.until(0.9)
+    clock.ahead += [lambda: 25.0, lambda: 5.0]
+    assert (clock.left(), share.left(), share.until(0.5).left()) == (70, 70, 45)
+    machine.go_on(60.0, 60.0)
+    assert share.has(10.0) and not clock.left_out
+    assert not share.has(11.0, "three steps") and not clock.has(12.0, "three steps") and not share.has(13.0)
+    assert clock.left_out == ["three steps", "a longer search"]

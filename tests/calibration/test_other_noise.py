@@ -14,8 +14,9 @@ import ttscompile
 from tests.once import Once
 from ttscompile.artifact.ceiling import FARTHEST
 from ttscompile.calibration.judge import Score, other_noise, other_observations
-from ttscompile.calibration.pipeline import UNHEARD, CalibrationResult, warn_if_noisy
+from ttscompile.calibration.pipeline import CalibrationResult
 from ttscompile.calibration.progress import Bar
+from ttscompile.calibration.recordings import UNHEARD, warn_if_noisy
 from ttscompile.calibration.trials import DRAWS
 from ttscompile.report import facts
 

@@ -77,7 +77,7 @@ def test_a_strategy_gets_the_cells_with_which_it_keeps_the_pace(
 def test_milliseconds_become_as_many_steps_as_they_have_room_for(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measured(artifact: Any, base: Any, goal: Goal, pruned: bool) -> Goal:
+    def measured(trials: Any, goal: Goal, pruned: bool) -> Goal:
         assert (goal.value, goal.threads) == (7.5, 1)
         return Goal(goal.kind, goal.value, 1, 4 * 6)
 

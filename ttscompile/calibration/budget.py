@@ -4,33 +4,28 @@ A latency is measured, with onnxruntime on this machine.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..artifact.ceiling import TYPICAL_SPARSITY
-from ..artifact.load import Artifact
 from ..artifact.manifest import Manifest
-from ..artifact.view import view_of
 from ..core.coercion import integer
 from ..core.lattice import dense_plan, uniform_plan
 from ..core.plan import Plan
 from ..errors import CalibrationError, CalibrationFailedError
-from ..measure.timer import Timer
 from ..runtimes.open import open_runtime
-from ..runtimes.policy import CompiledPolicy
 from ..runtimes.random_calls import normalized, random_call
 from ..runtimes.runtime import Runtime
+from .judge import TIMED, WARM_UP, timed
+from .trials import Trials
 
 SPARSITY, FLOPS, LATENCY, ERROR = "target_sparsity", "target_flops", "latency_ms", "max_action_error"
 """The ways to ask for a plan: the names of the arguments of ``calibrate``."""
 DISTANCE = "max_distance"
 """Another one, where the default is chosen among many plans; a latency may go with it."""
-
-WARM_UP, FEWEST, MOST, SECONDS = 2, 5, 25, 2.0
-"""Calls of a plan that are not counted; that are, at least and at most; and after how long no more are made."""
 
 
 @dataclass(frozen=True)
@@ -123,30 +118,23 @@ def cells_of(goal: Goal, manifest: Manifest, pruned: bool) -> int:
     return cells
 
 
-def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> Goal:
+def measure_budget(trials: Trials, goal: Goal, pruned: bool) -> Goal:
     """The goal with the largest number of computed cells, in whole steps, whose calls fit.
 
-    Bisection over the number of steps; each candidate is the median of some calls on one stream. Where the pruner may
-    run (``pruned``), what the loop waits for it is added. The goal is of kind ``latency_ms``; ``base`` is a plan of the
-    loop, in the precision that calls will have. Refused is one that not even one computed step keeps, or all steps do.
+    Bisection over the number of steps, on plans in the precision of the base. Where the pruner may run (``pruned``),
+    what the loop waits for it is added. The goal is of kind ``latency_ms``. Refused is one that not even one computed
+    step keeps, or all steps do.
     """
     assert goal.kind == LATENCY
-    manifest = view_of(artifact, base).manifest
+    manifest, base = trials.runner.view.manifest, trials.base
     steps, blocks = manifest.steps, len(manifest.blocks)
-    runtime = open_runtime(artifact, "onnxruntime", goal.threads, plan=base)
-    policy = CompiledPolicy(artifact, runtime, seed=0, plan=base)
-    obs, _ = random_call(manifest.spec, 0, 0)  # zeros may be none: a pose has a rotation
-    waited = _pruner_ms(manifest, runtime, base) if pruned else 0.0
+    runtime = open_runtime(trials.artifact, "onnxruntime", goal.threads, plan=base) if pruned else None
+    waited = 0.0 if runtime is None else _pruner_ms(manifest, runtime, base)
     measured: dict[int, float] = {}
 
     def fits(full: int) -> bool:
         plan = replace(base, cells=uniform_plan(steps, blocks, full))
-
-        def call() -> None:
-            policy.forget_frames()  # a call may have to compute them all
-            policy.predict_action(obs, plan=plan)
-
-        measured[full] = waited + median_ms(call)
+        measured[full] = waited + timed([(trials, plan)], goal.threads)[0].median
         return measured[full] <= goal.value
 
     here = f"on this machine with {goal.threads} thread{'s' * (goal.threads > 1)}"
@@ -166,20 +154,11 @@ def measure_budget(artifact: Artifact, base: Plan, goal: Goal, pruned: bool) -> 
     return replace(goal, cells=low * blocks, measured={"measured_ms": measured_ms})
 
 
-def median_ms(call: Callable[[], object]) -> float:
-    """Median wall time of a call, in milliseconds."""
-    timer = Timer(1, WARM_UP)
-    while timer.counted < FEWEST or (timer.counted < MOST and timer.seconds < SECONDS):
-        timer.round()
-        timer.time(0, call)
-    return timer.times[0].median
-
-
 def _pruner_ms(manifest: Manifest, runtime: Runtime, base: Plan) -> float:
     """For how long the loop waits for the pruner's plan, in milliseconds; whatever the plan is."""
     plan, waits, (obs, noise) = replace(base, cells=None, repair=True), list[float](), random_call(manifest.spec, 0, 0)
     given = normalized(manifest.spec, obs)
-    for _ in range(WARM_UP + FEWEST):
+    for _ in range(WARM_UP + TIMED):
         waits.append(runtime.predict(given, noise, plan)[1].timings.wait_pruner)
         runtime.reset()
     return float(np.median(waits[WARM_UP:]))

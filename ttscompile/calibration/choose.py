@@ -12,11 +12,12 @@ from ..core.plan import DENSE, FULL, SCHEDULE, Plan
 from ..errors import CalibrationFailedError
 from ..ir.pieces import LAYERS, is_of_loop
 from ..measure.points import ALIKE, best_plan, fastest
-from .judge import Score, judge, timed
+from .judge import TIMED, WARM_UP, Score, call_seconds, judge, seconds_to_judge, timed
 from .kept import Kept
 from .proposer import SAFER, Request, least_bound
 from .proposers.loops import too_far, would_help
 from .step_counts import FAST, SAFE
+from .trials import LEARNED
 
 TIMED_LONG = 200
 """Calls of a plan that may be the default by a deadline: their 99th percentile has to keep it."""
@@ -50,6 +51,25 @@ class Frontier:
     default: str
 
 
+def seconds_to_judge_others(kept: Kept, lowers: bool) -> float:
+    """That judging takes what has not been judged so; ``lowers``: in another precision, whose parts are tried first."""
+    trials, record = kept.trials, kept.trials.artifact.manifest.precision
+    plans = {name: plan for name, plan in kept.plans.items() if name not in (DENSE, FULL)}
+    new = [plan for name, plan in plans.items() if lowers or kept.known(name, plan) is None]
+    parts = 1 + len(record.kept) if lowers and record is not None else 0
+    tried = parts * max((seconds_to_judge(trials, plan, LEARNED, lowers) for plan in new), default=0.0)
+    return tried + sum(seconds_to_judge(trials, plan, lowered=lowers) for plan in new)
+
+
+def seconds_to_time(kept: Kept, deadline_ms: float | None) -> float:
+    """That timing takes: all plans in each precision, and by a deadline two for longer."""
+    trials = kept.trials
+    rounds = (WARM_UP + TIMED) * (1 if trials.artifact.manifest.precision is None else 2)
+    slower = max([1.0, *trials.clock.paces[True]])  # than when the loops were timed
+    a_round = sum(call_seconds(trials, plan) for name, plan in kept.plans.items() if name != FULL)
+    return slower * rounds * a_round + 2 * TIMED_LONG * (deadline_ms or 0.0) / 1e3
+
+
 def choose(kept: Kept, request: Request) -> Frontier:
     """Judge and time every plan, in each precision that it can have, and with all tokens, and choose.
 
@@ -65,6 +85,8 @@ def choose(kept: Kept, request: Request) -> Frontier:
     entrants = _Entrants(kept, request)
     times, distances, scores, within = entrants.times, entrants.distances, entrants.scores, entrants.within
     allowed, close = ([n for n in within if within[n] <= bound] for bound in (request.farthest, request.bound))
+    if not (allowed or kept.learned) and kept.trials.clock.left_out:  # see ``proposers.loops``
+        return Frontier(entrants.rows({}, (), ()), {DENSE: kept.plans[DENSE]}, {}, {DENSE: scores[DENSE]}, DENSE)
     if not allowed:
         name = min(within, key=lambda n: scores[n].interval[1])
         raise CalibrationFailedError(too_far(kept.trials, request, name, scores[name]))
@@ -90,20 +112,29 @@ class _Entrants:
 
     def __init__(self, kept: Kept, request: Request) -> None:
         self._trials, self._request = kept.trials, request
-        self.plans = {DENSE: kept.plans[DENSE]}
+        bar, clock, flops = self._trials.bar, self._trials.clock, self._trials.artifact.manifest.flops
+        dense = kept.plans[DENSE]  # which is 0 away from itself, without being asked once more
+        assert dense.cells is not None
+        saved = 1 - flops.call(dense.cells, pruned=False) / flops.dense
+        self.plans, self.scores = {DENSE: dense}, {DENSE: Score(0.0, (0.0, 0.0), 0.0, 0.0, 0.0, 0.0, saved, 1)}
+        del clock.ahead[1:]  # but timing
+        bar.stage("held-out calls", len(kept.plans))
         for name, plan in kept.plans.items():
             if name in (DENSE, FULL):
                 continue
-            self.plans[name] = plan
+            variants = {name: plan}
             if plan.precision:
-                self.plans[f"{name}@fp32"] = replace(plan, precision={})
+                variants[f"{name}@fp32"] = replace(plan, precision={})
             if plan.tokens is not None:  # looking for changes may take longer than a small encoder
-                self.plans[f"{name}, all tokens"] = replace(plan, tokens=None)
-        bar, self.scores = self._trials.bar, dict[str, Score]()
-        bar.stage("held-out calls", len(self.plans))
-        for number, (name, plan) in enumerate(self.plans.items(), 1):
-            self.scores[name] = kept.scores[name] if kept.judged.get(name) is plan else judge(self._trials, plan)
-            bar.update(number, f"{name}: {self.scores[name].distance:.3g}", self._trials.clock.left())
+                variants[f"{name}, all tokens"] = replace(plan, tokens=None)
+            for variant, one in variants.items():
+                if (score := kept.known(name, one)) is None:
+                    if not clock.has(seconds_to_judge(self._trials, one), one.in_words()):
+                        continue
+                    score = judge(self._trials, one)
+                own = variant if name in self.plans else name  # the first takes the place of what was left out
+                self.plans[own], self.scores[own] = one, score
+                bar.update(len(self.plans), f"{own}: {score.distance:.3g}", clock.left())
         bar.stage("timing", 1)
         each = timed([(self._trials, plan) for plan in self.plans.values()], request.threads)
         self.times = dict(zip(self.plans, each, strict=True))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from copy import copy
 from typing import TypeVar
 
@@ -30,11 +30,16 @@ class Clock:
         wall: whether seconds are those of the wall clock, because the work is done by other processes or a device.
 
     Attributes:
-        cut: whether anything was left out for want of time.
+        left_out: what was left out for want of time. Clocks that are made of one share this and the following.
+        ahead: give the seconds that what has to follow takes.
+        paces: how many times as long each judgement took as its calls would alone and in fp32; of those in another
+            precision, True, calls are computed one by one.
     """
 
     def __init__(self, limit: float = math.inf, before: float = 0.0, wall: bool = False) -> None:
-        self.limit, self.cut, self._before = limit, False, before
+        self.limit, self._end, self._before = limit, limit, before
+        self.left_out, self.ahead = list[str](), list[Callable[[], float]]()
+        self.paces = {False: list[float](), True: list[float]()}
         self._threads = 0 if wall else torch.get_num_threads()
         self._begun = time.monotonic(), time.process_time()
 
@@ -44,8 +49,8 @@ class Clock:
         return self._before + (min(wall, max(work / self._threads, wall / SLOWEST)) if self._threads else wall)
 
     def left(self) -> float:
-        """Seconds until the limit; negative after it."""
-        return self.limit - self.elapsed()
+        """Seconds until the limit, or until what has to follow must begin; negative after that."""
+        return min(self.limit, self._end - sum(one() for one in self.ahead)) - self.elapsed()
 
     def until(self, share: float) -> Clock:
         """The same clock with a share of the limit."""
@@ -53,10 +58,10 @@ class Clock:
         other.limit *= share
         return other
 
-    def has(self, seconds: float) -> bool:
-        """Whether so much is left; where it is not, something is left out, and ``cut`` says so."""
+    def has(self, seconds: float, what: str = "a longer search") -> bool:
+        """Whether so much is left; else ``what`` is left out."""
         enough = seconds <= self.left()
-        self.cut |= not enough
+        self.left_out += [what] * (not enough and what not in self.left_out)
         return enough
 
     def in_time(self, parts: Iterable[Part]) -> Iterator[Part]:

@@ -91,9 +91,24 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
         CalibrationError: a plan that begins with the chunk of the call before, and no recorded call has one before it.
     """
     plan, sample = replace(plan, repair=True), trials.sample(part)
-    answered = _Answers(trials, plan, sample)
+    begun, answered = trials.clock.elapsed(), _Answers(trials, plan, sample)
     scores = [_scored(trials, plan, sample, made, answered.reports) for made in answered.all()]
+    took, one_by_one = trials.clock.elapsed() - begun, sample.answers[:, :, 0, 0].size * call_seconds(trials, plan)
+    trials.clock.paces[bool(plan.precision)] += [took / one_by_one] if one_by_one else []
     return max(scores, key=lambda one: one.distance)
+
+
+def seconds_to_judge(trials: Trials, plan: Plan, part: str = HELD_OUT, lowered: bool = False) -> float:
+    """What ``judge`` takes, by what it has taken at most; ``lowered``: of the plan in another precision."""
+    pace = max(trials.clock.paces[lowered or bool(plan.precision)], default=1.0)
+    return pace * trials.sample(part).answers[:, :, 0, 0].size * call_seconds(trials, plan)
+
+
+def call_seconds(trials: Trials, plan: Plan) -> float:
+    """What a call takes alone, by what was measured of its loop (``proposers.loops``); 0 where nothing was."""
+    one, step = trials.state.progress.get("costs", {}).get(plan.loop, (0.0, 0.0))
+    steps = 1 if plan.cells is None else int((plan.cells == Source.COMPUTE).any(-1).sum())
+    return float(one + (steps - 1) * step) / 1e3
 
 
 def further(score: Score, other: Score) -> tuple[float, float]:

@@ -30,6 +30,7 @@ class Kept:
         trials: of the artifact with all that is kept.
         scores: of the plans that were judged, and ``notes`` on how they were found, by name.
         judged: the plans that these scores are of, by name.
+        exact: the same of plans while they were in fp32, with all tokens, with their scores.
         weights, starts: what plans name that the artifact had not, by name.
         pruner: constants, and the loop whose pruner has them; None where they stay.
         refused: why plans, or all that a proposer proposed, are left out, by name; begins with a verb.
@@ -45,6 +46,7 @@ class Kept:
         self.default, self.trials, self._farthest = first, replace(trials, name=first), farthest
         self.scores: dict[str, Score] = {}
         self.judged: dict[str, Plan] = {}
+        self.exact: dict[str, tuple[Plan, Score]] = {}
         self.notes: dict[str, Mapping[str, Any]] = {}
         self.weights: dict[str, BlockWeights] = {}
         self.starts: dict[str, StartRecord] = {}
@@ -99,10 +101,18 @@ class Kept:
             if fields and not any(getattr(plan, key) == fields[key] for plan in plans.values() for key in fields):
                 self.told[name] += ", and no chosen plan is faster by it"
 
+    def known(self, name: str, plan: Plan) -> Score | None:
+        """The score of a plan that was judged under this name, or before it got a precision and tokens."""
+        if self.judged.get(name) is plan:
+            return self.scores[name]
+        before, score = self.exact.get(name, (plan, None))
+        same = plan.exact is plan and plan.cells is before.cells and plan.correction is before.correction
+        return score if same else None
+
     def consider(self, proposal: Proposal) -> str | None:
         """Judge a proposal on held-out episodes, and keep it if it holds; else why it does not."""
         trials = holding(self.trials, proposal)
-        score = judge(trials, proposal.plan)
+        score = self.known(proposal.name, proposal.plan) or judge(trials, proposal.plan)
         reason = proposal.refusal(score, self.scores)
         if reason is None and not proposal.beside:
             reason = self._no_better(trials, score, proposal.margin)
@@ -113,6 +123,8 @@ class Kept:
         self.refused.pop(proposal.name, None)
         self.plans[proposal.name], self.scores[proposal.name] = proposal.plan, score
         self.judged[proposal.name] = proposal.plan
+        if proposal.plan.exact is proposal.plan:
+            self.exact[proposal.name] = proposal.plan, score
         self.notes[proposal.name] = proposal.notes
         self.weights |= proposal.weights
         self.starts |= proposal.starts

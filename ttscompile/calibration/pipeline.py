@@ -3,12 +3,13 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..artifact.ceiling import FARTHEST, few_steps, usual_sparsity
+from ..artifact.ceiling import FARTHEST, usual_sparsity
 from ..artifact.files import locked
 from ..artifact.load import Artifact, load_artifact
 from ..artifact.view import view_of
@@ -23,24 +24,19 @@ from ..trajectories import recorded_rate
 from ..verification.record_golden import record_plans
 from .arguments import calls_to_learn_from, require_directory, require_limits, require_loops_alone, require_one_place
 from .budget import DISTANCE, ERROR, LATENCY, goal_of
-from .calls import FRACTION, digest_of, load_episodes, window_of
-from .choose import choose
+from .calls import FRACTION, digest_of, load_episodes
+from .choose import choose, seconds_to_judge_others, seconds_to_time
 from .clock import Clock
-from .judge import Score, other_noise, other_observations
+from .judge import Score, other_noise, seconds_to_judge
 from .kept import Kept
 from .progress import Bar
 from .proposer import LOOPS, Proposer, Request, Row, rows_of
+from .recordings import warn_of_recordings
 from .schedule import FINISHED, TIME_LIMIT, Schedule
 from .state import StateFile
 from .step_counts import FAST, SAFE
 from .strategies import DEFAULT, strategy_of
-from .strategy import Strategy
-from .targets import REPEATS
-from .trials import Trials, base_of
-
-UNHEARD = 0.9
-"""Of what another observation changes, above which other noise changes suspiciously much. On Push-T it is a tenth, and
-0.97 to 1 with data times 100, a hundredth of them, or random ones."""
+from .trials import LEARNED, Trials, base_of
 
 
 @dataclass(frozen=True)
@@ -141,10 +137,10 @@ def calibrate(
     """Learn plans for an artifact from a few recorded episodes, and write them into it.
 
     What learns proposes plans, one after the other, each made from the best so far. They are judged on episodes that
-    nothing was learned from: how far is what they answer from what the original answers to the same observation. After
-    every interval of some seconds the state is saved in the artifact's directory: whatever stops the process, a call
-    with ``resume`` goes on from there, and ends where it would have ended. The same arguments give the same bytes,
-    unless the time limit cuts something short, or the budget is a latency, which is measured.
+    nothing was learned from: how far is what they answer from what the original answers to the same observation. Every
+    few seconds the state is saved in the artifact's directory: whatever stops the process, a call with ``resume`` goes
+    on from there, and ends where it would have ended. The same arguments give the same bytes, unless the time limit
+    cuts something short, or the budget is a latency, which is measured.
 
     At most one budget: ``target_sparsity``, ``target_flops``, ``latency_ms`` or ``max_action_error``. Beside the plan
     that keeps it, ``schedule``, the artifact gets ``uniform``, the baseline. A strategy that fits corrections adds
@@ -172,9 +168,10 @@ def calibrate(
         policy_hz: rate in Hz of the frames and actions that the policy was trained with, which an executor plays its
             actions at; None for what the recordings say, or the artifact.
         threads: how many threads the calls have that are timed for ``latency_ms``.
-        max_minutes: of work: those in which all of torch's threads compute. The best plan so far is taken in time to be
+        max_minutes: where loops are learned, by the clock. Else of work: those in which all of torch's threads compute,
+            so that a busy machine takes up to twice as long by the clock. The best plan so far is taken in time to be
             finished by then, as far as what was done before lets it be known; what has to be done at least is done.
-            Also decides how many calls are used. A busy machine takes up to twice as long by the wall clock.
+            Also decides how many calls are used.
         validation_fraction: of the episodes.
         observation: by key, the arrays of a recording that it is made of, where they are called otherwise; of ``task``
             the path of the tokenizer that makes recorded instructions tokens.
@@ -199,7 +196,8 @@ def calibrate(
         RuntimeUnavailableError: torch does not have the device.
         ClusterError: the cluster cannot be reached, or is gone; what was done before can be resumed.
     """
-    wall = ray is not None or device not in (None, "cpu")  # others work, and this process waits
+    # Where others work this process waits; and for a build somebody does.
+    wall = ray is not None or device not in (None, "cpu") or LOOPS in learn
     begun = Clock(wall=wall)
     seed = integer(seed, "seed", CalibrationError)
     rank, updates = integer(rank, "rank", CalibrationError, 1), integer(updates, "updates", CalibrationError, 1)
@@ -266,10 +264,10 @@ def calibrate(
         with Bar(progress) as bar:
             opened = {"clock": clock, "bar": bar, "pool": pool, "device": torch_device, "limits": limits}
             trials = Trials.of(artifact, episodes, state, seed=seed, fraction=validation_fraction, **opened)
-            _warn_of_recordings(trials, rows, strategy_row, corrects)
+            warn_of_recordings(trials, rows, strategy_row, corrects)
             # Where a distance was allowed, no plan that is kept is too far away to be the default.
             kept = Kept(trials, anew, FARTHEST if max_distance is None else np.inf)
-            _hear(kept, rows, proposers, clock)
+            _hear(kept, rows, proposers, clock, request)
             frontier = choose(kept, request) if chooses else None
             if frontier is not None:
                 kept.keep_only(frontier.plans, frontier.scores, frontier.default)
@@ -292,7 +290,7 @@ def calibrate(
             episodes={"calibration": trials.split.calibration, "validation": trials.split.validation},
             calls={"calibration": trials.used, "validation": len(trials.held_out.calls)},
             intervals=schedule.intervals,
-            stopped=schedule.stopped or (TIME_LIMIT if clock.left() < 0 else FINISHED),
+            stopped=schedule.stopped or (TIME_LIMIT if clock.left_out else FINISHED),
             seconds=clock.elapsed(),
             budget=asked_of_default if chooses else schedule.budget.record(),
             told=kept.told,
@@ -300,67 +298,44 @@ def calibrate(
             frontier=() if frontier is None else frontier.tried,
             timed_on=None if frontier is None else timed_on(goal.threads),
         )
-        _warn_of_result(bar, result, max_minutes)
+        _warn_of_result(bar, result, max_minutes, clock.left_out)
         _write(directory, artifact, result, kept, anew)
         state.remove()
         return result
 
 
-def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock: Clock) -> None:
+def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock: Clock, request: Request) -> None:
     """Have each proposer judged, in its share of the time. Raises CalibrationFailedError: nothing was kept."""
     takes = np.cumsum([row.takes for row in rows])
-    for row, proposer, share in zip(rows, proposers, takes / takes[-1], strict=True):
+    if request.by_time and len(rows) > 1:
+        kept.trials.sample(LEARNED)  # what others choose on is answered first: so nobody has to leave time for it
+    for number, (row, proposer, share) in enumerate(zip(rows, proposers, takes / takes[-1], strict=True)):
+        if request.by_time:
+            clock.ahead[:] = [partial(seconds_to_time, kept, request.deadline_ms)]
+            least = partial(seconds_to_judge, kept.trials, kept.plan, lowered=True)
+            if number and not (kept.learned and clock.has(2 * least(LEARNED) + least(), row.name)):
+                kept.refused[row.name] = "was not tried: there was no time for it"
+                continue
+            lowers = any(one.name == "precision" for one in rows[number + 1 :])
+            clock.ahead.append(partial(seconds_to_judge_others, kept, lowers))
         kept.hear(row.name, proposer, clock.until(float(share)))
-    if not kept.learned:
+    if not (kept.learned or (request.by_time and clock.left_out)):
         why = " ".join(f"{name!r} {reason}" for name, reason in kept.refused.items())
         raise CalibrationFailedError(f"{why or 'nothing was proposed.'} The artifact is as it was.")
     for name, reason in kept.refused.items():
         kept.trials.bar.warn(f"{name!r} is left out: it {reason}")
 
 
-def _warn_of_result(bar: Bar, result: CalibrationResult, max_minutes: float) -> None:
+def _warn_of_result(bar: Bar, result: CalibrationResult, max_minutes: float, left_out: Sequence[str]) -> None:
     if result.stopped == TIME_LIMIT:
-        bar.warn(
-            f"a search was cut short, since {max_minutes:g} minutes were over: with more, plans may be nearer to the"
-            " original."
-        )
+        told = f"a search was cut short, since {max_minutes:g} minutes were over"
+        more = f" Left out or cut short: {'; '.join(left_out)}." if left_out else ""
+        bar.warn(f"{told}: with more, plans may be nearer to the original.{more}")
     if result.doubtful:
         bar.warn(
             f"plan {result.default_plan!r} is {result.plans[result.default_plan].distance:.2f} of what other noise"
             f" changes from the original; above {FARTHEST:g} scores may fall. Allow more time or computed cells, or"
             " record more."
-        )
-
-
-def _warn_of_recordings(trials: Trials, rows: Sequence[Row], strategy: Strategy, corrects: bool) -> None:
-    """Warn, before anything is learned, of what makes it learn little."""
-    bar, fewest = trials.bar, trials.limits.fewest
-    if (warning := few_steps(trials.runner.view.manifest)) is not None:
-        bar.warn(warning)
-    consecutive = any(row.consecutive or (row.name == SCHEDULE and strategy.consecutive) for row in rows)
-    window = window_of(trials.episodes, trials.split)
-    if consecutive and (short := sum(each.calls < window for each in trials.episodes)):
-        bar.warn(
-            f"{short} of {len(trials.episodes)} episodes have fewer than {window} calls, and are left out where"
-            f" {window} consecutive ones are learned from."
-        )
-    warn_if_noisy(trials)
-    rows_recorded = sum(trials.episodes[n].calls for n in trials.split.calibration)
-    if corrects and (count := REPEATS * rows_recorded) < fewest:
-        bar.warn(
-            f"the recordings give {count} calls to learn from, and a correction needs {fewest}: it may do harm where"
-            " nothing was recorded. Record more episodes."
-        )
-
-
-def warn_if_noisy(trials: Trials) -> None:
-    """Warn where the original's answers depend on the noise about as much as on the observation."""
-    noise, observed = other_noise(trials), other_observations(trials)
-    if len(trials.held_out.answers) > 1 and not noise < UNHEARD * observed:  # of one there is no other
-        trials.bar.warn(
-            f"the original hardly heeds what was recorded: with other noise its actions change by {noise:.4g}, and with"
-            f" another observation by {observed:.4g}. Look at the units of the recordings, and at the order of their"
-            " columns. If these are right, the policy has learned little from what it observes: train it longer."
         )
 
 

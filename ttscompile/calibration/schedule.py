@@ -58,7 +58,7 @@ def search_plan(
         number += 1
         longest = max(longest, clock.elapsed() - start)
         after(number, longest)
-    return search.found(), number, TIME_LIMIT if clock.cut else FINISHED
+    return search.found(), number, TIME_LIMIT if clock.left_out else FINISHED
 
 
 def intervals_of(name: str) -> str:
@@ -135,8 +135,7 @@ class Schedule(Proposer):
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
         calls = trials.windows if self._strategy.consecutive else trials.calls
-        small = calls.count > trials.limits.usual
-        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small=small)
+        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small=calls.count > trials.limits.usual)
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)
@@ -170,7 +169,7 @@ class Schedule(Proposer):
         if found.pruner is not None:
             yield self._of_pruner(plan, found)
         named, self.skipped = plans_beside(crowded, task, self._strategy, budget.cells)
-        self.stopped = TIME_LIMIT if clock.cut else self.stopped
+        self.stopped = TIME_LIMIT if clock.left_out else self.stopped
         for name, one in named.items():
             made = replace(plan, cells=one.schedule, correction=one.correction)
             proposal = Proposal(name, made, {"steps": one.notes["steps"]}, beside=True)
@@ -185,7 +184,7 @@ class Schedule(Proposer):
             return replace(goal, cells=cells_of(goal, manifest, self._may_prune(view)))
         known = trials.state.progress.get("latency")
         if known is None:
-            budget = measure_budget(trials.artifact, trials.base, goal, self._may_prune(view))
+            budget = measure_budget(trials, goal, self._may_prune(view))
             known = {"cells": budget.cells, "measured": budget.measured}
             trials.state.save(latency=known, seconds=clock.elapsed())
         budget = replace(goal, cells=known["cells"], measured=known["measured"])

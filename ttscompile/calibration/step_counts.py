@@ -87,7 +87,7 @@ class SpacedSchedules:
         members = spacings(self._whole.steps, full_steps, crowding)
         self._bar.stage(what, len(members))
         for number, steps in enumerate(members):
-            errors = self._errors(steps, members[number:])
+            errors = self._errors(steps, members[number:], what)
             if errors is None:
                 break
             if found is None or errors.normalised < found[0].normalised:
@@ -95,18 +95,13 @@ class SpacedSchedules:
             self._bar.update(number + 1, f"error {found[0].units:.4g}", self._clock.left())
         return None if found is None else Best(found[1], found[0].units)
 
-    def knows(self, full_steps: int) -> bool:
-        """Whether one of the family is known, which is the first that ``best`` looks at: no time is needed for it."""
-        first = spacings(self._whole.steps, full_steps, FEWER_CROWDINGS[:1])[0]
-        return _listed(first) in self._state.progress.get(self._key, {})
-
-    def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]]) -> Errors | None:
+    def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]], what: str) -> Errors | None:
         """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
         known = self._state.progress.setdefault(self._key, {})
         key = _listed(steps)
         if key not in known:
             # All plans together are judged on fewer calls than one is compared on: that takes no longer.
-            if not self._clock.has(2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps))):
+            if not self._clock.has(2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps)), what):
                 return None
             self._whole.expect(coming)
             errors = self._whole.errors(steps)

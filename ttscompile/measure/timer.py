@@ -73,11 +73,6 @@ class Timer:
         """Rounds whose times count, the one under way included; 0 during warm-up."""
         return max(self._begun - self._warm_up, 0)
 
-    @property
-    def seconds(self) -> float:
-        """What all counted calls took together."""
-        return sum(map(sum, self._ms)) / 1e3
-
     def time(self, candidate: int, call: Callable[[], Result]) -> Result:
         """Time one call of a candidate, and return what it returns."""
         start = self._clock()

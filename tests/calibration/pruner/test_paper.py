@@ -117,7 +117,7 @@ def test_nothing_is_tried_before_the_first_update(task: Task) -> None:
     clock = Clock(0.0)
     search = Paper(replace(task, clock=clock))
     search.restore(trained(task, 1).state())
-    assert not clock.cut
+    assert not clock.left_out
 
 
 @pytest.mark.slow

@@ -19,25 +19,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...artifact.view import view_of
 from ...core.lattice import dense_plan, uniform_plan
 from ...core.plan import ORIGINAL, Plan
-from ...core.spec import Noise
 from ...errors import CalibrationFailedError
 from ...measure.points import TENTH
 from ...measure.units import rounded_up
-from ...runtimes.open import open_runtime
-from ...runtimes.random_calls import Observation
-from ...runtimes.runtime import Runtime
 from ..arguments import MOST_CALLS, MOST_NEEDED, CallLimits, calls_to_learn_from
-from ..budget import median_ms
 from ..clock import Clock
-from ..judge import Score, judge, other_noise, other_observations
+from ..judge import TIMED, Score, judge, other_noise, other_observations, seconds_to_judge, timed
 from ..proposer import SAFER, SURE, Proposal, Proposals, Proposer, Request, near
 from ..schedule import intervals_of, open_search, resumed_search
-from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules
+from ..step_counts import COUNTS, FEWER_CROWDINGS, SpacedSchedules, spaced_steps
 from ..task import Found, Task
-from ..trials import LEARNED, Trials
+from ..trials import Trials
 
 HOPELESS = 5.0
 """A number of steps is not searched any further if the error of its crowded schedules, as a share of what other noise
@@ -97,8 +91,7 @@ class Loops(Proposer):
             if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
-            if number and _over(clock, trials, f"crowded, {loop}"):
-                clock.cut = True
+            if number and _over(clock, trials, f"crowded, {loop}", loop):
                 self._left_out.append(f"{loop} for want of time")
                 continue
             weights = [ASIDE if one in far else 1.0 for one in order[number:]]
@@ -108,10 +101,17 @@ class Loops(Proposer):
         best = self._best or self._nearest
         found = "computes the least of those that are near enough" if self._best else "is the nearest"
         if best is None:
-            raise CalibrationFailedError(self._none(trials, min(order, key=lambda loop: costs[loop].one), costs))
+            told = self._none(trials, min(order, key=lambda loop: costs[loop].one), costs)
+            if self.request.deadline_ms is not None or not clock.left_out:
+                raise CalibrationFailedError(told)
+            trials.bar.warn(f"{told} Time was too short, so the original is all that there is.")
+            return
         yield best
         left = f"left out: {', '.join(self._left_out)}" if self._left_out else ""
-        more = self._tasks[best.name].whole.told_of_episodes(best.notes["steps"])
+        whole, steps = self._tasks[best.name].whole, best.notes["steps"]
+        # Each of its two answers takes about what a comparison takes without a correction and with one.
+        there_is_time = clock.has(2 * whole.comparing(len(steps)), "what more episodes would bring")
+        more = whole.told_of_episodes(steps) if there_is_time else ""
         self.told = "; ".join(filter(None, (f"{best.name} {found}", left, more)))
 
     def _by_distance(self, trials: Trials, costs: Mapping[str, Cost]) -> tuple[list[str], list[str]]:
@@ -122,8 +122,10 @@ class Loops(Proposer):
         close, far = list[str](), list[str]()
         for loop in sorted(costs.keys() - {ORIGINAL}, key=lambda loop: costs[loop].one):
             own = trials.of_loop(loop)
-            whole = judge(own, Plan(loop, dense_plan(own.runner.model.steps, own.runner.model.blocks), repair=True))
-            if whole.interval[0] > self._farthest:
+            plan = Plan(loop, dense_plan(own.runner.model.steps, own.runner.model.blocks), repair=True)
+            if _over(trials.clock, trials, f"crowded, {loop}", loop, seconds_to_judge(own, plan)):
+                continue
+            if (whole := judge(own, plan)).interval[0] > self._farthest:
                 self._left_out.append(f"{loop} is {whole.distance:.3g} from the original with every step computed")
             else:
                 (close if whole.distance <= self._bound else far).append(loop)
@@ -145,17 +147,17 @@ class Loops(Proposer):
         first = replace(own.runner.select(calls, range(few)), late=late) if small else calls
         task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
-        if small and any(not _over(clock, own, intervals_of(_search(loop, count))) for count in counts):
+        if small and any(not _over(clock, own, intervals_of(n), n) for n in map(partial(_search, loop), counts)):
             task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small=small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         reached = False  # what is wanted; then one number of steps more is tried
         for number, count in enumerate(counts):
-            if number and _over(clock, own, intervals_of(_search(loop, count))):
-                clock.cut = True
+            name = _search(loop, count)
+            if number and _over(clock, own, intervals_of(name), name):
                 break
             share = _ending(clock, clock.left() / (len(counts) - number))
             search = open_search("tts", replace(task, clock=share, budget=count * own.runner.model.blocks))
-            found = resumed_search(own, search, share, None, _search(loop, count))[0]
+            found = resumed_search(own, search, share, None, name)[0]
             yield from self._judged(own, self._proposal(task, loop, count, found), cost.of(count))
             before, reached = reached, self._reached(loop, count, wanted)
             if before or (reached and wanted < self._bound):
@@ -173,13 +175,15 @@ class Loops(Proposer):
         hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
         hopeful, reached = list[int](), False
         for number, count in enumerate(counts):
-            late = task.clock.left() <= 0 and not crowded.knows(count)
-            if number and (late or self._too_slow(cost.of(count), fastest)):
+            if number and self._too_slow(cost.of(count), fastest):
                 break
             quick = crowded.best(count, f"{loop}, {count} steps", FEWER_CROWDINGS)
-            if quick is None:  # no time; a search gives something
-                task.clock.cut = True
-                return hopeful or [count]
+            if quick is None:  # no time; where nothing was found, even steps without a correction give something
+                if not hopeful and self._best is None:
+                    even = spaced_steps(own.runner.model.steps, counts[-1], 1.0)
+                    found = Found(task.whole.plan(even), {"steps": list(even)})
+                    yield from self._judged(own, self._proposal(task, loop, counts[-1], found), cost.of(counts[-1]))
+                return hopeful
             if quick.error > hopeless and count != counts[-1]:
                 continue
             hopeful.append(count)
@@ -269,17 +273,14 @@ class Loops(Proposer):
             return Cost(float(one), float(step))
 
     def _measured(self, trials: Trials, loop: str) -> tuple[float, float]:
-        artifact, record = trials.artifact, trials.artifact.manifest.precision
-        steps, blocks = artifact.manifest.steps_of(loop), len(artifact.manifest.blocks)
-        obs, more = trials.observation([(trials.split.calibration[0], 0)]), min(4, steps)
-        found = []
-        for precision in ({}, *([dict.fromkeys(record.kept, record.name)] if record is not None else [])):
-            plans = [Plan(loop, uniform_plan(steps, blocks, n), precision=precision) for n in (1, more)]
-            runtime = open_runtime(artifact, "onnxruntime", self.request.threads, None, plans[0])
-            noise = trials.noise(view_of(artifact, plans[0]).manifest.spec, [trials.noise_key(LEARNED, 0, 0, 0)])
-            one, most = (median_ms(partial(_call, runtime, obs, noise, plan)) for plan in plans)
-            found.append((one, max(most - one, 0.0) / max(more - 1, 1)))
-        return min(found)
+        manifest, record = trials.artifact.manifest, trials.artifact.manifest.precision
+        steps, blocks = manifest.steps_of(loop), len(manifest.blocks)
+        lowered = [] if record is None else [dict.fromkeys(record.kept, record.name)]
+        counts = (1, min(4, steps))
+        plans = [Plan(loop, uniform_plan(steps, blocks, n), precision=p) for p in ({}, *lowered) for n in counts]
+        took = [one.median for one in timed([(trials, plan) for plan in plans], self.request.threads, TIMED // 2)]
+        pairs = zip(took[::2], took[1::2], strict=True)
+        return min((one, max(more - one, 0.0) / max(counts[1] - 1, 1)) for one, more in pairs)
 
 
 def _name(loop: str, count: int) -> str:
@@ -291,9 +292,9 @@ def _search(loop: str, count: int) -> str:
     return f"search, {loop}, {count} steps"
 
 
-def _over(clock: Clock, trials: Trials, begun: str) -> bool:
-    """Whether there is no time to begin this. What an interrupted build has begun is in the state, and read again."""
-    return clock.left() <= 0 and begun not in trials.state.progress
+def _over(clock: Clock, trials: Trials, begun: str, what: str, seconds: float = 0.0) -> bool:
+    """Whether there is no time for this. What an interrupted build has begun is in the state, and read again."""
+    return begun not in trials.state.progress and not clock.has(seconds, what)
 
 
 def _ending(clock: Clock, seconds: float) -> Clock:
@@ -319,8 +320,3 @@ def would_help(trials: Trials, request: Request, within: float | None = None, al
     told += ["one instruction compiled in (--task)"] * (spec.instruction is not None)
     told += ["a larger --error" if within is None else f"--error {rounded_up(within)}"]
     return f"What may help: {', '.join(told)}, or a slower loop."
-
-
-def _call(runtime: Runtime, obs: Observation, noise: Noise, plan: Plan) -> None:
-    runtime.reset()
-    runtime.predict(obs, noise, plan)
