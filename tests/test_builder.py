@@ -100,6 +100,16 @@ def test_a_loop_that_no_call_keeps_up_with_says_what_to_give(
     assert "calibrate" not in asked and contents(directory) == before
 
 
+def test_what_calibration_warns_of_is_not_said_before_it_too(
+    asked: dict[str, Any], directory: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    recording = policies.record(directory.parent / "calls.npz")
+    with np.load(recording) as held:
+        np.savez(recording, **held, reward=np.zeros(3))
+    ttscompile.build("policy.ckpt", directory, [recording], progress=False)
+    assert "calibrate" in asked and not recwarn.list
+
+
 @pytest.fixture
 def calibrated(directory: Path) -> Path:
     """The artifact with a plan."""
@@ -266,11 +276,17 @@ def test_a_checkpoint_becomes_a_policy(
     (chosen,) = (row for row in record["frontier"] if row["name"] == "schedule")
     told = f"Chosen among {len(record['frontier'])} plans: {chosen['told']}"
     assert told in " ".join(result.output.split())
+    lines = result.output.splitlines()
+    for row in record["frontier"]:
+        assert any(row["name"] in line and row["told"] in line for line in lines), "a plan is a line"
     instructed = "observation['task'] = "
     assert instructed not in result.output
+    (dense,) = (row for row in record["frontier"] if row["name"] == "dense")
+    dense["distance"] = -1e-9  # rounding
     monkeypatch.setattr(summary, "instruct_of", lambda each: each is artifact)  # of a policy that is told its task
     summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1)
     assert instructed in printed.getvalue() and "AsyncExecutor" not in printed.getvalue()
+    assert "-0.000" not in printed.getvalue()
     summary.print_frontier(artifact, tmp_path, Console(file=(printed := StringIO())), 1, control_hz=50.0)
     loop = printed.getvalue().partition("    with ttscompile.")[2].splitlines()
     assert loop[0] == "AsyncExecutor(policy, control_hz=50) as executor:"

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,8 +21,7 @@ from .core.spec import INT8, PolicySpec
 from .driver import Explain, convert
 from .errors import ArtifactError, CalibrationError, CalibrationFailedError
 from .frontends import recordings_of
-from .runtimes.executor import ExecutorSettings
-from .runtimes.executor.settings import resolve
+from .runtimes.executor.settings import ExecutorSettings, resolve
 from .runtimes.load import open_policy
 from .trajectories import recorded_rate
 
@@ -30,9 +30,8 @@ FURTHER_LOOPS = (("dpmsolver++", 16), ("ddim", 16))
 which is nearer to the original than a loop of as many."""
 
 LEARNED = (LOOPS, "precision", "tokens")
-"""What is learned, where it applies. A start from the chunk before and trained weights are left to ``calibrate``: the
-first is further from the original than a default may be on every policy that it was tried on, and the second takes
-most of an hour."""
+"""What is learned, where it applies. Starts from the chunk before and trained weights are left to ``calibrate``: where
+they were tried they were no default, and the second take most of an hour."""
 
 
 def build(
@@ -74,7 +73,7 @@ def build(
         max_distance: from the original, that a plan may have (``calibration.proposer.near``), in units of what other
             noise changes; None for a tenth for the default, and a quarter for faster plans (``artifact.ceiling``).
         threads: that calls have.
-        max_minutes: for all but the conversion.
+        max_minutes: by the clock, for all but the conversion.
         seed: of everything random.
         resume: go on where the same build was interrupted.
         observation, progress, ray: see ``calibrate``.
@@ -87,16 +86,16 @@ def build(
     if latency_ms is not None and control_hz is not None:
         raise CalibrationError("expected one deadline; found latency_ms and control_hz. Give one of them.")
     require_rate(policy_hz)
-    if isinstance(trajectories, str | os.PathLike):
-        trajectories = (trajectories,)
-    if not trajectories:
-        trajectories = (recordings_of(checkpoint, of_checkpoint.get("format", "auto")),)
-        explain("recordings", (f"no episodes were given, so those of its training are read: {trajectories[0]}",))
-    named = tuple(trajectories)
+    named = (trajectories,) if isinstance(trajectories, str | os.PathLike) else tuple(trajectories)
+    if not named:
+        named = (recordings_of(checkpoint, of_checkpoint.get("format", "auto")),)
+        explain("recordings", (f"no episodes were given, so those of its training are read: {named[0]}",))
 
     def check(spec: PolicySpec) -> None:
         if spec.instruction is None:  # else the artifact's tokenizer is needed
-            load_episodes(spec, named, observation)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # calibration reads them again, and warns
+                load_episodes(spec, named, observation)
 
     how: dict[str, Any] = {"loops": FURTHER_LOOPS, "prediction_horizon": "needed", "precision": INT8, "read": check}
     how |= of_checkpoint
@@ -104,13 +103,13 @@ def build(
     with replacing(target) as put, _beside(target) as made:
         _convert(checkpoint, made, resume, explain, how)
         if control_hz is not None:
-            policy_hz = policy_hz or recorded_rate(trajectories)
+            policy_hz = policy_hz or recorded_rate(named)
             latency_ms = _deadline(made, control_hz, policy_hz, explain)
         artifact, request = load_artifact(made), Request(Goal(SPARSITY, 0.5))  # a goal that none of these reads
         rows = [row for row in rows_of(LEARNED) if row.name == LOOPS or row.make(request).applies(artifact) is None]
         result = calibrate(
             made,
-            trajectories,
+            named,
             learn=[row.name for row in rows],
             latency_ms=latency_ms,
             max_distance=max_distance,
@@ -160,10 +159,8 @@ def _convert(
     found, expected = (read_manifest(each).model_identity for each in (directory, again))
     shutil.rmtree(again, ignore_errors=True)
     if found != expected:
-        raise CalibrationError(
-            f"{directory}: expected the interrupted build of {os.fspath(checkpoint)}; found another model. Leave"
-            " --resume out to begin anew."
-        )
+        told = f"{directory}: expected the interrupted build of {os.fspath(checkpoint)}; found another model"
+        raise CalibrationError(f"{told}. Leave --resume out to begin anew.")
 
 
 def _deadline(directory: Path, control_hz: float, policy_hz: float | None, explain: Explain) -> float:

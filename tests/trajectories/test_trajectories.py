@@ -112,9 +112,13 @@ def test_rows_after_the_last_end_are_left_out_with_a_warning(file: Path) -> None
 
 
 def test_arrays_that_are_no_observation_are_left_out_with_a_warning(file: Path) -> None:
-    saved(file, **arrays(), action=np.zeros((5, 2)))
-    with pytest.warns(UserWarning, match=r"\['action'\] are no keys of the observation"):
+    saved(file, **arrays(), reward=np.zeros(5), action=np.zeros((5, 2)))
+    with pytest.warns(UserWarning, match=r"\['reward'\] are no keys of the observation"):
         assert len(load(file)) == 2
+
+
+def test_actions_that_were_recorded_are_left_out_without_a_warning(file: Path) -> None:
+    assert len(load(saved(file, **arrays(), action=np.zeros((5, 2))))) == 2
 
 
 def changed(**changes: Any) -> dict[str, Any]:

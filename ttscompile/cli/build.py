@@ -8,17 +8,10 @@ import click
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
+from ttscompile.cli import sections
 from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, warn_if_busy
-from ttscompile.cli.sections import (
-    LEROBOT,
-    Recordings,
-    Section,
-    SectionedCommand,
-    Sources,
-    require_recordings,
-    trajectories_options,
-)
+from ttscompile.cli.sections import LEROBOT, Recordings, Section, SectionedCommand, Sources, require_recordings
 from ttscompile.cli.summary import print_frontier
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
@@ -31,7 +24,7 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)
 @click.argument("checkpoint", type=PATH_OR_HUB)
-@trajectories_options(
+@sections.trajectories_options(
     required=False,
     what="Learn from these recorded episodes; without any, from those of its training, if CHECKPOINT says which.",
 )
@@ -56,7 +49,7 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
     " no plan is surely within 0.1, the original stays the default.",
 )
 @threads_option("Threads that the policy will have on the robot.")
-@number_option("--minutes", MINUTES, "Search for so many minutes, about.", default=30.0)
+@number_option("--minutes", MINUTES, "Be done in so many minutes, about, once it is compiled.", default=30.0)
 @click.option("--resume", is_flag=True, help="Go on where the same build was interrupted.")
 @lerobot_options
 @json_option
@@ -107,4 +100,4 @@ def build(
     if as_json:
         print_json(document(artifact))
     else:
-        print_frontier(artifact, directory, results(), how["threads"], how["control_hz"])
+        print_frontier(artifact, directory, results(150), how["threads"], how["control_hz"])

@@ -78,8 +78,8 @@ def print_frontier(
             ms(row["worst"], 4),
             f"{dense['milliseconds'] / row['milliseconds']:.1f} x",
             f"{row['weights'] / 1e6:.1f}",
-            f"{row['distance']:.3f}",
-            "..".join(f"{one:.3f}" for one in row["interval"]),
+            f"{round(row['distance'], 3) + 0:.3f}",  # + 0: never -0
+            "..".join(f"{round(one, 3) + 0:.3f}" for one in row["interval"]),
             "" if row["near"] else "too far",
         )
     made.columns[1].justify = "left"

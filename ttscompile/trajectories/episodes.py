@@ -144,7 +144,7 @@ def _read(
     sources = default_sources(observations, held.names, frames) | sources
     words = instruction if folder is not None or (tokenizer and _in_text_alone(held, instruction, sources)) else None
     seen = {key: spec for key, spec in observations.items() if words is None or key not in (words.tokens, words.mask)}
-    used = array_names(seen, sources) | ({TASK} if words else set())
+    used = array_names(seen, sources) | ({TASK} if words else set()) | {"action"}  # which demonstrations have, too
     if sources and not frames:
         told = f"{path}: its rows are calls of the policy, and {sorted(sources)} are to be made of other arrays, which"
         raise TrajectoryError(f"{told} is for frames. Save each key of the observation as an array of its own.")

@@ -85,7 +85,7 @@ def observation_frames(
         parts = sources.get(key, (key,))
         arrays = [_part(path, frames, key, part, spec.image) for part in parts]
         if len(arrays) == 1 and ":" not in parts[0]:
-            found[key] = _as_image(arrays[0], spec if spec.frames is None else spec.one_frame)
+            found[key] = _as_image(arrays[0], spec.one_frame)
             continue
         if len({array.shape[:1] for array in arrays}) != 1:
             shapes = {part: list(array.shape) for part, array in zip(parts, arrays, strict=True)}
