@@ -39,7 +39,7 @@ class Instruct:
             expected = f"a text, 'pick up the cup' say, or its tokens, {self._told.tokens!r} and {self._told.mask!r}"
             raise ObservationError(f"the observation has no {TASK!r}; expected {expected}.")
         rest = {key: value for key, value in obs.items() if key != TASK}
-        task = obs[TASK]
+        task = obs[TASK].tolist() if isinstance(obs[TASK], np.ndarray) else obs[TASK]
         own = (rest[key] for key in self._keys if key in rest)
         streams = next((len(value) for value in own if getattr(value, "shape", ())), 1)
         texts = [task] * streams if isinstance(task, str) else task

@@ -151,6 +151,18 @@ def test_bad_input_ends_with_2_and_one_error(toy_compiled: Path, words: list[str
     assert result.stderr.lower().count("error: ") == 1
 
 
+def test_a_state_is_asked_for_only_where_it_is_the_one_that_is_given() -> None:
+    """Of several vectors one may be called so; the others come in an archive."""
+    spec = cameras.policy("shared", told=True)[1]
+    more = replace(spec, observations={**spec.observations, "environment": ObservationSpec((2, 3))})
+    told = replace(more, instruction=Instruction("tokens", "mask", new_line=False))
+    for one in (more, told):
+        assert _option("state", one) == "--state NUMBER,.."
+        assert _option("environment", one) == "--observation FILE.npz"
+    two = replace(spec, observations={"pose": ObservationSpec((2,)), "wrench": ObservationSpec((6,))})
+    assert _option("pose", two) == _option("wrench", two) == "--observation FILE.npz"
+
+
 def test_tokens_are_given_by_the_task_where_a_text_gives_them() -> None:
     spec = cameras.policy("shared", told=True)[1]
     assert _option("mask", spec) == "--observation FILE.npz"

@@ -63,6 +63,12 @@ def test_files_beside_the_artifact_are_mentioned(artifact: Path) -> None:
     assert "notes.txt" in rung.told
 
 
+def test_files_that_conversion_puts_there_for_lerobot_are_no_strangers(artifact: Path) -> None:
+    (artifact / "config.json").write_text("{}")
+    rung, _ = check_integrity(artifact)
+    assert rung.told.endswith("have the hashes that they were written with")
+
+
 def test_what_is_no_artifact_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ArtifactError, match="does not exist"):
         check_integrity(tmp_path / "nowhere")

@@ -138,12 +138,11 @@ def observed(
     more = [(_camera(name, specs), name, path) for name, path in pictures.items()]
     parts = [(key, _picture(path, specs[key], f"--image {name}={path}")) for key, name, path in more]
     if state is not None:
-        vectors = [key for key, one in specs.items() if not one.image and np.dtype(one.dtype).kind == "f"]
-        named = [key for key in vectors if key.rpartition(".")[2] == "state"] or vectors
-        if len(named) != 1:
+        vectors = _vectors(specs)
+        if len(vectors) != 1:
             told = f"--state is for the one vector of a policy; this one reads {', '.join(vectors) or 'none'}"
             raise ObservationError(f"{told}. Give all in an archive: --observation FILE.npz.")
-        parts.append((named[0], state))
+        parts.append((vectors[0], state))
     for key, array in parts:
         if key in given:
             raise ObservationError(f"{key} is given twice. Leave out one picture, --state, or the array in {archive}.")
@@ -152,10 +151,17 @@ def observed(
     return {key: array for key, (array, _) in whole.items()}, [key for key, (_, one) in whole.items() if one]
 
 
+def _vectors(specs: Mapping[str, ObservationSpec]) -> list[str]:
+    """The vectors that --state may be: all of them, or those that are called so."""
+    vectors = [key for key, one in specs.items() if not one.image and np.dtype(one.dtype).kind == "f"]
+    return [key for key in vectors if key.rpartition(".")[2] == "state"] or vectors
+
+
 def _option(key: str, spec: PolicySpec) -> str:
     """The option that gives this observation."""
-    one, others = spec.observations[key], "--observation FILE.npz" if spec.instruction is None else _TASK
-    return f"--image {key}=FILE" if one.image else "--state NUMBER,.." if np.dtype(one.dtype).kind == "f" else others
+    told, state = spec.instruction, _vectors(spec.observations) == [key]
+    others = _TASK if told is not None and key in (told.tokens, told.mask) else "--observation FILE.npz"
+    return f"--image {key}=FILE" if spec.observations[key].image else "--state NUMBER,.." if state else others
 
 
 def _camera(name: str, specs: Mapping[str, ObservationSpec]) -> str:

@@ -14,6 +14,7 @@ from ..artifact.golden import load_golden, load_golden_plans
 from ..artifact.load import Artifact, load_artifact, present, read_manifest, require_artifact_path
 from ..artifact.manifest import MANIFEST
 from ..artifact.view import view_of
+from ..artifact.write import BESIDE
 from ..core.coercion import integer
 from ..core.plan import DENSE
 from ..errors import ArtifactChangedError, ArtifactError, RuntimeUnavailableError, TtscompileError
@@ -101,9 +102,8 @@ def check_integrity(path: Path) -> tuple[Rung, Artifact | None]:
         told = f"{len(wrong)} of its files are not as written: " * (len(wrong) > 1) + " ".join(wrong)
         return Rung(INTEGRITY, FAILED, told, len(wrong), 0, "files", remedy, details={"wrong": wrong}), None
     files, size = artifact.present, artifact.bytes / 1e6
-    other = sorted({p.name for p in path.iterdir()} - {MANIFEST, *files}) if path.is_dir() else []
-    lie = f"{len(other)} other file{'s lie' if len(other) > 1 else ' lies'} beside them"
-    more = f"; {lie}, which nothing reads: {', '.join(other[:3])}" if other else ""
+    other = sorted({p.name for p in path.iterdir()} - {MANIFEST, *BESIDE, *files}) if path.is_dir() else []
+    more = f"; {len(other)} more, which nothing reads: {', '.join(other[:3])}" if other else ""
     told = f"manifest and {len(files)} files, {size:.1f} MB, have the hashes that they were written with{more}"
     return Rung(INTEGRITY, PASSED, told, 0, 0, "files", details={"unlisted": other}), artifact
 
