@@ -18,6 +18,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import add
 from types import MappingProxyType
 from typing import TypeAlias, TypeVar
 
@@ -70,7 +71,7 @@ class FrameWork:
     scenes_remembered: int = 0
 
     def __add__(self, other: FrameWork) -> FrameWork:
-        return FrameWork(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
+        return FrameWork(*map(add, vars(self).values(), vars(other).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,9 @@ held against these pixels, not against the frame before, so that slow changes ad
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,9 +21,9 @@ from ttscompile.ir.pieces import INDEX, PIXELS, PLACES, ROWS, frame_pieces, pixe
 
 Run: TypeAlias = Callable[[str, Mapping[str, Array]], tuple[Array, ...]]
 """A piece, by its name, on inputs by theirs; its outputs in order."""
-Renew: TypeAlias = Callable[[str, Mapping[str, Array], Mapping[str, Array]], tuple[Array, ...]]
-"""A piece for some tokens, by its name, on inputs and on what is kept, by theirs; its other outputs in order. What is
-kept gets its new rows where it is."""
+Renew: TypeAlias = "Callable[[str, Mapping[str, Array], Kept], tuple[Array, ...]]"
+"""A piece for some tokens, by its name, on inputs by theirs, and what is kept, whose rows it renews where they are; its
+other outputs in order."""
 
 
 class Lane(NamedTuple):
@@ -94,7 +95,7 @@ class Seen:
 
 
 @dataclass
-class _Kept:
+class Kept:
     """What is kept of a lane.
 
     Attributes:
@@ -105,6 +106,7 @@ class _Kept:
         forward: of those that took the rows of a computed one.
         age: new frames since all tokens were computed.
         number: of the newest frame.
+        shared, bound: what ``renew`` has bound to the arrays, and arrays that it shares.
     """
 
     pixels: Array
@@ -115,6 +117,8 @@ class _Kept:
     forward: Array
     age: int = 0
     number: int = 0
+    shared: dict[str, Array] = field(default_factory=dict)
+    bound: dict[tuple[int, ...], Any] = field(default_factory=dict)
 
 
 class TokenTower:
@@ -131,7 +135,7 @@ class TokenTower:
     ) -> None:
         (self._pixels, self._part), self._run, self._renew = names, run, renew
         self._record, self._reuse, self._forward = record, reuse, forward
-        self._lanes: dict[Lane, _Kept] = {}
+        self._lanes: dict[Lane, Kept] = {}
 
     @property
     def tokens(self) -> int:
@@ -162,10 +166,10 @@ class TokenTower:
         (pixels,) = self._run(self._pixels, row)
         if kept is None:
             self._require_patches(pixels[0])
-        index, off, work = self._changed(kept, pixels[0])
+        index, off, work = self._changed(kept, pixels[0], lane)
         if kept is None:
             nothing = {name: np.zeros(kind.at(1), kind.dtype) for name, kind in self._record.kept.items()}
-            kept = _Kept(pixels[0], nothing, (), work, index, index[:0])
+            kept = Kept(pixels[0], nothing, (), work, index, index[:0])
         else:
             kept.age, kept.number, kept.forward = kept.age + 1, kept.number + 1, index[:0]
         if index.size:
@@ -173,7 +177,7 @@ class TokenTower:
             if self._forward:
                 kept.forward, rows = self._similar(kept.pixels, pixels[0], index, off)
                 feed |= _written(index, kept.forward, rows)
-            kept.values = self._renew(self._part, feed, kept.arrays)
+            kept.values = self._renew(self._part, feed, kept)
         if len(index) == self.tokens:
             kept.pixels, kept.age = pixels[0], 0
         elif index.size:
@@ -181,26 +185,27 @@ class TokenTower:
             y, x = np.divmod(index[self._record.fixed :] - self._record.fixed, ours.shape[2])
             theirs[:, y, x] = ours[:, y, x]
         kept.index, self._lanes[lane] = index, kept
-        kept.work = replace(work, forward=len(kept.forward), camera=lane.camera, stream=lane.stream)
+        kept.work = replace(work, forward=len(kept.forward)) if len(kept.forward) else work
         return kept.values, kept.work
 
-    def _changed(self, kept: _Kept | None, pixels: Array) -> tuple[Array, Array, TokenWork]:
+    def _changed(self, kept: Kept | None, pixels: Array, lane: Lane) -> tuple[Array, Array, TokenWork]:
         """Numbers of the tokens to compute, int64, none where no patch changed; how much each patch differs; and why.
 
         Of a frame that is computed whole anyway nobody asks how much differs, and nothing is said.
         """
         fixed, tokens = self._record.fixed, self.tokens
+        work = partial(TokenWork, tokens, camera=lane.camera, stream=lane.stream)
         if kept is None or kept.age + 1 >= self._reuse.refresh:
-            why = TokenWork(tokens, first=tokens) if kept is None else TokenWork(tokens, refresh=tokens)
-            return np.arange(tokens), np.zeros(0, np.float32), why
+            return np.arange(tokens), np.zeros(0, np.float32), work(refresh=tokens) if kept else work(first=tokens)
         off = self._differences(pixels, kept.pixels)
         changed = int(np.count_nonzero(off > self._reuse.threshold))
         if not changed:
-            return np.arange(0), off, TokenWork(tokens)
+            return np.arange(0), off, work()
         size = next((size for size in sizes_of(tokens) if size >= fixed + changed), tokens)
-        most = np.argpartition(-off, size - fixed - 1)[: size - fixed] if size < tokens else np.arange(tokens - fixed)
-        index = np.concatenate([np.arange(fixed), fixed + np.sort(most)])
-        return index, off, TokenWork(tokens, changed=changed, filled=size - changed)
+        index = np.arange(size)
+        if size < tokens:
+            index[fixed:] = fixed + np.sort(np.argpartition(-off, size - fixed - 1)[: size - fixed])
+        return index, off, work(changed=changed, filled=size - changed)
 
     def _similar(self, old: Array, new: Array, index: Array, off: Array) -> tuple[Array, Array]:
         """Tokens that take the rows of a computed one, and which one each takes, as a place in ``index``.
@@ -209,8 +214,7 @@ class TokenTower:
         for. They are at most as many as are computed: those that gain most.
         """
         fixed, computed = self._record.fixed, index[self._record.fixed :] - self._record.fixed
-        (others,) = off.nonzero()
-        others = np.setdiff1d(others, computed, assume_unique=True)
+        others = np.setdiff1d(off.nonzero()[0], computed, True) if len(index) < self.tokens else index[:0]
         if not others.size:
             return others, others
         one, known = self._of(new, others), self._of(new, computed)
@@ -239,7 +243,7 @@ class TokenTower:
     def _differences(self, one: Array, other: Array) -> Array:
         """The mean absolute difference of each patch of ``[C, H, W]``, row by row."""
         high, wide = self._record.patch
-        _, rows, columns, *_ = self._patches(one).shape
+        rows, columns = one.shape[1] // high, one.shape[2] // wide
         off = one[:, : rows * high, : columns * wide] - other[:, : rows * high, : columns * wide]
         np.abs(off, out=off)
         # Long rows first: a mean over all three axes at once takes twelve times as long.

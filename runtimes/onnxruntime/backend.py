@@ -49,7 +49,7 @@ class OnnxBackend:
         self._blocks = view.pruned or any(one.partial for one in self._schedules)  # whether these have sessions
         self.sessions = sessions.of(view, self._blocks)
         self._run = partial(run_piece, self.sessions, self._manifest.pieces)  # which does not keep the backend alive
-        self._renew = partial(renew_piece, self.sessions, self._manifest.pieces)
+        self._renew = partial(renew_piece, self.sessions)
         self.frames = known.setdefault(view.frames_key, self._open_frames())
         self.keeps = readable_rollout(view)
         self.workspace: Workspace | None = self._open_workspace(1)
