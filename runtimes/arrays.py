@@ -88,8 +88,7 @@ def _check_kind(key: str, array: Array, spec: ObservationSpec) -> None:
     if array.shape == spec.shape:
         remedy = " A single stream needs a first axis of 1: use obs[None]."
     expected = f"{spec.dtype} [B, {', '.join(map(str, spec.shape))}]; found {array.dtype!s:.80} {list(array.shape)}"
-    told = f"observation {key!r} has the wrong {wrong}: expected {expected}"
-    raise ObservationError(f"{told}.{remedy}")
+    raise ObservationError(f"observation {key!r} has the wrong {wrong}: expected {expected}.{remedy}")
 
 
 def _frames_remedy(array: Array, spec: ObservationSpec) -> str:

@@ -162,8 +162,7 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
     channels = slice(spec.chunk.action_dim)
     positions = slice(spec.chunk.start, spec.chunk.start + prefix.shape[1])
     if spec.trained_prefix:
-        others = ((0, 0), (0, 0), (0, spec.sample[1] - spec.chunk.action_dim))
-        clean = np.pad(prefix, others)
+        clean = np.pad(prefix, ((0, 0), (0, 0), (0, spec.sample[1] - spec.chunk.action_dim)))
         return Known(positions, slice(None), np.stack([clean] * (spec.sampler.steps + 1)))
     levels = noise_levels(spec.sampler)
     assert levels is not None

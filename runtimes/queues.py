@@ -23,7 +23,7 @@ class Queues:
 
     def __init__(self, specs: Mapping[str, ObservationSpec]) -> None:
         self._specs = specs
-        self._frame_specs = {key: spec if spec.frames is None else spec.one_frame for key, spec in specs.items()}
+        self._frame_specs = {key: spec.one_frame for key, spec in specs.items()}
         self._frames: Frames = {}
         self._actions: deque[FloatArray] = deque()
 

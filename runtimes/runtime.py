@@ -186,8 +186,7 @@ class Runtime:
         self.require_streams(streams)
         if plan.otherwise is not None and self._chunk is None:
             plan = plan.otherwise
-        name = self._artifact.name_of(plan)
-        told = name or self._artifact.told(plan)
+        name, told = self._artifact.name_of(plan), self._artifact.told(plan)
         opened = self._opened_for(plan)
         view, backend = opened.view, opened.backend
         spec, manifest = view.manifest.spec, view.manifest

@@ -17,7 +17,7 @@ Who owns what:
 import sys
 import warnings
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from numbers import Real
 from types import TracebackType
 from typing import Any
@@ -78,7 +78,7 @@ class AsyncExecutor:
         info = policy.info
         self._resolved = resolve(settings, info, control_hz)
         require_plans(policy, self._resolved)
-        self._with_tokens: Callable[[Mapping[str, Any]], Mapping[str, Any]] = getattr(policy, "with_tokens", _as_it_is)
+        self._with_tokens = getattr(policy, "with_tokens", lambda frame: frame)
         self._clock = clock or MonotonicClock()
         self._identity = str(getattr(info, "identity", ""))  # anything that predicts may be driven
         self.trace = Trace(settings.trace_events, self._identity)
@@ -298,10 +298,6 @@ class AsyncExecutor:
             raised = f"a call raised {type(failure).__name__}: {failure}"
             remedy = "Stop the robot safely; close this executor, and make another one when the cause is gone."
             raise WorkerDeadError(f"the thread that owns the policy has ended, because {raised}. {remedy}") from failure
-
-
-def _as_it_is(frame: Mapping[str, Any]) -> Mapping[str, Any]:
-    return frame
 
 
 def _seconds(value: Any, what: str) -> float | None:

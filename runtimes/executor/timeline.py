@@ -94,8 +94,7 @@ class Timeline:
 
     def then(self, other: Timeline) -> Timeline:
         """This, and after its end another."""
-        pairs = zip(self._arrays, other._arrays, strict=True)
-        return Timeline(self.start, *(np.concatenate(pair) for pair in pairs))
+        return Timeline(self.start, *(np.concatenate(pair) for pair in zip(self._arrays, other._arrays, strict=True)))
 
     def clipped_to(self, rows: FloatArray) -> Timeline:
         """The same with rows that the guard made of these."""

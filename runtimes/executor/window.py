@@ -96,7 +96,7 @@ class FrameSpec:
     @property
     def seen_before(self) -> bool:
         """Whether a call reads pictures that are not of its newest frame, if it reads any."""
-        pictures = {key for key, spec in self.specs.items() if len(spec.shape) - (spec.frames is not None) >= 3}
+        pictures = {key for key, spec in self.specs.items() if len(spec.one_frame.shape) >= 3}
         return not pictures or not self.history.isdisjoint(pictures)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from ttscompile.core.coercion import Array
 from ttscompile.core.correction import FEATURES, remember
 from ttscompile.core.spec import FloatArray, SamplerTable
-from ttscompile.core.update import clips, rows
+from ttscompile.core.update import clip_of, rows
 from ttscompile.ir.pieces import BASE, PRODUCT, SHIFT, TOTAL
 
 from .sessions import Bound
@@ -42,10 +42,8 @@ class IdleSteps:
         self._held = not product.any()  # the prediction is the total's, whatever the sample is
         self._base = np.zeros((len(product), streams, horizon), np.float32)
         self._prepare = Bound(session, {TOTAL: self.total}, {BASE: self._base})
-        self._clip = None
-        if clips(sampler):
-            assert sampler.clip is not None
-            self._clip = np.full(shape, -sampler.clip, np.float32), np.full(shape, sampler.clip, np.float32)
+        clip = clip_of(sampler)
+        self._clip = None if clip is None else (np.full(shape, -clip, np.float32), np.full(shape, clip, np.float32))
         before = 2 + (self._clip is not None)
         parts = np.zeros((before + self._memories, *shape), np.float32)  # sample, prediction, denoised, memories
         self._parts, self._memory = parts, parts[before:]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ttscompile.core.spec import BF16, FP16, FP32
-from ttscompile.errors import RuntimeUnavailableError
+from ttscompile.errors import RuntimeUnavailableError, first_line
 
 NARROW = {FP32: None, BF16: torch.bfloat16, FP16: torch.float16}
 """Precisions of the products in residual blocks."""
@@ -36,10 +36,8 @@ def device_of(name: str) -> torch.device:
     try:
         found: torch.device = torch.zeros(1, device=torch.device(name)).add_(1).device
     except Exception as error:  # AssertionError of a build without CUDA, RuntimeError, AcceleratorError, TypeError
-        first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        problem = f"device {name!r} cannot be had: {first}"
         remedy = "Use device='cpu', or install the build of torch that has it: https://pytorch.org/get-started."
-        raise RuntimeUnavailableError(f"{problem}. {remedy}") from error
+        raise RuntimeUnavailableError(f"device {name!r} cannot be had: {first_line(error)}. {remedy}") from error
     return found
 
 

@@ -47,7 +47,7 @@ def denoise(  # noqa: PLR0913  # the tensors of a call, each by its name
     Args:
         network: of the call.
         plan: lowered.
-        keep: bool ``[K, blocks]``; computed residuals that the result holds.
+        keep: flat indices of the computed residuals that the result holds.
         advance: the sampler.
         initial: the sample at step 0, ``[B, T, D]``.
         offset: what each step adds to the sample, K of ``[D, B, (1 + S) T]``.

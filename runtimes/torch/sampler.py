@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ttscompile.core.correction import HISTORY, Correction, no_correction
 from ttscompile.core.spec import PolicySpec
-from ttscompile.core.update import clips, matrices
+from ttscompile.core.update import clip_of, matrices
 from ttscompile.ir.idle_form import IdleForm
 
 from . import devices
@@ -60,7 +60,7 @@ class Advance(devices.OnTensors):
         self.anchors: list[bool] = used.anchors.tolist()
         self.updates = devices.placed(matrices(table, used), device)
         self._of_step = [one.expand(self.dimensions, -1, -1) for one in self.updates]
-        self.clip = table.clip if clips(table) else None
+        self.clip = clip_of(table)
         self._to_clean = list(zip(table.sample_to_x0.tolist(), table.out_to_x0.tolist(), strict=True))
         self.to_clean = torch.tensor(self._to_clean, dtype=torch.float32, device=device)
         self.reading = self.observed = self.inner = self.middle = self.outer = None

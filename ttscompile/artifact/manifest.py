@@ -242,8 +242,7 @@ class PrecisionRecord:
     @property
     def kept(self) -> tuple[str, ...]:
         """The parts that have such weights, those of the prologue first."""
-        own = {str(part_of(piece)) for piece in self.models}
-        return tuple(sorted(own, key=lambda part: (part == BLOCKS, part)))
+        return tuple(sorted({str(part_of(piece)) for piece in self.models}, key=lambda part: (part == BLOCKS, part)))
 
     @property
     def told(self) -> str:

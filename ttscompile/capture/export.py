@@ -195,12 +195,10 @@ class _Converter:
         self.taken: set[str] = set()
 
     def convert(self) -> tuple[Graph, Weights]:
-        signature = self.exported.graph_signature
-        kinds = {s.arg.name: s for s in signature.input_specs}
+        kinds = {s.arg.name: s for s in self.exported.graph_signature.input_specs}
         inputs: dict[str, TensorType] = {}
         constants: dict[str, TensorType] = {}
         weights: Weights = {}
-        nodes: list[Node] = []
         state = {**self.exported.state_dict, **self.exported.constants}
         placeholders = [n for n in self.exported.graph.nodes if n.op == "placeholder"]
         users = [n for n in placeholders if kinds[n.name].kind is InputKind.USER_INPUT]
@@ -221,10 +219,9 @@ class _Converter:
                 raise CaptureError(f"the module reads what it computed when it was called before.{KEEPS}")
             weights[target] = state[target].detach().cpu().contiguous().numpy()
         self.taken = {*inputs, *constants}
-        for fx_node in self.exported.graph.nodes:
-            if fx_node.op == "call_function" and (node := self._node(fx_node)) is not None:
-                nodes.append(node)
-        return Graph(inputs, constants, tuple(nodes), (self._output(),)), weights
+        made = [self._node(fx_node) for fx_node in self.exported.graph.nodes if fx_node.op == "call_function"]
+        nodes = tuple(node for node in made if node is not None)
+        return Graph(inputs, constants, nodes, (self._output(),)), weights
 
     def _size(self, fx_node: torch.fx.Node, size: Any) -> int:
         if isinstance(size, int):

@@ -17,7 +17,7 @@ from ttscompile.cli.output import manifest_of, only_results_on_stdout, progress,
 from ttscompile.cli.sections import Recordings
 from ttscompile.core.envelope import FAR
 from ttscompile.core.plan import DENSE
-from ttscompile.core.spec import LARGEST, Noise, PolicySpec
+from ttscompile.core.spec import Noise, PolicySpec
 from ttscompile.errors import ArtifactChangedError, SpecError, needing
 from ttscompile.measure.machine import fingerprint, one_line
 from ttscompile.measure.units import ms, share
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 MOST_DRAWN = 8
 """Plans whose furthest calls are drawn."""
+_NO_LIMIT = 1e6  # of a distance; where one episode was held out its interval ends at 1e15 (``measure.points``)
 
 
 @dataclass(frozen=True)
@@ -232,7 +233,7 @@ def print_comparison(found: Comparison, output: Console) -> None:
             p.series,
             p.name,
             f"{p.distance:.3f}",
-            "..".join(f"{one:.3f}" for one in p.interval) if max(p.interval) < LARGEST else "unknown",
+            "..".join(f"{one:.3f}" for one in p.interval) if max(p.interval) < _NO_LIMIT else "unknown",
             "" if p.error is None else f"{p.error:.4g}",
             "" if p.error_p90 is None else f"{p.error_p90:.4g}",
             ms(p.latency_ms, 4),

@@ -52,9 +52,8 @@ class Origins:
 
 def check_plan(plan: npt.ArrayLike, steps: int, blocks: int, streams: int) -> PlanArray:
     """A plan ``[K, blocks]`` or ``[B, K, blocks]`` of any integer dtype as int8 ``[B, K, blocks]``; or refused."""
-    array = given = _sources(plan)
-    if array.ndim == 2:
-        array = np.broadcast_to(array, (streams, *array.shape))
+    given = _sources(plan)
+    array = np.broadcast_to(given, (streams, *given.shape)) if given.ndim == 2 else given
     if array.shape != (streams, steps, blocks):
         expected = f"[K, blocks] = ({steps}, {blocks}) or [B, K, blocks] = ({streams}, {steps}, {blocks})"
         raise IllegalPlanError(f"plan has shape {given.shape}; expected {expected}.")

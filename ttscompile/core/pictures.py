@@ -88,8 +88,7 @@ def _bilinear(array: FloatArray, count: int, axis: int) -> FloatArray:
     share = (at - low).astype(np.float32)
     share = share[:, None] if axis == -2 else share
     left, right = array.take(low, axis), array.take(np.minimum(low + 1, before - 1), axis)
-    made: FloatArray = left * (1 - share) + right * share
-    return made
+    return np.asarray(left * (1 - share) + right * share, np.float32)
 
 
 def _cubic(array: FloatArray, count: int, axis: int) -> FloatArray:

@@ -101,8 +101,8 @@ class ObservationSpec:
 
     @property
     def one_frame(self) -> ObservationSpec:
-        """The same of one frame, where there are several."""
-        return replace(self, shape=self.shape[1:], window=False)
+        """The same of one frame, without an axis of several."""
+        return self if self.frames is None else replace(self, shape=self.shape[1:], window=False)
 
     @property
     def image(self) -> bool:

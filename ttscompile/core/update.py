@@ -21,9 +21,10 @@ from .correction import FEATURES, Correction, correction_flops
 from .spec import FloatArray, SamplerTable
 
 
-def clips(sampler: SamplerTable) -> bool:
-    """Whether the update has a term that is not linear."""
-    return sampler.clip is not None and bool((sampler.sample_to_x0 != 0).any() or (sampler.out_to_x0 != 0).any())
+def clip_of(sampler: SamplerTable) -> float | None:
+    """The bound of denoised samples, for which the update has a term that is not linear; None where it has none."""
+    predicts = (sampler.sample_to_x0 != 0).any() or (sampler.out_to_x0 != 0).any()
+    return sampler.clip if predicts else None
 
 
 def bounded(sampler: SamplerTable, sample: FloatArray) -> FloatArray:
@@ -39,7 +40,7 @@ def bounded(sampler: SamplerTable, sample: FloatArray) -> FloatArray:
 
 def rows(sampler: SamplerTable, horizon: int) -> int:
     """R."""
-    return (FEATURES + clips(sampler) + sampler.memories) * horizon
+    return (FEATURES + (clip_of(sampler) is not None) + sampler.memories) * horizon
 
 
 def columns(sampler: SamplerTable, horizon: int) -> int:
@@ -59,7 +60,7 @@ def diagonals(sampler: SamplerTable) -> dict[tuple[int, int], FloatArray]:
     The places of features are those of ``features_k``; the result at place 0 is the sample, at 1 + s a memory.
     """
     wide = {name: getattr(sampler, name).astype(np.float64) for name in sampler.COLUMNS}
-    memories, clipped = sampler.memories, clips(sampler)
+    memories, clipped = sampler.memories, clip_of(sampler) is not None
     own = [wide["x0_to_next"], wide["sample_to_next"], wide["out_to_next"]]
     results = [np.concatenate([np.stack(own, 1), sampler.memory_to_next.astype(np.float64)], 1)]
     results += [sampler.to_memory[:, s].astype(np.float64) for s in range(memories)]

@@ -127,8 +127,7 @@ def _extra(name: str, wanted: list[Requirement]) -> Finding:
 def _providers() -> list[Finding]:
     part = "onnxruntime"
     try:
-        module = importlib.import_module("onnxruntime")
-        offered = list(module.get_available_providers())
+        offered = list(importlib.import_module("onnxruntime").get_available_providers())
     except ModuleNotFoundError as error:
         lacking = error.name or "onnxruntime"
         told, remedy = f"fails: {lacking} is not installed", f"Run: pip install {lacking}."

@@ -193,8 +193,7 @@ def plan_flops(artifact: Artifact, name: str) -> float | None:
     if own.flops_sparsity is None:
         return None
     manifest = view_of(artifact, plan).manifest
-    whole = dense_plan(manifest.steps, len(manifest.blocks))
-    dense = manifest.flops.call(whole, own.pruned, plan.correction)
+    dense = manifest.flops.call(dense_plan(manifest.steps, len(manifest.blocks)), own.pruned, plan.correction)
     return dense - own.flops_sparsity * manifest.steps * sum(manifest.flops.blocks)
 
 
