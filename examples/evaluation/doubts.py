@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,6 +35,7 @@ class Going:
         left: actions that were predicted and are left, ``[B]``.
         seen: observation of the call before, ``[B, N]``.
         done: actions since then, normalised, ``[B, h * D]``.
+        pictures: by key, those that the chunk was drawn with.
     """
 
     chunk: FloatArray
@@ -42,6 +43,7 @@ class Going:
     left: npt.NDArray[np.int64]
     seen: FloatArray
     done: FloatArray
+    pictures: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -71,17 +73,20 @@ class Check:
         directory: of an artifact.
         step: whose level of noise the chunk gets.
         answered: whether the network's clean chunk is executed where it is near enough.
+        blind: whether it sees the pictures that the chunk was drawn with, and of what is new the state alone.
     """
 
     evaluations = 1
 
-    def __init__(self, directory: Path, step: int, answered: bool = False) -> None:
+    def __init__(self, directory: Path, step: int, answered: bool = False, blind: bool = False) -> None:
         artifact = load_artifact(directory)
         view = view_of(artifact, artifact.plan(full_plan(directory)))
         self._spec, levels = view.manifest.spec, noise_levels(view.manifest.spec.sampler)
         if levels is None or not 0 < step < self._spec.sampler.steps:
             raise TtscompileError(f"{directory}: its loop gives no level of noise before a step {step}.")
-        self._model, self._step, self._answered = ReferenceModel.from_view(view), step, answered
+        if blind and not any(one.image for one in self._spec.observations.values()):
+            raise TtscompileError(f"{directory}: it sees no pictures, so a check has none to keep. Leave out 'blind'.")
+        self._model, self._step, self._answered, self.blind = ReferenceModel.from_view(view), step, answered, blind
         self._signal, self._deviation = (np.float32(one[step]) for one in levels)
 
     def reset(self) -> None:
@@ -90,6 +95,7 @@ class Check:
     def judge(self, obs: Mapping[str, Array], fresh: FloatArray, going: Going) -> Verdict:
         """See ``Doubt``."""
         specs, table, k = self._spec.observations, self._spec.sampler, self._step
+        obs = {**obs, **going.pictures} if self.blind else obs
         given = {key: torch.from_numpy(spec.normalized(np.asarray(obs[key]))) for key, spec in specs.items()}
         sample = self._signal * going.chunk + self._deviation * going.noise
         with torch.no_grad():

@@ -1,20 +1,23 @@
 """Does it pay to go on with the chunk of the call before, where one evaluation says that it still holds?
 
-    python examples/evaluation/kept_chunk.py DIR OTHER@4 --horizon 4 --every 8,4 --environment pusht:moved
+    python examples/evaluation/kept_chunk.py DIR OTHER@4 --horizon 4 --every 4,8 --warm 2 --environment pusht:moved
 
 A call comes every ``--horizon`` actions. It draws a chunk, or goes on with the one before while that has actions left.
-DIR's plan draws; other plans, such as warm starts, draw in every call, as DIR's does in rows of ``--every``.
+DIR's plan draws; other plans draw in every call, as DIR's does in rows of ``--every``, and so do the last steps of the
+whole loop, from the chunk before, in rows of ``--warm``.
 
 - ``check`` spends one evaluation: the chunk before, moved by what was executed, with noise as before step ``--step`` of
   the whole loop, and the newest observation. The call draws where the network's clean chunk is further from that chunk
   than a threshold. FLASH (arXiv 2605.13778) checks what a small model drafted so.
 - ``answered`` is the same, and executes the clean chunk where it is near enough.
+- ``blind`` is ``check`` with the pictures that the chunk was drawn with, whose features are known.
 - ``forecast`` spends none: a linear map of the observation and the actions of the call before says what is observed
   now, and the call draws where that is wrong.
 - ``chance`` draws by chance; with a share of 0 it goes on until a chunk is used up.
 
 Thresholds are quantiles over episodes that nothing is judged on, and which go on whenever they can; ``--shares`` are
-those of the checks that fail there. Maps are fitted on the same episodes.
+those of the checks that fail there. Maps are fitted on the same episodes. Milliseconds are those of calls of each kind
+(``kept_times.py``), by how often each was made.
 
 Where somebody moves a block (``NAME:moved``), all is driven without that, too. A policy has reacted once an action
 differs by ``REACTED`` of the actions' range from that of the episode in which the block stays.
@@ -24,122 +27,35 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
 import numpy as np
-from doubts import Array, Chance, Check, Doubt, Forecast, Going, flat
+from doubts import Array, Chance, Check, Doubt, Forecast
 from environments import environment_class, environment_option
 from evaluate import Evaluation, summarise
+from keeping import Keeping, active
+from kept_times import Stopwatch, Times, warmed
 from rich.table import Table
 from rollout import Episode, Rollout, run_episodes
 from variants import Variant, batch_option, first_seed_option, json_option, open_variant, results_console, run
+from warm_start import WARM
 
-import ttscompile
 from ttscompile.artifact.load import load_artifact
-from ttscompile.core.lattice import Source
 from ttscompile.core.spec import ChunkSpec
 from ttscompile.errors import TtscompileError
-from ttscompile.runtimes.info import PolicyInfo
 
 REACTED = 0.1
 """Of the range of each action, by which one differs from that of an episode in which nothing was moved."""
 
-RULES = ("check", "answered", "forecast", "chance")
+TIMED = 4
+"""Episodes whose calls are timed."""
 
-
-@dataclass
-class Slots:
-    """What calls of a batch of episodes did, in order: arrays with a row for each stream.
-
-    Attributes:
-        drawn: whether a chunk was drawn.
-        checked: whether the one before had enough actions left to go on.
-        steps: evaluations of the loop.
-        distances: of the doubt; NaN where there was none.
-        known: the observation, and what is executed.
-        seen: the observation.
-    """
-
-    drawn: list[Array] = field(default_factory=list)
-    checked: list[Array] = field(default_factory=list)
-    steps: list[Array] = field(default_factory=list)
-    distances: list[Array] = field(default_factory=list)
-    known: list[Array] = field(default_factory=list)
-    seen: list[Array] = field(default_factory=list)
-
-
-class Keeping:
-    """A policy that goes on with chunks.
-
-    Args:
-        variant: what draws.
-        chunk: what of a sample is action.
-        horizon: actions from one call to the next.
-        doubt: that decides; None where each call draws.
-        threshold: above which distance a chunk is drawn.
-    """
-
-    def __init__(
-        self, variant: Variant, chunk: ChunkSpec, horizon: int, doubt: Doubt | None = None, threshold: float = np.inf
-    ) -> None:
-        self._variant, self._chunk, self._horizon = variant, chunk, horizon
-        self._doubt, self._threshold = doubt, threshold
-        self.info: PolicyInfo = variant.policy.info
-        self.batches: list[Slots] = []
-
-    def reset(self) -> None:
-        """A new episode."""
-        self._variant.policy.reset()
-        if self._doubt is not None:
-            self._doubt.reset()
-        self._going: Going | None = None
-        self.batches.append(Slots())
-
-    def predict_action(
-        self, obs_dict: Mapping[str, Any], noise: ttscompile.Noise | None = None, plan: object = None
-    ) -> Mapping[str, Any]:
-        """One call. All streams are drawn anew, but only those that have to be are counted."""
-        assert noise is not None
-        chunk, h, log, going, seen = self._chunk, self._horizon, self.batches[-1], self._going, flat(obs_dict)
-        made, steps = self._drawn(obs_dict, noise)
-        fresh, whole = noise.initial[:, : made.shape[1]], np.full(len(made), made.shape[1] - chunk.start)
-        after, noises, left = made, fresh, whole
-        drawn, checked, distances = np.ones(len(made), np.bool_), whole < 0, np.full(len(made), np.nan)
-        if going is not None and self._doubt is not None:
-            verdict = self._doubt.judge(obs_dict, fresh, going)
-            answered = verdict.clean is not None
-            checked = (going.left >= h) | answered
-            drawn = ~checked | (verdict.distances > self._threshold)
-            distances = np.where(checked, verdict.distances, np.nan)
-            old = drawn[:, None, None], going.chunk if verdict.clean is None else verdict.clean
-            after, noises = np.where(old[0], made, old[1]), np.where(old[0], fresh, going.noise)
-            left = np.where(drawn | answered, whole, going.left)
-        done = after[:, chunk.start : chunk.start + h].reshape(len(made), -1)
-        told = drawn, checked, steps * drawn, distances, np.concatenate([seen, done], 1), seen
-        for name, array in zip(("drawn", "checked", "steps", "distances", "known", "seen"), told, strict=True):
-            getattr(log, name).append(array)
-        noises = np.concatenate([noises[:, h:], fresh[:, :h]], 1)
-        self._going = Going(chunk.moved(after, h), noises, left - h, seen, done)
-        return {"action": chunk.unnormalized(after)[:, chunk.start : chunk.start + h]}
-
-    def _drawn(self, obs: Mapping[str, Any], noise: ttscompile.Noise) -> tuple[Array, Array]:
-        """Chunks ``[B, T, D]``, normalised, and how many evaluations each took."""
-        policy: Any = self._variant.policy
-        if self._going is not None:
-            policy.follow(self._horizon)
-        predicted = policy.predict_action(obs, noise=noise, plan=self._variant.plan)["action_pred"]
-        computed = (policy.last_report.plan == Source.COMPUTE).any(-1).sum(-1)
-        return self._chunk.normalized(np.asarray(predicted)), computed
-
-
-def active(slots: Sequence[Slots], name: str, episodes: Sequence[Episode]) -> list[Array]:
-    """What is known of the calls of each episode, in order, while it was not done."""
-    columns = [(one, i) for one in slots for i in range(len(one.drawn[0]))]
-    arrays = ([row[i] for row in getattr(one, name)] for one, i in columns)
-    return [np.stack(rows[: episode.calls]) for rows, episode in zip(arrays, episodes, strict=True)]
+RULES = ("check", "answered", "blind", "forecast", "chance")
 
 
 @dataclass(frozen=True)
@@ -160,6 +76,8 @@ class Row:
     Attributes:
         steps: evaluations that are steps of the loop, for each action.
         checks: evaluations that check a chunk, likewise.
+        ms: milliseconds of calls, likewise.
+        times: milliseconds of a call, by its kind.
         anew: share of the calls that could have gone on, and drew.
         evaluation: against the first row.
         still: the same where nothing is moved; None where nothing is in any case.
@@ -168,14 +86,16 @@ class Row:
 
     steps: float
     checks: float
+    ms: float
+    times: Mapping[str, float]
     anew: float | None
     evaluation: Evaluation
     still: Evaluation | None
     reaction: tuple[float, float] | None
 
     def cells(self, actions: int) -> list[str]:
-        """For the table; evaluations are of so many actions."""
-        told = [f"{actions * one:.2f}" for one in (self.steps + self.checks, self.checks)]
+        """For the table; evaluations and milliseconds are of so many actions."""
+        told = [f"{actions * one:.2f}" for one in (self.steps + self.checks, self.checks, self.ms)]
         told.append("" if self.anew is None else f"{self.anew:.0%}")
         for one in (self.evaluation, self.still):
             if one is not None:
@@ -209,13 +129,15 @@ class Bench:
         chunk: what of a sample is action.
         batch: episodes in lockstep.
         learned: seeds of the episodes that thresholds and forecasts are of.
+        calls: of each kind that are timed.
     """
 
-    def __init__(self, environment: str, chunk: ChunkSpec, batch: int, learned: Sequence[int]) -> None:
+    def __init__(self, environment: str, chunk: ChunkSpec, batch: int, learned: Sequence[int], calls: int) -> None:
         make: Any = environment_class(environment)
-        self._make, self._chunk, self._batch, self._learned = make, chunk, batch, learned
+        self._make, self._chunk, self._batch, self._learned, self._calls = make, chunk, batch, learned, calls
         self._still = type("Still", (make,), {"moves": False}) if hasattr(make, "moves") else None
         self._known: dict[tuple[int, int], Array] = {}
+        self._times: dict[tuple[str, int], Mapping[str, float]] = {}
 
     def forecast(self, variant: Variant, horizon: int) -> Forecast:
         """Fitted on episodes that go on whenever they can."""
@@ -233,10 +155,21 @@ class Bench:
             self._known[key] = told[np.isfinite(told)]
         return float(np.quantile(self._known[key], 1 - way.share))
 
+    def times(self, way: Way) -> Mapping[str, float]:
+        """Milliseconds of calls of the way's artifact and plan, by kind."""
+        if (key := (way.variant.label, way.horizon)) not in self._times:
+            driven = self._driven(Way("", way.variant, way.horizon), np.inf, self._still, self._learned[:TIMED])[1]
+            windows = [[{n: a[i] for n, a in one.windows.items()} for i in range(one.calls)] for one in driven.episodes]
+            pairs = [pair for one in windows for pair in pairwise(one)][: self._calls]
+            self._times[key] = Stopwatch(*key).times(pairs)
+        return self._times[key]
+
     def rows(self, ways: Sequence[Way], seeds: Sequence[int], tell: Callable[[str], None]) -> list[Row]:
         """Every way on every seed."""
         rows, first, first_still = list[Row](), None, None
-        for way in ways:
+        tell("times")
+        times = [self.times(way) for way in ways]
+        for way, own in zip(ways, times, strict=True):
             tell(way.label)
             keeping, rollout = self._driven(way, threshold := self.threshold(way), self._make, seeds)
             first, still, reaction = first or rollout, None, None
@@ -250,8 +183,9 @@ class Bench:
             steps, checked, drawn = (np.concatenate(active(keeping.batches, n, rollout.episodes)) for n in names)
             checks = 0 if way.doubt is None else way.doubt.evaluations * int(checked.sum())
             anew = float(drawn[checked].mean()) if checked.any() else None
-            found = summarise(way.label, rollout, first)
-            rows.append(Row(float(steps.sum()) / actions, checks / actions, anew, found, still, reaction))
+            found, took = summarise(way.label, rollout, first), Times.by(own, way.doubt).of(drawn, checked)
+            evaluations, ms = float(steps.sum()) / actions, float(took.sum()) / actions
+            rows.append(Row(evaluations, checks / actions, ms, own, anew, found, still, reaction))
         return rows
 
     def _driven(self, way: Way, threshold: float, make: Any, seeds: Sequence[int]) -> tuple[Keeping, Rollout]:
@@ -293,12 +227,14 @@ def _actions(word: str) -> int:
 @click.argument("directory", type=click.Path(exists=True, path_type=Path))
 @click.argument("others", nargs=-1, metavar="[DIR:PLAN@HORIZON...]")
 @click.option("--horizon", default=4, type=click.IntRange(1), help="Actions from one call to the next.")
-@click.option("--every", default="8,4", callback=_listed(_actions), help="Horizons of calls that all draw.")
+@click.option("--every", default="4,8", callback=_listed(_actions), help="Horizons of calls that all draw.")
+@click.option("--warm", default="", callback=_listed(_actions), help="Last steps of calls that begin with a chunk.")
 @click.option("--step", default=5, type=click.IntRange(1), help="Of the whole loop, whose noise a check has.")
 @click.option("--rules", default="check,chance", callback=_listed(_rule), help=f"Of {', '.join(RULES)}.")
 @click.option("--shares", default="0.25,0.5,0.75", callback=_listed(_share), help="Of the checks, that shall fail.")
 @click.option("--chances", default="0", callback=_listed(_share), help="Likewise, by chance.")
 @click.option("--learned", default=32, type=click.IntRange(1), help="Episodes for thresholds and maps, from seed 0.")
+@click.option("--calls", default=40, type=click.IntRange(2), help="Of each kind, that are timed.")
 @environment_option
 @click.option("--episodes", default=200, type=click.IntRange(1))
 @first_seed_option
@@ -309,11 +245,13 @@ def main(
     others: tuple[str, ...],
     horizon: int,
     every: list[int],
+    warm: list[int],
     step: int,
     rules: list[str],
     shares: list[float],
     chances: list[float],
     learned: int,
+    calls: int,
     environment: str,
     episodes: int,
     first_seed: int,
@@ -321,25 +259,31 @@ def main(
     as_json: bool,
 ) -> None:
     """Drive DIRECTORY's plan with rules about going on, and other plans."""
-    own, chunk = open_variant(str(directory), "onnxruntime", 1), load_artifact(directory).manifest.spec.chunk
+    chunk = load_artifact(directory).manifest.spec.chunk
     if chunk.relative is not None or chunk.switches:
         raise TtscompileError(f"{directory}: its actions are relative, or switches; chunks of those are not kept here.")
-    bench = Bench(environment, chunk, batch, range(learned))
-    ways = [Way(f"every {h} actions", own, h) for h in every]
-    for text in others:
-        name, _, h = text.partition("@")
-        ways.append(Way(text, open_variant(name, "onnxruntime", 1), int(h or horizon)))
-    doubts: dict[str, Callable[[], Doubt]] = {
-        "check": lambda: Check(directory, step),
-        "answered": lambda: Check(directory, step, answered=True),
-        "forecast": lambda: bench.forecast(own, horizon),
-        "chance": Chance,
-    }
-    for rule in rules:
-        doubt = doubts[rule]()
-        some = chances if rule == "chance" else shares
-        ways += [Way(f"{rule}, {share:g}", own, horizon, doubt, share) for share in some]
-    rows = bench.rows(ways, range(first_seed, first_seed + episodes), lambda label: click.echo(label, err=True))
+    bench = Bench(environment, chunk, batch, range(learned), calls)
+    with TemporaryDirectory() as folder:
+        copy = warmed(directory, sorted({1, *warm}), Path(folder))
+        own = open_variant(str(copy), "onnxruntime", 1)
+        ways = [Way(f"every {h} actions", own, h) for h in every]
+        for text in others:
+            name, _, h = text.partition("@")
+            ways.append(Way(text, open_variant(name, "onnxruntime", 1), int(h or horizon)))
+        for last in warm:
+            ways.append(Way(f"warm, {last}", open_variant(f"{copy}:{WARM}-{last}", "onnxruntime", 1), horizon))
+        doubts: dict[str, Callable[[], Doubt]] = {
+            "check": lambda: Check(directory, step),
+            "answered": lambda: Check(directory, step, answered=True),
+            "blind": lambda: Check(directory, step, blind=True),
+            "forecast": lambda: bench.forecast(own, horizon),
+            "chance": Chance,
+        }
+        for rule in rules:
+            doubt = doubts[rule]()
+            some = chances if rule == "chance" else shares
+            ways += [Way(f"{rule}, {share:g}", own, horizon, doubt, share) for share in some]
+        rows = bench.rows(ways, range(first_seed, first_seed + episodes), lambda label: click.echo(label, err=True))
     if as_json:
         click.echo(json.dumps([row.to_json() for row in rows]))
         return
@@ -348,15 +292,20 @@ def main(
 
 def _drawn(rows: Sequence[Row], environment: str, actions: int) -> Table:
     count = len(rows[0].evaluation.rollout.episodes)
-    table = Table(title=f"{environment}: {count} paired episodes; evaluations of the network in {actions} actions")
+    title = f"{environment}: {count} paired episodes; evaluations of the network and milliseconds in {actions} actions"
+    table = Table(title=title, caption=f"Milliseconds of a call of DIR: {_listing(rows[0].times)}.")
     scores = "score", "success", "score, difference", "success, difference"
     left_alone = [f"{name}; left alone" for name in scores] if rows[0].still is not None else []
     reaction = ["reaction", "of 90 %"] if rows[0].reaction is not None else []
-    for column in ("", "evaluations", "checks", "anew", *scores, *left_alone, *reaction):
+    for column in ("", "evaluations", "checks", "ms", "anew", *scores, *left_alone, *reaction):
         table.add_column(column, justify="right" if column else "left")
     for row in rows:
         table.add_row(*row.cells(actions))
     return table
+
+
+def _listing(times: Mapping[str, float]) -> str:
+    return ", ".join(f"{kind} {ms:.2f}" for kind, ms in times.items())
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import kept_chunk
@@ -13,34 +14,22 @@ import pytest
 from click.testing import CliRunner
 from doubts import Array, Chance, Check, Forecast, Going
 from environments import environment_class
+from keeping import Keeping
+from kept_times import BLIND, BLIND_BOTH, BOTH, CHECKED, DRAWN, Times
 from rollout import Episode
 from variants import Variant, open_variant, seeded_noise
 from warm_start import add_warm_plans
 
 import ttscompile
-from tests.once import Once
 from ttscompile.artifact.load import load_artifact
 from ttscompile.core.spec import ChunkSpec
 
 CALLS, STREAMS, HORIZON = 4, 3, 2
 
 
-@pytest.fixture(scope="module")
-def directory(once: Once, one_layer_checkpoint: Path) -> Path:
-    path, _ = once.compiled(
-        "one layer, ddim 4", lambda at: ttscompile.convert(one_layer_checkpoint, at, sampler="ddim", steps=4)
-    )
-    return path
-
-
 @pytest.fixture
-def whole(directory: Path) -> Variant:
-    return open_variant(f"{directory}:full", "onnxruntime", 1)
-
-
-@pytest.fixture
-def chunk(directory: Path) -> ChunkSpec:
-    return load_artifact(directory).manifest.spec.chunk
+def chunk(four_steps: Path) -> ChunkSpec:
+    return load_artifact(four_steps).manifest.spec.chunk
 
 
 def windows(variant: Variant, call: int) -> dict[str, Array]:
@@ -49,7 +38,7 @@ def windows(variant: Variant, call: int) -> dict[str, Array]:
     return {key: given.uniform(100, 400, (STREAMS, *spec.shape)).astype(np.float32) + call}
 
 
-def acted(keeping: kept_chunk.Keeping, variant: Variant, calls: int = CALLS) -> list[Array]:
+def acted(keeping: Keeping, variant: Variant, calls: int = CALLS) -> list[Array]:
     keeping.reset()
     noise = [seeded_noise(variant.noise, range(STREAMS), call) for call in range(calls)]
     return [np.asarray(keeping.predict_action(windows(variant, i), one)["action"]) for i, one in enumerate(noise)]
@@ -63,7 +52,7 @@ def predicted(variant: Variant, call: int) -> Array:
 
 
 def test_without_a_doubt_every_call_draws(whole: Variant, chunk: ChunkSpec) -> None:
-    keeping = kept_chunk.Keeping(whole, chunk, HORIZON)
+    keeping = Keeping(whole, chunk, HORIZON)
     for call, made in enumerate(acted(keeping, whole)):
         expected = predicted(whole, call)[:, chunk.start : chunk.start + HORIZON]
         np.testing.assert_allclose(made, expected, rtol=1e-4, atol=1e-2)  # of 0..512
@@ -73,7 +62,7 @@ def test_without_a_doubt_every_call_draws(whole: Variant, chunk: ChunkSpec) -> N
 def test_a_chunk_is_gone_on_with_until_it_is_used_up(whole: Variant, chunk: ChunkSpec) -> None:
     first = predicted(whole, 0)[:, chunk.start :]
     going = first.shape[1] // HORIZON
-    keeping = kept_chunk.Keeping(whole, chunk, HORIZON, Chance())
+    keeping = Keeping(whole, chunk, HORIZON, Chance())
     made = acted(keeping, whole, going + 1)
     np.testing.assert_allclose(np.concatenate(made[:-1], 1), first[:, : going * HORIZON], rtol=1e-4, atol=1e-2)
     expected = predicted(whole, going)[:, chunk.start : chunk.start + HORIZON]
@@ -83,13 +72,13 @@ def test_a_chunk_is_gone_on_with_until_it_is_used_up(whole: Variant, chunk: Chun
     assert checked == [False, *[True] * (going - 1), False]
 
 
-def test_a_stream_whose_check_fails_is_drawn_alone(directory: Path, whole: Variant, chunk: ChunkSpec) -> None:
-    check = Check(directory, 2)
-    found = kept_chunk.Keeping(whole, chunk, HORIZON, check)
+def test_a_stream_whose_check_fails_is_drawn_alone(four_steps: Path, whole: Variant, chunk: ChunkSpec) -> None:
+    check = Check(four_steps, 2)
+    found = Keeping(whole, chunk, HORIZON, check)
     going = acted(found, whole, 2)
     distances = found.batches[0].distances[1]
     between = float(np.sort(distances)[-2:].mean())
-    keeping = kept_chunk.Keeping(whole, chunk, HORIZON, check, between)
+    keeping = Keeping(whole, chunk, HORIZON, check, between)
     made = acted(keeping, whole, 2)
     fails = int(distances.argmax())
     assert keeping.batches[0].drawn[1].tolist() == [i == fails for i in range(STREAMS)]
@@ -99,8 +88,8 @@ def test_a_stream_whose_check_fails_is_drawn_alone(directory: Path, whole: Varia
     np.testing.assert_allclose(made[1][fails], expected, rtol=1e-4, atol=1e-2)
 
 
-def test_a_check_at_the_last_step_is_a_warm_start_of_one(directory: Path, chunk: ChunkSpec, tmp_path: Path) -> None:
-    shutil.copytree(directory, tmp_path / "warm")
+def test_a_check_at_the_last_step_is_a_warm_start_of_one(four_steps: Path, chunk: ChunkSpec, tmp_path: Path) -> None:
+    shutil.copytree(four_steps, tmp_path / "warm")
     add_warm_plans(tmp_path / "warm", [1])
     warm = open_variant(f"{tmp_path / 'warm'}:warm-1", "onnxruntime", 1)
     noises = [seeded_noise(warm.noise, range(STREAMS), call) for call in range(2)]
@@ -109,7 +98,7 @@ def test_a_check_at_the_last_step_is_a_warm_start_of_one(directory: Path, chunk:
     executed = chunk.stop - chunk.start
     left = np.full(STREAMS, first.shape[1] - chunk.start - executed)
     going = Going(chunk.moved(sample, executed), fresh, left, fresh[:, 0], fresh[:, 0])
-    verdict = Check(directory, 3, answered=True).judge(windows(warm, 1), fresh, going)
+    verdict = Check(four_steps, 3, answered=True).judge(windows(warm, 1), fresh, going)
     assert verdict.clean is not None
     np.testing.assert_allclose(chunk.unnormalized(verdict.clean), second, rtol=1e-4, atol=1e-2)
     counted = np.abs(verdict.clean - going.chunk)[:, chunk.start : chunk.start + left[0]]
@@ -162,18 +151,27 @@ def test_a_block_is_moved_once_and_only_then_the_score_counts() -> None:
 
 
 @pytest.mark.slow
-def test_ways_are_driven_beside_each_other(directory: Path) -> None:
+def test_ways_are_driven_beside_each_other(four_steps: Path) -> None:
     rules = ["--rules", "check,answered,forecast,chance", "--shares", "0.5", "--horizon", "3", "--every", "3"]
-    words = [str(directory), f"{directory}:full@6", *rules, "--step", "2", "--episodes", "2", "--learned", "2"]
+    words = [str(four_steps), f"{four_steps}:full@6", *rules, "--step", "2", "--episodes", "2", "--learned", "2"]
+    words += ["--warm", "1", "--calls", "4"]
     asked = [*words, "--environment", "pusht:moved", "--json"]
     result = CliRunner().invoke(kept_chunk.main, asked, catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    rows = {row["evaluation"]["label"].removeprefix(f"{directory}:"): row for row in json.loads(result.stdout)}
-    assert list(rows) == ["every 3 actions", "full@6", "check, 0.5", "answered, 0.5", "forecast, 0.5", "chance, 0"]
+    rows = {row["evaluation"]["label"].removeprefix(f"{four_steps}:"): row for row in json.loads(result.stdout)}
+    ruled = ["check, 0.5", "answered, 0.5", "forecast, 0.5", "chance, 0"]
+    assert list(rows) == ["every 3 actions", "full@6", "warm, 1", *ruled]
     assert rows["every 3 actions"]["steps"] == pytest.approx(4 / 3, rel=0.02)
     assert rows["full@6"]["steps"] == pytest.approx(4 / 6, rel=0.02)
+    assert rows["warm, 1"]["steps"] == pytest.approx(1 / 3, rel=0.1)  # the first call has no chunk
     assert rows["check, 0.5"]["checks"] > 0 == rows["forecast, 0.5"]["checks"] == rows["chance, 0"]["anew"]
     assert rows["chance, 0"]["steps"] < rows["check, 0.5"]["steps"] < rows["every 3 actions"]["steps"]
+    times = rows["every 3 actions"]["times"]
+    assert list(times) == ["drawn", "checked", "both"] and times["checked"] < times["drawn"] < times["both"]
+    assert rows["every 3 actions"]["ms"] == pytest.approx(times["drawn"] / 3, rel=0.02)
+    assert rows["chance, 0"]["ms"] / rows["every 3 actions"]["ms"] == pytest.approx(
+        rows["chance, 0"]["steps"] / rows["every 3 actions"]["steps"]
+    )
     assert all(row["still"] is not None and len(row["reaction"]) == 2 for row in rows.values())
 
 
@@ -186,12 +184,40 @@ def test_ways_are_driven_beside_each_other(directory: Path) -> None:
         (["--chances", "x"], "could not convert string to float"),
     ],
 )
-def test_words_that_mean_nothing_are_refused(words: list[str], told: str, directory: Path) -> None:
-    result = CliRunner().invoke(kept_chunk.main, [str(directory), *words])
+def test_words_that_mean_nothing_are_refused(words: list[str], told: str, four_steps: Path) -> None:
+    result = CliRunner().invoke(kept_chunk.main, [str(four_steps), *words])
     assert (result.exit_code, told in result.output) == (2, True), result.output
 
 
 @pytest.mark.parametrize("step", [0, 4])
-def test_a_check_needs_a_step_with_noise_and_action(step: int, directory: Path) -> None:
+def test_a_check_needs_a_step_with_noise_and_action(step: int, four_steps: Path) -> None:
     with pytest.raises(ttscompile.errors.TtscompileError, match=f"no level of noise before a step {step}"):
-        Check(directory, step)
+        Check(four_steps, step)
+
+
+def test_calls_take_what_they_are_made_of(four_steps: Path) -> None:
+    kinds = {DRAWN: 8.0, CHECKED: 3.0, BOTH: 10.0, BLIND: 2.0, BLIND_BOTH: 9.0}
+    drawn, checked = np.array([True, True, False]), np.array([False, True, True])
+    check = Check(four_steps, 2)
+    assert Times.by(kinds, check).of(drawn, checked).tolist() == [8, 10, 3]
+    check.blind = True
+    assert Times.by(kinds, check).of(drawn, checked).tolist() == [8, 9, 2]
+    assert Times.by(kinds, Chance()).of(drawn, checked).tolist() == [8, 8, 0]
+
+
+def test_without_pictures_no_check_is_blind(four_steps: Path) -> None:
+    with pytest.raises(ttscompile.errors.TtscompileError, match="sees no pictures"):
+        Check(four_steps, 2, blind=True)
+
+
+def test_the_pictures_are_those_that_the_chunk_of_a_stream_was_drawn_with(whole: Variant, chunk: ChunkSpec) -> None:
+    keeping = Keeping(whole, chunk, HORIZON, Chance())
+    keeping.reset()
+    told = {"camera": SimpleNamespace(image=True), "state": SimpleNamespace(image=False)}
+    keeping.info = cast(Any, SimpleNamespace(observation=told))
+    first, second = ({"camera": np.full((2, 1, 1), n), "state": np.full((2, 1), n)} for n in (1, 2))
+    before = keeping._pictures(first, np.ones(2, np.bool_))
+    nothing = np.zeros(1, np.float32)
+    keeping._going = Going(nothing, nothing, np.zeros(1, np.int64), nothing, nothing, before)
+    after = keeping._pictures(second, np.array([False, True]))
+    assert list(after) == ["camera"] and after["camera"].ravel().tolist() == [1, 2]

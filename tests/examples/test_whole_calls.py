@@ -13,25 +13,11 @@ import numpy as np
 import pytest
 import whole_calls
 from click.testing import CliRunner
-from variants import Variant, open_variant, seeded_noise
+from variants import Variant, seeded_noise
 
 import ttscompile
-from tests.once import Once
 
 CALLS, STREAMS = 4, 3
-
-
-@pytest.fixture(scope="module")
-def directory(once: Once, one_layer_checkpoint: Path) -> Path:
-    path, _ = once.compiled(
-        "one layer, ddim 4", lambda at: ttscompile.convert(one_layer_checkpoint, at, sampler="ddim", steps=4)
-    )
-    return path
-
-
-@pytest.fixture
-def whole(directory: Path) -> Variant:
-    return open_variant(f"{directory}:full", "onnxruntime", 1)
 
 
 def answers(policy: whole_calls.Falcon | whole_calls.Light, variant: Variant) -> list[whole_calls.Array]:
@@ -48,8 +34,8 @@ def test_what_is_on_a_line_stays_on_it() -> None:
     np.testing.assert_allclose(whole_calls.extrapolated(past, 2), [[8, -11], [9, -13]], atol=0.05)
 
 
-def test_without_a_threshold_falcon_is_the_original(directory: Path, whole: Variant) -> None:
-    falcon = whole_calls.Falcon(directory, "full", 0.0)
+def test_without_a_threshold_falcon_is_the_original(four_steps: Path, whole: Variant) -> None:
+    falcon = whole_calls.Falcon(four_steps, "full", 0.0)
     light = whole_calls.Light(whole, 4, np.inf, displacements=False)  # nothing is that fast
     for mine, own in zip(answers(falcon, whole), answers(light, whole), strict=True):
         np.testing.assert_allclose(mine, own, rtol=1e-4, atol=1e-2)  # of 0..512
@@ -58,10 +44,10 @@ def test_without_a_threshold_falcon_is_the_original(directory: Path, whole: Vari
 
 
 def test_a_chunk_that_is_near_enough_is_begun_with(
-    directory: Path, whole: Variant, monkeypatch: pytest.MonkeyPatch
+    four_steps: Path, whole: Variant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(whole_calls, "EXPLORED", 0.0)
-    falcon = whole_calls.Falcon(directory, "full", np.inf)
+    falcon = whole_calls.Falcon(four_steps, "full", np.inf)
     answers(falcon, whole)
     assert falcon.count.steps == (4 + CALLS - 1) * STREAMS  # the last step alone, but for the first call
 
@@ -103,11 +89,11 @@ def test_pictures_are_kept_between_two_looks_and_the_state_is_new(whole: Variant
 
 
 @pytest.mark.slow
-def test_they_drive_beside_plans(directory: Path) -> None:
-    words = [str(directory), "--falcon", "0,9:2", "--light", "1", "--episodes", "2", "--json"]
+def test_they_drive_beside_plans(four_steps: Path) -> None:
+    words = [str(four_steps), "--falcon", "0,9:2", "--light", "1", "--episodes", "2", "--json"]
     result = CliRunner().invoke(whole_calls.main, words, catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    rows = {row["label"].removeprefix(f"{directory}:"): row for row in json.loads(result.stdout)}
+    rows = {row["label"].removeprefix(f"{four_steps}:"): row for row in json.loads(result.stdout)}
     assert list(rows) == ["full", "Falcon, 0:1", "Falcon, 9:2", "SP-VLA, 1"]
     assert rows["Falcon, 0:1"]["steps"] == rows["full"]["steps"] == 4
     assert 2 <= rows["Falcon, 9:2"]["steps"] < 3
@@ -125,6 +111,6 @@ def test_rules_that_mean_nothing_are_refused(words: list[str]) -> None:
     assert CliRunner().invoke(whole_calls.main, ["DIR", *words]).exit_code == 2
 
 
-def test_more_steps_than_the_loop_has_cannot_be_left(directory: Path) -> None:
+def test_more_steps_than_the_loop_has_cannot_be_left(four_steps: Path) -> None:
     with pytest.raises(ttscompile.errors.TtscompileError, match="has 4 steps; 5 cannot"):
-        whole_calls.Falcon(directory, "full", 0.1, 5)
+        whole_calls.Falcon(four_steps, "full", 0.1, 5)
