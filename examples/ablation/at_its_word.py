@@ -25,7 +25,7 @@ from typing import Any
 import click
 import numpy as np
 from ablate import DIRECTIONS, Row, drawn, interval, keep, other_noise
-from head_training import START, Recipe, Training, later
+from head_training import EVERY, START, Recipe, Training, later
 from rich.console import Console
 
 from ttscompile.artifact.load import load_artifact
@@ -91,6 +91,8 @@ def train(training: Training, updates: int, minutes: float, tell: Callable[[Mapp
     told = 0
     while training.done < updates and time.monotonic() - begun < 60 * minutes:
         training.update()
+        if time.monotonic() - begun >= 60 * minutes and training.done % EVERY and training.done < updates:
+            training.compare()  # the last head counts, too
         for line in training.told[told:]:
             tell({**line, "seconds": time.monotonic() - begun})
         told = len(training.told)
@@ -107,6 +109,9 @@ def train(training: Training, updates: int, minutes: float, tell: Callable[[Mapp
 @click.option("--direction", type=click.Choice(list(DIRECTIONS)), default="TIMESTEP", help="What cells may read.")
 @click.option("--correction", "corrected", is_flag=True, help="Correct the sampler while the head is trained.")
 @click.option("--detached", is_flag=True, help="Ours: gates have no part of what later cells read of the caches.")
+@click.option("--rate", default=1.0, help="The paper's: times their learning rate.")
+@click.option("--sparse-stream", is_flag=True, help="Compute what cells would have computed, as they do; slower.")
+@click.option("--dropout/--no-dropout", default=True, help="The paper's: theirs, while their layer is trained.")
 @click.option("--updates", default=3000)
 @click.option("--minutes", default=600.0, help="Of the training, at most.")
 @click.option("--learned", default=512, help="Calls to learn from, at most.")
@@ -122,6 +127,9 @@ def main(
     direction: str,
     corrected: bool,
     detached: bool,
+    rate: float,
+    sparse_stream: bool,
+    dropout: bool,
     updates: int,
     minutes: float,
     learned: int,
@@ -147,7 +155,17 @@ def main(
         rows, found = reference_rows(task, sets[1], noise, computed_steps)
     else:
         begin = crowded(task, START * computed_steps) if training == "ours" else [0]
-        recipe = Recipe(DIRECTIONS[direction], training == "paper", corrected, updates, begin, detached)
+        recipe = Recipe(
+            DIRECTIONS[direction],
+            training == "paper",
+            corrected,
+            updates,
+            begin,
+            detached,
+            rate,
+            sparse_stream,
+            dropout,
+        )
         one = Training(task, recipe)
         seconds = train(one, updates, minutes, progress.print)
         found = one.found()

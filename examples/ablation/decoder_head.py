@@ -7,9 +7,9 @@ of the other head: both are a graph from features to logits.
 
 What the authors' code has is here (arXiv 2605.13316, https://github.com/ky-ji/Test-time-Sparsity at ab1c72b): one
 pre-norm decoder layer, whose queries are sinusoidal codes of the blocks, and whose memory at a step are the features
-and the time of that step. Each query attends to the others and to the memory, and goes through a feed-forward. Their
-memory has the policy's own token of the time, which the compiler has folded into tables; here the time is a sinusoidal
-code that goes through a linear layer of its own. Their dropout of a tenth while training is left out.
+and the time of that step. Each query attends to the others and to the memory, and goes through a feed-forward. The
+token of the time is the policy's own, after its encoder, as theirs; a policy whose encoder does not take tokens one by
+one has a sinusoidal code instead. ``dropped.py`` has their dropout, for the training.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from pathlib import Path
 import click
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import nn
 
 from ttscompile.artifact.write import write_artifact
 from ttscompile.driver import transform
@@ -32,6 +34,7 @@ from ttscompile.ir.plan_head import MASKED, SOURCES
 from ttscompile.ir.program import Program
 from ttscompile.lower.program import lower_program
 from ttscompile.passes.base import Pass, PassResult
+from ttscompile.policies.networks.transformer_for_diffusion import TransformerForDiffusion
 from ttscompile.verification.record_golden import record_original
 
 BASE = "pruner.base"
@@ -59,11 +62,13 @@ class DecoderHead(Pass[Program, Program]):
         width: theirs is 512, beside policies of width 256.
         inner: of the feed-forward; theirs is 1024.
         heads: of the attention, as theirs.
+        time: what the policy makes of each step's time, ``[K, size]``; None for sinusoidal codes.
     """
 
     width: int = 128
     inner: int = 256
     heads: int = 8
+    time: npt.NDArray[np.float32] | None = None
 
     def call(self, program: Program) -> PassResult[Program]:
         pieces, steps, blocks = program.pieces, program.spec.sampler.steps, len(program.blocks)
@@ -72,7 +77,7 @@ class DecoderHead(Pass[Program, Program]):
         if self.width % (2 * self.heads):
             raise self.fail(f"a width of {self.width}: expected a multiple of twice the {self.heads} heads.")
         features = pieces.pruner.inputs
-        tokens = {name: _tokens(type_) for name, type_ in features.items()}
+        tokens = {name: tokens_of(type_) for name, type_ in features.items()}
         parameters = self._first_numbers(tokens, [float(t) for t in program.spec.sampler.timesteps], blocks)
         graph = _Head(self, features, tokens, parameters, steps, blocks).graph()
         weights = {name: value for name, value in program.weights.items() if name not in pieces.pruner.constants}
@@ -83,7 +88,7 @@ class DecoderHead(Pass[Program, Program]):
     def _first_numbers(
         self, tokens: Mapping[str, tuple[int, int]], timesteps: Sequence[float], blocks: int
     ) -> Parameters:
-        """Those that torch's modules begin with: Xavier's, but of the feed-forward, and biases of 0."""
+        """Those that torch's modules begin with: Xavier's and biases of 0, but of the feed-forward."""
         draw, d, steps = np.random.default_rng(0), self.width, len(timesteps)
 
         def uniform(rows: int, columns: int, bound: float) -> npt.NDArray[np.float32]:
@@ -94,8 +99,10 @@ class DecoderHead(Pass[Program, Program]):
 
         sizes = {"self.in": (3 * d, d), "self.out": (d, d), "cross.q": (d, d), "cross.k": (d, d), "cross.v": (d, d)}
         sizes |= {"cross.out": (d, d), "wide": (self.inner, d), "narrow": (d, self.inner), "head": (SOURCES, d)}
-        sizes |= {f"memory{i}": (d, size) for i, (_, size) in enumerate(tokens.values())} | {"clock": (d, d)}
-        found: Parameters = {"pruner.query": _codes(np.arange(blocks), d), "pruner.time": _codes(timesteps, d)}
+        time = _codes(timesteps, d) if self.time is None else self.time
+        sizes |= {f"memory{i}": (d, size) for i, (_, size) in enumerate(tokens.values())}
+        sizes["clock"] = d, time.shape[1]
+        found: Parameters = {"pruner.query": _codes(np.arange(blocks), d), "pruner.time": time}
         for name, (rows, columns) in sizes.items():
             value = (
                 uniform(rows, columns, columns**-0.5) if name in ("wide", "narrow", "self.out", "cross.out") else None
@@ -103,6 +110,8 @@ class DecoderHead(Pass[Program, Program]):
             joint = 3 * d if name.startswith("cross") else 0  # torch draws the three projections as one matrix
             found[f"pruner.{name}.weight"] = xavier(rows, columns, joint) if value is None else value
             found[f"pruner.{name}.bias"] = np.zeros(rows, np.float32)
+            if name in ("wide", "narrow"):
+                found[f"pruner.{name}.bias"] = uniform(1, rows, columns**-0.5)[0]
         for i in (1, 2, 3):
             found[f"pruner.norm{i}.weight"], found[f"pruner.norm{i}.bias"] = (
                 make(d, np.float32) for make in (np.ones, np.zeros)
@@ -246,7 +255,18 @@ def _codes(places: Sequence[float] | npt.NDArray[np.int64], width: int) -> npt.N
     return np.concatenate([np.sin(angles), np.cos(angles)], 1).astype(np.float32)
 
 
-def _tokens(type_: TensorType) -> tuple[int, int]:
+def time_tokens(module: nn.Module, timesteps: Sequence[int]) -> npt.NDArray[np.float32] | None:
+    """What a policy's encoder makes of each step's time, ``[K, width]``; None if it does not take tokens one by one."""
+    networks = [one for one in module.modules() if isinstance(one, TransformerForDiffusion)]
+    if len(networks) != 1 or not isinstance(networks[0].encoder, nn.Sequential):
+        return None
+    network = networks[0]
+    with torch.no_grad():
+        time = network.time_emb(torch.tensor([int(one) for one in timesteps])).unsqueeze(1)
+        return np.asarray(network.encoder(time + network.cond_pos_emb[:, :1])[:, 0].numpy(), np.float32)
+
+
+def tokens_of(type_: TensorType) -> tuple[int, int]:
     """How many tokens a feature is, and of what size: its last axis is a token's."""
     axis, sizes = type_.batch_axis or 0, type_.at(1)
     rest = [n for i, n in enumerate(sizes) if i != axis]
@@ -261,7 +281,8 @@ def _tokens(type_: TensorType) -> tuple[int, int]:
 def main(checkpoint: Path, directory: Path, width: int, inner: int) -> None:
     """Write the artifact of CHECKPOINT, in its own loop, with the paper's head to DIRECTORY."""
     module, spec = load_checkpoint_policy(checkpoint)
-    made = DecoderHead(width=width, inner=inner)(transform(module, spec))
+    head = DecoderHead(width=width, inner=inner, time=time_tokens(module, spec.sampler.timesteps.tolist()))
+    made = head(transform(module, spec))
     program = made.program
     write_artifact(program, lower_program(program), directory, golden=record_original(module, program))
     click.echo(f"{directory}: its head has {made.notes[0]}")

@@ -3,8 +3,8 @@
     python examples/ablation/gate_checks.py compiled/ --trajectories calls.npz --computed-steps 5
 
 Beside evenly spaced whole steps one more cell is computed, and the mean error of the chunk changes. The gradient of its
-gates had said by how much: as the authors' code has it, where residuals in caches are detached, and with what later
-cells read of the caches.
+gates had said by how much: as the authors' code has it, where residuals in caches are detached; with what the dense
+call would have computed in the cell, in place of the sparse one; and of that with what later cells read of the caches.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def wrong(samples: Sequence[Tensor], calls: Calls) -> Tensor:
     return (samples[-1] - calls.targets).abs().mean()
 
 
-def predicted(runner: Runner, calls: Calls, steps: int, through_caches: bool) -> Numbers:
+def predicted(runner: Runner, calls: Calls, steps: int, through_caches: bool, sparse_stream: bool) -> Numbers:
     """By how much computing a cell, in place of reusing it, changes the error to first order, ``[K, blocks]``."""
-    of = GateGradients(runner, calls, (Source.TIMESTEP,), through_caches)
+    of = GateGradients(runner, calls, (Source.TIMESTEP,), through_caches, sparse_stream)
     plan = uniform_plan(runner.model.steps, runner.model.blocks, steps)
     _, gates = of(np.repeat(plan[None], calls.count, 0), np.arange(calls.count), wrong)
     return np.asarray((gates[..., Source.COMPUTE] - gates[..., Source.TIMESTEP]).sum(0).double().numpy())
@@ -75,8 +75,13 @@ def main(directory: Path, trajectories: Sequence[Path], computed_steps: int, cou
     places = [(int(k), int(b)) for k, b in chosen]
     change = measured(runner, calls, computed_steps, places)
     click.echo(f"{len(places)} cells, {calls.count} calls: one more lowers the error in {np.mean(change < 0):.0%}")
-    for name, through in (("as the authors' code has it", False), ("with what later cells read", True)):
-        found = predicted(runner, calls, computed_steps, through)[tuple(chosen.T)]
+    ways = (
+        ("as the authors' code has it", False, True),
+        ("with what the dense call computes", False, False),
+        ("with what later cells read, too", True, False),
+    )
+    for name, through, beside in ways:
+        found = predicted(runner, calls, computed_steps, through, beside)[tuple(chosen.T)]
         right = np.mean((found < 0) == (change < 0))
         click.echo(f"gradient {name}: rank correlation {rank_correlation(found, change):.2f}, right sign {right:.0%}")
 

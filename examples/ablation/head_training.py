@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from decoder_head import BASE, FIXED
+from dropped import DroppedHead
 from gate_gradients import GateGradients
 from torch import Tensor
 
@@ -70,6 +71,9 @@ class Recipe:
         updates: how many.
         begin: ours: the steps to begin with, more than the budget has.
         detached: ours: whether gates have no part of what later cells read of the caches, as theirs.
+        rate: the paper's: times their rates.
+        sparse_stream: whether what a cell would have computed is computed where the sparse call was, as theirs is.
+        dropout: the paper's: whether a tenth of the numbers is left out while their layer is trained.
     """
 
     sources: tuple[Source, ...]
@@ -78,6 +82,9 @@ class Recipe:
     updates: int
     begin: Sequence[int] = (0,)
     detached: bool = False
+    rate: float = 1.0
+    sparse_stream: bool = False
+    dropout: bool = True
 
 
 class Training:
@@ -93,7 +100,12 @@ class Training:
         practised, compared = _divided(task)
         self.compared = task.runner.select(task.calls, compared)
         self._fitted = task.runner.select(task.calls, practised)
-        self._practice = GateGradients(task.runner, self._fitted, recipe.sources, not (recipe.paper or recipe.detached))
+        through_caches = not (recipe.paper or recipe.detached)
+        sources, beside = recipe.sources, recipe.sparse_stream
+        self._practice = GateGradients(task.runner, self._fitted, sources, through_caches, beside)
+        self._head: DroppedHead | None = None
+        if recipe.paper and recipe.dropout and not has_head(task.pruner):
+            self._head = DroppedHead(task.runner)
         self._cells = task.runner.model.steps * task.runner.model.blocks
         values = _first_values(task, recipe)
         changed = {name for name in values if name != BASE or not recipe.paper or has_head(values)}  # theirs has none
@@ -105,6 +117,7 @@ class Training:
         self.correction: Correction | None = None
         self.best: dict[str, Array] = {}
         self.loss, self.done, self.told = float("inf"), 0, list[dict[str, float]]()
+        self._latest = float("nan"), float("nan")
 
     @property
     def first_is_dense(self) -> bool:
@@ -133,16 +146,15 @@ class Training:
         numbers = calls_of(order, window)
         calls = task.runner.select(practice.calls, numbers)
         with torch.autocast("cpu", torch.bfloat16):  # a decoder layer takes half of an update otherwise
-            logits = task.runner.model.logits(calls.contexts, self._values).float()
+            logits = self._logits(calls)
         if not recipe.paper:
             price = torch.zeros(len(Source))
             price[Source.COMPUTE] = price_of(logits.detach().numpy(), self._room())
             logits = logits - price
-        plans = self.executed(pruner_plan(logits.detach().numpy()), calls)
-        value, gates = practice(plans, numbers, self._wrong)
-        if self.first_is_dense:
-            gates[::window] = 0  # these calls do not ask the head
-        reused = torch.from_numpy((plans != Source.COMPUTE).mean((1, 2)))
+        told = pruner_plan(logits.detach().numpy())
+        told[:, 0] = Source.COMPUTE
+        value, gates = practice(self.executed(told.copy(), calls), numbers, self._wrong)
+        reused = torch.from_numpy((told != Source.COMPUTE).mean((1, 2)))  # in dense calls, what the head would have
         if recipe.paper:
             sign = torch.sign(reused - (1 - task.budget / self._cells)).float() / (self._cells * calls.count)
             gates[..., 1:] += sign[:, None, None, None]
@@ -150,9 +162,14 @@ class Training:
         leaves = {name: value for name, value in self._values.items() if value.requires_grad}
         gradients = torch.autograd.grad(logits.softmax(-1), list(leaves.values()), gates, allow_unused=True)
         self._step(dict(zip(leaves, gradients, strict=True)))
-        self.done += 1
+        self.done, self._latest = self.done + 1, (value, float(reused.mean()))
         if self.done % EVERY == 0 or self.done == recipe.updates:
-            self.compare(value, float(reused.mean()))
+            self.compare()
+
+    def _logits(self, calls: Calls) -> Tensor:
+        if self._head is not None:
+            return self._head(calls.contexts, self._values, self._task.draw(self.done, 8))
+        return self._task.runner.model.logits(calls.contexts, self._values).float()
 
     def _wrong(self, samples: Sequence[Tensor], calls: Calls) -> Tensor:
         """How far sparse calls are from dense ones with the same noise: the chunk; ours also on the way there."""
@@ -187,11 +204,12 @@ class Training:
                     rate = OURS_BASE if name == BASE else OURS_OTHERS * self._sizes[name]
                     value -= rate * (1 - share) * step
                 else:
-                    rate = RATES[0] * rate_of(share)
+                    rate = self._recipe.rate * RATES[0] * rate_of(share)
                     value -= rate * (step + DECAY * value)
 
-    def compare(self, value: float, reused: float) -> None:
+    def compare(self) -> None:
         """Hold the head, with the price that keeps the budget, against the best so far."""
+        value, reused = self._latest
         runner, calls = self._task.runner.corrected(self.correction), self.compared
         values = self.priced()
         plans = self.plans(calls, values)
