@@ -96,21 +96,30 @@ class ShorterPrefix(Prefix):
         seen = self.connector(self.vision_model(torch.stack(images, 1).flatten(0, 1))) * scale
         seen = seen.unflatten(0, (-1, len(images))).flatten(1, 2)
         words = self.text_model.embed_tokens(tokens) * scale
-        x = torch.cat([seen, words, self.state_proj(state)[:, None]], 1)
-        valid, count = functional.pad(mask, (seen.shape[1], 1), value=True), seen.shape[1]
-        positions = torch.cumsum(valid, 1) - 1
+        x, own = torch.cat([seen, words], 1), self.state_proj(state)[:, None]
+        valid, count = functional.pad(mask, (seen.shape[1], 0), value=True), seen.shape[1]
+        positions, own_turns = torch.cumsum(valid, 1) - 1, layers.rotation(valid.sum(1, keepdim=True), self.channels)
         found, still = list[Tensor](), valid
         for number, layer in enumerate(self.text_model.layers):
-            before, turns, seen_by = x, layers.rotation(positions, self.channels), layers.prefix_mask(still, late=1)
+            before, turns, seen_by = x, layers.rotation(positions, self.channels), layers.prefix_mask(still)
             x, keys, values = layer(x, turns, seen_by)
-            found += [keys, values]
+            # The state's token follows by itself, as in the original: no other token sees it.
+            late, *last = layer(own, own_turns, layers.added(_and_own(still)[:, None, None]), layers.Seen(keys, values))
+            found += [torch.cat(pair, 2) for pair in zip((keys, values), last, strict=True)]
             if number in self.left_out:
                 x = before  # so that nobody reads what the layer does but for keys and values
+            else:
+                own = late
             if number == 0 and self.kept is not None and self.kept < count:
                 relevant = relevance(layer.self_attn, layer.input_layernorm(before), keys, turns, seen_by, mask)
                 index = self.rule(relevant, x[:, :count], self.kept)
                 x, positions, still = (with_some(each, index, count) for each in (x, positions, still))
-        return valid, still, *found
+        return _and_own(valid), _and_own(still), *found
+
+
+def _and_own(valid: Tensor) -> Tensor:
+    """Which tokens count, ``[B, T]``, and the state's after them."""
+    return functional.pad(valid, (0, 1), value=True)
 
 
 class ShorterExpert(Expert):
@@ -147,9 +156,9 @@ def relevance(
 ) -> Tensor:
     """What all words together give to each image token, ``[B, images]``: of their attention, the mean over heads.
 
-    ``normed`` are images, words and the state ``[B, T, width]``; ``mask`` is of the words, ``[B, L]``.
+    ``normed`` are images and words ``[B, T, width]``; ``mask`` is of the words, ``[B, L]``.
     """
-    words = slice(normed.shape[1] - mask.shape[1] - 1, normed.shape[1] - 1)
+    words = slice(normed.shape[1] - mask.shape[1], normed.shape[1])
     queries = attention.q_norm(attention.split(attention.q_proj(normed[:, words])))
     queries = layers.rotate(queries, layers.Rotation(*(each[:, :, words] for each in turns)))
     scores = queries @ attention.for_all_heads(keys).transpose(2, 3) * attention.channels**-0.5

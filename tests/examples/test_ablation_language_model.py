@@ -50,6 +50,13 @@ def test_with_all_layers_and_tokens_it_is_the_original(policy: Any) -> None:
     torch.testing.assert_close(answer(ablation.shorter(policy)), answer(policy))
 
 
+def test_masks_are_as_large_as_the_originals(policy: Any) -> None:
+    """Artifacts whose constants of one name differ are refused as those of two checkpoints."""
+    with patch.object(layers, "prefix_mask", wraps=layers.prefix_mask) as made:
+        policy.encoder(GIVEN), ablation.shorter(policy, (1,)).encoder(GIVEN)
+    assert {tuple(call.args[0].shape) for call in made.call_args_list} == {(3, 37)}  # the state is none of these
+
+
 def test_a_layer_that_changes_nothing_goes_first_and_is_not_missed(policy: Any) -> None:
     idle = policy.encoder.prefix.text_model.layers[1]
     nn.init.zeros_(idle.self_attn.o_proj.weight), nn.init.zeros_(idle.mlp.down_proj.weight)
@@ -64,11 +71,11 @@ def test_a_layer_that_changes_nothing_goes_first_and_is_not_missed(policy: Any) 
 def test_kept_are_those_with_most_attention_and_those_unlike_them() -> None:
     attention = layers.Attention(layers.LanguageConfig(2, 2, 1, heads=1, groups=1, channels=2))
     nn.init.eye_(attention.q_proj.weight)
-    keys, normed, tokens = torch.zeros(1, 1, 11, 2), torch.zeros(1, 11, 2), torch.ones(1, 8, 2)
+    keys, normed, tokens = torch.zeros(1, 1, 10, 2), torch.zeros(1, 10, 2), torch.ones(1, 8, 2)
     keys[..., :8, 1] = torch.tensor([0.0, 0.9, 0.1, 0.8, 0.7, 0.2, 0.6, 0.3])
     normed[0, 8:10, 1] = torch.tensor([1.0, -50.0])  # a word, and padding that looks elsewhere
-    still = layers.Rotation(torch.ones(1, 1, 11, 1), torch.zeros(1, 1, 11, 1))
-    mask, seen_by = torch.tensor([[True, False]]), torch.zeros(1, 1, 11, 11)
+    still = layers.Rotation(torch.ones(1, 1, 10, 1), torch.zeros(1, 1, 10, 1))
+    mask, seen_by = torch.tensor([[True, False]]), torch.zeros(1, 1, 10, 10)
     relevant = ablation.relevance(attention, normed, keys, still, seen_by, mask)
     torch.testing.assert_close(relevant[0], (keys[0, 0, :, 1] / 2**0.5).softmax(0)[:8])
     tokens[0, [2, 7]] = torch.tensor([[1.0, -1.0], [-1.0, -1.0]])
@@ -82,7 +89,7 @@ def test_what_is_left_out_is_as_if_nobody_saw_it(policy: Any, monkeypatch: pytes
     assert [one.shape[2] for one in found] == [38, 38, *[9] * 6]
     masked = valid & torch.ones_like(valid).index_fill(1, torch.arange(32), 0).scatter(1, index, 1)
     # The same with all tokens at their positions, and those masked from the second layer on.
-    instead = {torch.bool: masked, torch.int64: valid.cumsum(1) - 1}
+    instead = {torch.bool: masked[:, :-1], torch.int64: valid[:, :-1].cumsum(1) - 1}
     monkeypatch.setattr(ablation, "with_some", lambda x, index, count: instead.get(x.dtype, x))
     torch.testing.assert_close(answer(short, (valid, still, *found)), answer(short, short.encoder(GIVEN)))
     with patch.object(layers, "rotation", wraps=layers.rotation) as turned:
