@@ -1,7 +1,8 @@
 """Calls of a large policy on several numbers of threads, in one table, for ``large.py --threads 1,2``.
 
-Seconds are the clock's, so let the machine be quiet. Contestants take turns call by call, and numbers of threads in
-passes. What does not fit into memory beside the others was timed before, in a process of its own: ``alone``.
+Seconds are the clock's, so let the machine be quiet; of each pass it is told how long threads waited for others to
+leave the processor. Contestants take turns call by call, and numbers of threads in passes. What does not fit into
+memory beside the others was timed before, in a process of its own: ``alone``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 from large_calls import PARTS, Arithmetic, Times, lowered, plans_of, timed
 from large_smolvla import call
 from rate import Clock
+from waiting import from_now_on
 
 from ttscompile import Plan, PolicySpec
 from ttscompile.artifact.load import Artifact, load_artifact
@@ -47,11 +49,12 @@ def alone(folder: Path, what: str, calls: Callable[[int], Call], threads: Sequen
     found = []
     for count in threads:
         torch.set_num_threads(count)
-        own = calls(count)
+        own, waited = calls(count), from_now_on()
         made = [own() for _ in range(rounds + 1)]
         found.append([statistics.median(part) for part in zip(*(split for _, split in made[1:]), strict=True)])
         actions = made[0][0]
-        print(f"{sum(found[-1]):8.2f} s  {what} on {count}: {', '.join(f'{part:.2f}' for part in found[-1])}")
+        parts = ", ".join(f"{part:.2f}" for part in found[-1])
+        print(f"{sum(found[-1]):8.2f} s  {what} on {count}: {parts}; {waited()}")
     np.savez(folder / f"{what}.npz", actions=actions, seconds=found, threads=threads)
 
 
@@ -131,7 +134,7 @@ def _one_pass(
         plans = {f"dense, {EXACT}": (EXACT, artifact.plan(f"dense@{EXACT}")), **plans}
     policy: CompiledPolicy = open_policy(artifact, threads=threads, plan=next(iter(plans.values()))[1])
     obs, noise = call(spec)
-    times = Times(Arithmetic(artifact), threads, perf_counter)
+    times, waited = Times(Arithmetic(artifact), threads, perf_counter), from_now_on()
     print(f"On {_counted(threads)}:")
     for _ in range(rounds + 1):  # the first does not count
         times.next_round()
@@ -147,5 +150,6 @@ def _one_pass(
                     times.add(other, EXACT, split, policy.last_report)
                 eagerly.clear()
     times.tell(1)
+    print(f"{'':10}{waited()}")
     found = times.medians(1)
     return {name: found[name] for name in sorted(found, key=lambda one: not one.startswith(EAGER))}

@@ -13,6 +13,7 @@ import numpy as np
 import parts
 import pytest
 import torch
+import waiting
 from click.testing import CliRunner
 from large_smolvla import call
 from rate import ProductRate
@@ -72,12 +73,28 @@ def test_all_contestants_are_in_one_table(
     capsys.readouterr()
     large_threads.compare(folder, "all, of it", eager, spec, 2, (1, 2), rounds=1)
     assert asked == [1, 1, 2, 2]
-    head, _, *rows = (line for line in capsys.readouterr().out.splitlines() if line.startswith("|"))
+    printed = capsys.readouterr().out.splitlines()
+    assert sum("for a processor" in line for line in printed) == 2
+    head, _, *rows = (line for line in printed if line.startswith("|"))
     assert head == "| seconds a call | 1 thread | 2 threads | 2 of 1 |"
     names = ["eager: all, of it", *(f"{name}: prologue, loop" for name in ("dense, fp32", "dense, int8"))]
     named = [row.split(" | ")[0].removeprefix("| ") for row in rows]
     assert sorted(named) == sorted([*names, "2 of 3 steps, int8: prologue, loop"])
     assert rows[0] == "| eager: all, of it | 6.00 (4.00, 2.00) | 4.00 (2.00, 2.00) | 0.67 |"
+
+
+def test_it_is_told_for_how_much_of_their_time_threads_waited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(thread: str, ran: int, waited: int) -> None:
+        (tmp_path / thread).mkdir(exist_ok=True)
+        (tmp_path / thread / "schedstat").write_text(f"{ran} {waited} 7\n")
+
+    monkeypatch.setattr(waiting, "TASKS", tmp_path)
+    write("1", 1000, 500)
+    told = waiting.from_now_on()
+    assert told() == "threads waited an unknown part of their time for a processor"
+    write("1", 1600, 600)
+    write("2", 100, 200)  # it began since
+    assert told() == "threads waited 30% of their time for a processor"
 
 
 def test_one_thread_is_timed_by_the_processor() -> None:
