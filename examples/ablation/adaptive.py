@@ -70,7 +70,9 @@ def main(
 def show(found: Nested) -> None:
     """What was found as a table, and what the words in it mean."""
     output = results_console()
-    made = table("who decides", "evaluations", "at most", "error", "95 %", "99 %", "gain", "95 % interval", "rank")
+    made = table(
+        "who decides", "evaluations", "at most", "error", "95 %", "99 %", "worst", "gain", "95 % interval", "rank"
+    )
     for one in found.rows:
         made.add_row(*_cells(one))
     for each in found.decided:

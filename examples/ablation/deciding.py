@@ -132,7 +132,7 @@ class Row:
         evaluations: of a call, mean.
         most: of any call.
         error: mean over the calls.
-        tail: the error that 95 % and that 99 % of the calls have at most.
+        tail: the error that 95 %, 99 % and all of the calls have at most.
         gain: share of the error of fixed schedules with as many evaluations that is saved; negative if it is worse. Its
             95 % interval is over episodes.
         rank: correlation of the estimate with the error of the first ending.
@@ -142,7 +142,7 @@ class Row:
     evaluations: float
     most: int
     error: float
-    tail: tuple[float, float]
+    tail: tuple[float, ...]
     gain: tuple[float, float, float] | None = None
     rank: float | None = None
 
@@ -248,9 +248,8 @@ def rank_correlation(one: Array, other: Array) -> float:
     return float(first @ second / (first @ first))
 
 
-def _tail(errors: Array, weights: Array) -> tuple[float, float]:
-    """The errors that 95 % and 99 % of weighted calls have at most; arrays of one shape."""
+def _tail(errors: Array, weights: Array) -> tuple[float, ...]:
+    """The errors that 95 %, 99 % and all of weighted calls have at most; arrays of one shape."""
     order = errors.ravel().argsort()
     reached = np.cumsum(weights.ravel()[order]) / weights.sum()
-    low, high = (float(errors.ravel()[order[np.searchsorted(reached, share - 1e-9)]]) for share in (0.95, 0.99))
-    return low, high
+    return tuple(float(errors.ravel()[order[np.searchsorted(reached, share - 1e-9)]]) for share in (0.95, 0.99, 1.0))

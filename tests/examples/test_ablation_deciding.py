@@ -76,7 +76,12 @@ def test_a_mixture_of_two_fixed_numbers() -> None:
     errors = {2: np.array([1.0, 3.0]), 3: np.array([0.0, 1.0])}
     mixed = Fixed(errors, np.array([0, 1]), 0).mixed(2.25)
     assert mixed.error == pytest.approx(0.75 * 2 + 0.25 * 0.5) and mixed.most == 3
-    assert mixed.tail == (3.0, 3.0)
+    assert mixed.tail == (3.0, 3.0, 3.0)
+
+
+def test_the_worst_of_a_mixture_is_that_of_the_calls_that_count() -> None:
+    errors = {2: np.array([1.0, 9.0]), 3: np.array([0.0, 1.0])}
+    assert Fixed(errors, np.array([0, 1]), 0).mixed(3.0).tail == (1.0, 1.0, 1.0)
 
 
 def test_the_gain_is_that_over_the_mixture() -> None:
