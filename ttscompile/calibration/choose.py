@@ -116,7 +116,10 @@ class _Entrants:
         dense = kept.plans[DENSE]  # which is 0 away from itself, without being asked once more
         assert dense.cells is not None
         saved = 1 - flops.call(dense.cells, pruned=False) / flops.dense
-        self.plans, self.scores = {DENSE: dense}, {DENSE: Score(0.0, (0.0, 0.0), 0.0, 0.0, 0.0, 0.0, saved, 1)}
+        same = Score(
+            0.0, (0.0, 0.0), error=0.0, error_p90=0.0, sparsity=0.0, flops_sparsity=0.0, flops_saved=saved, plans=1
+        )
+        self.plans, self.scores = {DENSE: dense}, {DENSE: same}
         del clock.ahead[1:]  # but timing
         bar.stage("held-out calls", len(kept.plans))
         for name, plan in kept.plans.items():
