@@ -134,7 +134,8 @@ def fill_initial(initial: FloatArray, noise: Noise, known: Known | None) -> None
 def fill_offset(offset: FloatArray, sampler: SamplerTable, noise: Noise, correction: Correction | None) -> None:
     """What every step adds to the sample that depends neither on it nor on the observation, ``[K, D, B, T]``."""
     if sampler.stochastic and noise.steps is not None:
-        np.multiply(noise.steps.transpose(0, 3, 1, 2), sampler.noise_to_next[:, None, None, None], out=offset)
+        column = sampler.noise_to_next[:, None, None, None]
+        np.multiply(noise.steps.transpose(0, 3, 1, 2), column, out=offset)
     else:
         offset.fill(0)
     if correction is not None:

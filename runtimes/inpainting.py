@@ -162,7 +162,8 @@ def known_samples(spec: PolicySpec, prefix: FloatArray, initial: FloatArray) -> 
     channels = slice(spec.chunk.action_dim)
     positions = slice(spec.chunk.start, spec.chunk.start + prefix.shape[1])
     if spec.trained_prefix:
-        clean = np.pad(prefix, ((0, 0), (0, 0), (0, spec.sample[1] - spec.chunk.action_dim)))
+        others = ((0, 0), (0, 0), (0, spec.sample[1] - spec.chunk.action_dim))
+        clean = np.pad(prefix, others)
         return Known(positions, slice(None), np.stack([clean] * (spec.sampler.steps + 1)))
     levels = noise_levels(spec.sampler)
     assert levels is not None

@@ -157,7 +157,8 @@ class ExecutorSettings:
                 least = 0 if one.name in _MAY_BE_ZERO else 1
                 object.__setattr__(self, one.name, integer(value, one.name, ExecutorError, least, _MOST))
             if one.type == "float" or (one.type == "float | None" and value is not None):
-                object.__setattr__(self, one.name, require_number(value, one.name, *_BETWEEN.get(one.name, ())))
+                own = require_number(value, one.name, *_BETWEEN.get(one.name, ()))
+                object.__setattr__(self, one.name, own)
         for name, what in (("cores", "a processor"), ("displacements", "a channel")):
             if (given := getattr(self, name)) is not None:
                 if not isinstance(given, tuple | list | range):
@@ -286,7 +287,8 @@ def resolve(settings: ExecutorSettings, info: PolicyInfo, control_hz: float) -> 
     stall = None
     if settings.stall_after is not None:
         reach = np.float32(settings.stall_range) / np.atleast_2d(chunk.scale).max(0)
-        stall = StallRule(ceil(settings.stall_after * control_hz), reach, settings.stall_plan, settings.displacements)
+        after = ceil(settings.stall_after * control_hz)
+        stall = StallRule(after, reach, settings.stall_plan, settings.displacements)
     named = tiers if stall is None else (*tiers, stall.plan)
     if unknown := [name for name in named if name.partition("@")[0] not in (*info.plans, info.default_plan)]:
         known = list(info.plans)

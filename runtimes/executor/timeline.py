@@ -94,7 +94,8 @@ class Timeline:
 
     def then(self, other: Timeline) -> Timeline:
         """This, and after its end another."""
-        return Timeline(self.start, *(np.concatenate(pair) for pair in zip(self._arrays, other._arrays, strict=True)))
+        pairs = zip(self._arrays, other._arrays, strict=True)
+        return Timeline(self.start, *(np.concatenate(pair) for pair in pairs))
 
     def clipped_to(self, rows: FloatArray) -> Timeline:
         """The same with rows that the guard made of these."""

@@ -223,7 +223,8 @@ class PrunedCall(CallModule):
         written: Tensor,
         keeps: bool,
     ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Rollout]:
-        plans, _ = repair_plan(pruner_plan(network.logits().detach().cpu().numpy()), written.cpu().numpy())
+        logits = network.logits().detach().cpu().numpy()
+        plans, _ = repair_plan(pruner_plan(logits), written.cpu().numpy())
         far = np.zeros(len(plans), np.bool_) if self._far is None else self._is_far(network).cpu().numpy()
         if far.any():
             plans = np.where(far[:, None, None], self._plain_cells, plans)

@@ -242,7 +242,8 @@ class PrecisionRecord:
     @property
     def kept(self) -> tuple[str, ...]:
         """The parts that have such weights, those of the prologue first."""
-        return tuple(sorted({str(part_of(piece)) for piece in self.models}, key=lambda part: (part == BLOCKS, part)))
+        own = {str(part_of(piece)) for piece in self.models}
+        return tuple(sorted(own, key=lambda part: (part == BLOCKS, part)))
 
     @property
     def told(self) -> str:

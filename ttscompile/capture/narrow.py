@@ -88,7 +88,8 @@ def _difference(module: nn.Module, spec: PolicySpec, steps: int) -> float:
             timestep = timesteps[k].expand(_STREAMS)
             whole = evaluate(sample, timestep)[:, :steps]
             try:
-                found.append(float((evaluate(sample[:, :steps], timestep) - whole).abs().max() / whole.std()))
+                first = evaluate(sample[:, :steps], timestep)
+                found.append(float((first - whole).abs().max() / whole.std()))
             except Exception as error:  # whatever the user's code raises
                 raise SpecError(
                     f"the network does not take a sample of {steps} steps: {error}. Slice its masks and position tables"

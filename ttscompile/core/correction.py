@@ -209,7 +209,8 @@ class Correction:
 
 def jumps_of(anchors: npt.NDArray[np.bool_]) -> dict[int, int]:
     """The last step before the next anchor, by the anchor; without anchors that the next one follows at once."""
-    return {anchor: after - 1 for anchor, after in pairwise(np.flatnonzero(anchors).tolist()) if after - 1 > anchor}
+    steps = np.flatnonzero(anchors).tolist()
+    return {anchor: after - 1 for anchor, after in pairwise(steps) if after - 1 > anchor}
 
 
 def may_jump(sample: tuple[int, int]) -> bool:

@@ -88,7 +88,8 @@ def _bilinear(array: FloatArray, count: int, axis: int) -> FloatArray:
     share = (at - low).astype(np.float32)
     share = share[:, None] if axis == -2 else share
     left, right = array.take(low, axis), array.take(np.minimum(low + 1, before - 1), axis)
-    return np.asarray(left * (1 - share) + right * share, np.float32)
+    made: FloatArray = left * (1 - share) + right * share
+    return made
 
 
 def _cubic(array: FloatArray, count: int, axis: int) -> FloatArray:

@@ -127,7 +127,8 @@ def _extra(name: str, wanted: list[Requirement]) -> Finding:
 def _providers() -> list[Finding]:
     part = "onnxruntime"
     try:
-        offered = list(importlib.import_module("onnxruntime").get_available_providers())
+        module = importlib.import_module("onnxruntime")
+        offered = list(module.get_available_providers())
     except ModuleNotFoundError as error:
         lacking = error.name or "onnxruntime"
         told, remedy = f"fails: {lacking} is not installed", f"Run: pip install {lacking}."

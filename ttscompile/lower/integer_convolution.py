@@ -93,7 +93,8 @@ def integer_convolution(
         pixels = w.op("Gather", pixels, w.constant(seen, np.int32), axis=1)
     rows = w.op("Reshape", pixels, w.constant([0, places, len(matrix)]))
     made = w.op(INTEGER_PRODUCT, rows, integers, scale, scales, zero, NO_ZERO, *([bias] if bias else []), domain=DOMAIN)
-    w.ops("Reshape", [w.op("Transpose", made, perm=[0, 2, 1]), w.constant([0, out, *result])], node.output)
+    turned = w.op("Transpose", made, perm=[0, 2, 1])
+    w.ops("Reshape", [turned, w.constant([0, out, *result])], node.output)
     return True
 
 

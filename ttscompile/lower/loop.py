@@ -117,12 +117,15 @@ class DenoisingLoop:
         self._shape = main.op("Shape", stream)
         width = main.op("ReduceProd", self._shape, keepdims=1)
         self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
-        table = main.op("ConstantOfShape", main.op("Concat", main.constant([len(self._groups)]), width, axis=0))
+        count = main.constant([len(self._groups)])
+        table = main.op("ConstantOfShape", main.op("Concat", count, width, axis=0))
         memory = (inputs.memory,) if inputs.memory is not None else ()
         first = _State(main.op("Transpose", inputs.initial, perm=[2, 0, 1]), stream, inputs.history, memory)
         carried = [*first.values, table, main.op("SequenceEmpty")]
-        state = main.ops("Loop", [plan.computed_steps, "", *carried], len(carried), body=self._computed_step())
-        return main.op("Transpose", state[0], perm=[1, 2, 0]), main.op("ConcatFromSequence", state[-1], axis=0)
+        body = self._computed_step()
+        state = main.ops("Loop", [plan.computed_steps, "", *carried], len(carried), body=body)
+        sample = main.op("Transpose", state[0], perm=[1, 2, 0])
+        return sample, main.op("ConcatFromSequence", state[-1], axis=0)
 
     def _computed_step(self) -> GraphProto:
         """Body of the outer loop: carries sample, stream, every block's last computed residual, and all computed."""

@@ -103,7 +103,8 @@ def lower_plan(w: GraphWriter, plan: str, groups: Sequence[int], steps: int, tog
     gaps = w.op("Slice", ends, w.constant([-1]), w.constant([steps]))
     nothing = w.op("ConstantOfShape", w.op("Concat", gaps, w.constant([3 * count]), axis=0))
     units = w.op("Expand", w.constant(1, np.float32), w.op("Shape", rows))
-    parts = w.ops("Split", [w.op("ScatterND", nothing, places, units, reduction="add")], 3, axis=1, num_outputs=3)
+    matrix = w.op("ScatterND", nothing, places, units, reduction="add")
+    parts = w.ops("Split", [matrix], 3, axis=1, num_outputs=3)
     in_step = w.op("Greater", w.op("ReduceMax", parts[1], w.constant([1]), keepdims=0), w.constant(0, np.float32))
 
     # Steps in a row that add the same.
@@ -187,7 +188,8 @@ def write_executed_plans(
         pruner: bool [], whether it makes the plans, and what writes its logits [B, K, N, 4]; None without a pruner.
         far: bool [B]; streams that execute the input ``PLAIN`` instead.
     """
-    shape = w.op("Concat", streams, w.constant(lattice), axis=0)
+    cells = w.constant(lattice)
+    shape = w.op("Concat", streams, cells, axis=0)
     if pruner is None:
         wanted, broken = w.op("Expand", plan, shape), w.constant(np.zeros((1, 1, 1)), np.float32)
     else:

@@ -131,7 +131,8 @@ def _offset(main: GraphWriter, spec: PolicySpec, streams: str, condition: str | 
     offset = main.op("Expand", correction.CORRECTION_BIAS, main.op("Concat", *sizes, axis=0))
     if condition is not None:
         offset = main.op("Add", offset, _observed(main, spec, condition))
-    offset = main.op("Where", main.op("Reshape", far, main.constant([-1, 1])), main.constant(0, np.float32), offset)
+    of_stream = main.op("Reshape", far, main.constant([-1, 1]))
+    offset = main.op("Where", of_stream, main.constant(0, np.float32), offset)
     if sampler.stochastic:
         noise = main.op("Transpose", "step_noise", perm=[0, 3, 1, 2])
         scale = main.constant(sampler.noise_to_next[:, None, None, None], np.float32)

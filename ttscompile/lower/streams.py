@@ -65,7 +65,8 @@ def write_streams(
     by_stream = w.op("Reshape", chosen, w.op("Concat", *sizes, axis=0), allowzero=1)
     by_stream = w.op("Transpose", by_stream, perm=[0, 2, 1, 3])
     flat = w.op("Reshape", numbers, w.constant([-1]))
-    new = w.op("Reshape", by_stream, w.op("Concat", w.op("Shape", flat), before, after, axis=0), allowzero=1)
+    shape = w.op("Concat", w.op("Shape", flat), before, after, axis=0)
+    new = w.op("Reshape", by_stream, shape, allowzero=1)
     more = [w.op("SequenceInsert", rows, new), w.op("SequenceInsert", cells, flat)]
     going_on = w.op("Identity", on)
     results = [tensor(going_on, np.bool_), tensor(every, np.float32), sequence(more[0]), sequence(more[1], np.int64)]

@@ -137,7 +137,8 @@ def attention(
         return op.Attention(*given, attn_mask, **options)[0]
     flat = [op.Reshape(each, op.Constant(value_ints=[0, 0, -1])) for each in before]
     made = op.Attention(*flat, attn_mask, q_num_heads=heads[0], kv_num_heads=heads[1], **options)
-    return op.Transpose(op.Reshape(made[0], op.Constant(value_ints=[0, 0, heads[0], -1])), perm=_HEADS_FORWARD)
+    apart = op.Reshape(made[0], op.Constant(value_ints=[0, 0, heads[0], -1]))
+    return op.Transpose(apart, perm=_HEADS_FORWARD)
 
 
 def _before_heads(value: Any) -> Any:
