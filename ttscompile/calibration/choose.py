@@ -65,7 +65,7 @@ def seconds_to_time(kept: Kept, deadline_ms: float | None) -> float:
     """That timing takes: all plans in each precision, and by a deadline two for longer."""
     trials = kept.trials
     rounds = (WARM_UP + TIMED) * (1 if trials.artifact.manifest.precision is None else 2)
-    slower = max([1.0, *trials.clock.paces[True]])  # than when the loops were timed
+    slower = max(1.0, trials.clock.paces.get(True, 1.0))  # than when the loops were timed
     a_round = sum(call_seconds(trials, plan) for name, plan in kept.plans.items() if name != FULL)
     return slower * rounds * a_round + 2 * TIMED_LONG * (deadline_ms or 0.0) / 1e3
 
@@ -85,7 +85,7 @@ def choose(kept: Kept, request: Request) -> Frontier:
     entrants = _Entrants(kept, request)
     times, distances, scores, within = entrants.times, entrants.distances, entrants.scores, entrants.within
     allowed, close = ([n for n in within if within[n] <= bound] for bound in (request.farthest, request.bound))
-    if not (allowed or kept.learned) and kept.trials.clock.left_out:  # see ``proposers.loops``
+    if not within:  # there was no time for any
         return Frontier(entrants.rows({}, (), ()), {DENSE: kept.plans[DENSE]}, {}, {DENSE: scores[DENSE]}, DENSE)
     if not allowed:
         name = min(within, key=lambda n: scores[n].interval[1])
@@ -125,12 +125,7 @@ class _Entrants:
         for name, plan in kept.plans.items():
             if name in (DENSE, FULL):
                 continue
-            variants = {name: plan}
-            if plan.precision:
-                variants[f"{name}@fp32"] = replace(plan, precision={})
-            if plan.tokens is not None:  # looking for changes may take longer than a small encoder
-                variants[f"{name}, all tokens"] = replace(plan, tokens=None)
-            for variant, one in variants.items():
+            for variant, one in _variants(name, plan).items():
                 if (score := kept.known(name, one)) is None:
                     if not clock.has(seconds_to_judge(self._trials, one), one.in_words()):
                         continue
@@ -224,6 +219,16 @@ class _Entrants:
             }
             for name, times in sorted(self.times.items(), key=lambda one: one[1].median)
         )
+
+
+def _variants(name: str, plan: Plan) -> dict[str, Plan]:
+    """A plan by its name, and without what other plans than it have gained by."""
+    found = {name: plan}
+    if plan.precision:
+        found[f"{name}@fp32"] = replace(plan, precision={})
+    if plan.tokens is not None:  # looking for changes may take longer than a small encoder
+        found[f"{name}, all tokens"] = replace(plan, tokens=None)
+    return found
 
 
 def _base(name: str) -> str:

@@ -32,14 +32,14 @@ class Clock:
     Attributes:
         left_out: what was left out for want of time. Clocks that are made of one share this and the following.
         ahead: give the seconds that what has to follow takes.
-        paces: how many times as long each judgement took as its calls would alone and in fp32; of those in another
-            precision, True, calls are computed one by one.
+        paces: how many times as long a judgement took, at most, as its calls would alone; of plans in fp32, False, and
+            of those in another precision, True, whose calls are computed one by one.
     """
 
     def __init__(self, limit: float = math.inf, before: float = 0.0, wall: bool = False) -> None:
         self.limit, self._end, self._before = limit, limit, before
         self.left_out, self.ahead = list[str](), list[Callable[[], float]]()
-        self.paces = {False: list[float](), True: list[float]()}
+        self.paces = dict[bool, float]()
         self._threads = 0 if wall else torch.get_num_threads()
         self._begun = time.monotonic(), time.process_time()
 
@@ -61,7 +61,8 @@ class Clock:
     def has(self, seconds: float, what: str = "a longer search") -> bool:
         """Whether so much is left; else ``what`` is left out."""
         enough = seconds <= self.left()
-        self.left_out += [what] * (not enough and what not in self.left_out)
+        if not enough and what not in self.left_out:
+            self.left_out.append(what)
         return enough
 
     def in_time(self, parts: Iterable[Part]) -> Iterator[Part]:

@@ -93,15 +93,17 @@ def judge(trials: Trials, plan: Plan, part: str = HELD_OUT) -> Score:
     plan, sample = replace(plan, repair=True), trials.sample(part)
     begun, answered = trials.clock.elapsed(), _Answers(trials, plan, sample)
     scores = [_scored(trials, plan, sample, made, answered.reports) for made in answered.all()]
-    took, one_by_one = trials.clock.elapsed() - begun, sample.answers[:, :, 0, 0].size * call_seconds(trials, plan)
-    trials.clock.paces[bool(plan.precision)] += [took / one_by_one] if one_by_one else []
+    took, alone = trials.clock.elapsed() - begun, len(sample.calls) * sample.draws * call_seconds(trials, plan)
+    if alone:
+        paces, lowered = trials.clock.paces, bool(plan.precision)
+        paces[lowered] = max(paces.get(lowered, 0.0), took / alone)
     return max(scores, key=lambda one: one.distance)
 
 
 def seconds_to_judge(trials: Trials, plan: Plan, part: str = HELD_OUT, lowered: bool = False) -> float:
     """What ``judge`` takes, by what it has taken at most; ``lowered``: of the plan in another precision."""
-    pace = max(trials.clock.paces[lowered or bool(plan.precision)], default=1.0)
-    return pace * trials.sample(part).answers[:, :, 0, 0].size * call_seconds(trials, plan)
+    sample, pace = trials.sample(part), trials.clock.paces.get(lowered or bool(plan.precision), 1.0)
+    return pace * len(sample.calls) * sample.draws * call_seconds(trials, plan)
 
 
 def call_seconds(trials: Trials, plan: Plan) -> float:

@@ -1,7 +1,7 @@
 """The plans of a calibration so far: what was proposed, held on held-out episodes, and will be written."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy.typing as npt
@@ -97,17 +97,19 @@ class Kept:
     def keep_only(self, plans: Mapping[str, Plan], scores: Mapping[str, Score], default: str) -> None:
         """Have no other plans than these, and tell of what was given to all plans that none of these has."""
         self.plans, self.scores, self.default = dict(plans), dict(scores), default
-        for name, fields in self.shared.items():
-            if fields and not any(getattr(plan, key) == fields[key] for plan in plans.values() for key in fields):
+        for name, given in self.shared.items():
+            if given and not any(getattr(plan, key) == given[key] for plan in plans.values() for key in given):
                 self.told[name] += ", and no chosen plan is faster by it"
 
     def known(self, name: str, plan: Plan) -> Score | None:
         """The score of a plan that was judged under this name, or before it got a precision and tokens."""
         if self.judged.get(name) is plan:
             return self.scores[name]
-        before, score = self.exact.get(name, (plan, None))
-        same = plan.exact is plan and plan.cells is before.cells and plan.correction is before.correction
-        return score if same else None
+        if name not in self.exact or plan.exact is not plan:
+            return None
+        before, score = self.exact[name]
+        others = (field.name for field in fields(Plan) if field.name not in ("precision", "tokens"))
+        return score if all(getattr(plan, one) is getattr(before, one) for one in others) else None
 
     def consider(self, proposal: Proposal) -> str | None:
         """Judge a proposal on held-out episodes, and keep it if it holds; else why it does not."""

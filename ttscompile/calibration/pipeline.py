@@ -313,11 +313,11 @@ def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock:
         if request.by_time:
             clock.ahead[:] = [partial(seconds_to_time, kept, request.deadline_ms)]
             least = partial(seconds_to_judge, kept.trials, kept.plan, lowered=True)
+            # It chooses among two ways at least, and the better one is judged.
             if number and not (kept.learned and clock.has(2 * least(LEARNED) + least(), row.name)):
                 kept.refused[row.name] = "was not tried: there was no time for it"
                 continue
-            lowers = any(one.name == "precision" for one in rows[number + 1 :])
-            clock.ahead.append(partial(seconds_to_judge_others, kept, lowers))
+            clock.ahead.append(partial(seconds_to_judge_others, kept, any(one.lowers for one in rows[number + 1 :])))
         kept.hear(row.name, proposer, clock.until(float(share)))
     if not (kept.learned or (request.by_time and clock.left_out)):
         why = " ".join(f"{name!r} {reason}" for name, reason in kept.refused.items())
@@ -328,9 +328,8 @@ def _hear(kept: Kept, rows: Sequence[Row], proposers: Sequence[Proposer], clock:
 
 def _warn_of_result(bar: Bar, result: CalibrationResult, max_minutes: float, left_out: Sequence[str]) -> None:
     if result.stopped == TIME_LIMIT:
-        told = f"a search was cut short, since {max_minutes:g} minutes were over"
-        more = f" Left out or cut short: {'; '.join(left_out)}." if left_out else ""
-        bar.warn(f"{told}: with more, plans may be nearer to the original.{more}")
+        told = f"{max_minutes:g} minutes were too few for all of it: with more, plans may be nearer to the original"
+        bar.warn(f"{told}. Left out or cut short: {'; '.join(left_out) or 'the search'}.")
     if result.doubtful:
         bar.warn(
             f"plan {result.default_plan!r} is {result.plans[result.default_plan].distance:.2f} of what other noise"

@@ -159,6 +159,7 @@ class Row:
         trains: whether it trains a network on the calls, for which more of them are better.
         consecutive: whether it learns from consecutive calls too (``Trials.windows``).
         anew: whether the plans of an earlier calibration go: all that follows is made from what it proposes.
+        lowers: whether it gives plans another precision, in which all of them are judged again.
         takes: its share of the time, beside those of the others that take part.
     """
 
@@ -169,6 +170,7 @@ class Row:
     trains: bool = False
     consecutive: bool = False
     anew: bool = False
+    lowers: bool = False
     takes: float = 1.0
 
     def make(self, request: Request) -> Proposer:
@@ -191,7 +193,12 @@ PROPOSERS = (
         takes=6.0,
     ),
     Row("pruner", "gates for each observation", "calibration.proposers.pruner:Pruner", consecutive=True),
-    Row("precision", "which parts compute in the other precision", "calibration.proposers.precision:Precision"),
+    Row(
+        "precision",
+        "which parts compute in the other precision",
+        "calibration.proposers.precision:Precision",
+        lowers=True,
+    ),
     Row("tokens", "when a token of an image encoder is computed anew", "calibration.proposers.tokens:Tokens"),
     Row(
         "weights",

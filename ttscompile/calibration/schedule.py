@@ -135,7 +135,8 @@ class Schedule(Proposer):
         steps, blocks = view.manifest.steps, len(view.manifest.blocks)
         budget = self._budget(trials, view, clock)
         calls = trials.windows if self._strategy.consecutive else trials.calls
-        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small=calls.count > trials.limits.usual)
+        small = calls.count > trials.limits.usual
+        task = Task.of(trials.runner, calls, 0, trials.seed, trials.pool, small=small)
         crowded = SpacedSchedules(task.whole, trials.state, clock, trials.bar)
         if budget is None:
             budget = budget_of_error(crowded, request.goal, steps, blocks)

@@ -98,7 +98,7 @@ class SpacedSchedules:
     def _errors(self, steps: tuple[int, ...], coming: Sequence[tuple[int, ...]], what: str) -> Errors | None:
         """The errors of a schedule, the first of those that are coming; None if not known and there is no time."""
         known = self._state.progress.setdefault(self._key, {})
-        key = _listed(steps)
+        key = ",".join(map(str, steps))
         if key not in known:
             # All plans together are judged on fewer calls than one is compared on: that takes no longer.
             if not self._clock.has(2 * self._whole.comparing(len(steps)) + self._whole.correcting(len(steps)), what):
@@ -110,10 +110,6 @@ class SpacedSchedules:
         with self._state.reading():
             normalised, units = known[key]
             return Errors(float(normalised), float(units))
-
-
-def _listed(steps: tuple[int, ...]) -> str:
-    return ",".join(map(str, steps))
 
 
 def budget_of_error(crowded: SpacedSchedules, goal: Goal, steps: int, blocks: int) -> Goal:

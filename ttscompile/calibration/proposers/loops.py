@@ -91,7 +91,7 @@ class Loops(Proposer):
             if wanted >= self._bound and (reason := self._too_slow(costs[loop].one, self._fastest)) is not None:
                 self._left_out.append(f"{loop} {reason}")
                 continue
-            if number and _over(clock, trials, f"crowded, {loop}", loop):
+            if number and _over(clock, trials, _crowds(loop), loop):
                 self._left_out.append(f"{loop} for want of time")
                 continue
             weights = [ASIDE if one in far else 1.0 for one in order[number:]]
@@ -123,9 +123,11 @@ class Loops(Proposer):
         for loop in sorted(costs.keys() - {ORIGINAL}, key=lambda loop: costs[loop].one):
             own = trials.of_loop(loop)
             plan = Plan(loop, dense_plan(own.runner.model.steps, own.runner.model.blocks), repair=True)
-            if _over(trials.clock, trials, f"crowded, {loop}", loop, seconds_to_judge(own, plan)):
+            if _over(trials.clock, trials, _crowds(loop), loop, seconds_to_judge(own, plan)):
+                self._left_out.append(f"{loop} for want of time")
                 continue
-            if (whole := judge(own, plan)).interval[0] > self._farthest:
+            whole = judge(own, plan)
+            if whole.interval[0] > self._farthest:
                 self._left_out.append(f"{loop} is {whole.distance:.3g} from the original with every step computed")
             else:
                 (close if whole.distance <= self._bound else far).append(loop)
@@ -147,7 +149,8 @@ class Loops(Proposer):
         first = replace(own.runner.select(calls, range(few)), late=late) if small else calls
         task = replace(Task.of(own.runner, first, 0, own.seed, own.pool), clock=clock)
         counts = yield from self._crowded(own, task, loop, cost, wanted)
-        if small and any(not _over(clock, own, intervals_of(n), n) for n in map(partial(_search, loop), counts)):
+        names = [_search(loop, count) for count in counts]
+        if small and not all(_over(clock, own, intervals_of(name), name) for name in names):
             task = replace(Task.of(own.runner, calls, 0, own.seed, own.pool, small=small), clock=clock)
             counts = self._within_reach(loop, counts, wanted)
         reached = False  # what is wanted; then one number of steps more is tried
@@ -169,7 +172,7 @@ class Loops(Proposer):
         """Plans that crowd their computed steps; returns the numbers of steps that a search may make near enough."""
         safer = wanted < self._bound
         fastest = float("inf") if safer else self._fastest  # of the loops before
-        crowded = SpacedSchedules(task.whole, own.state, task.clock, own.bar, f"crowded, {loop}")
+        crowded = SpacedSchedules(task.whole, own.state, task.clock, own.bar, _crowds(loop))
         counts = [n for n in COUNTS if n <= max(1, own.runner.model.steps // 2)]
         apart = other_noise(own) or TENTH * other_observations(own)  # the judge's unit where noise changes nothing
         hopeless = HOPELESS * (wanted if safer else self._farthest) * apart
@@ -285,6 +288,11 @@ class Loops(Proposer):
 
 def _name(loop: str, count: int) -> str:
     return f"{loop.replace('+', '')}.{count}"  # in the name of a plan a + is before a part
+
+
+def _crowds(loop: str) -> str:
+    """Where the state keeps what crowded schedules of a loop are worth."""
+    return f"crowded, {loop}"
 
 
 def _search(loop: str, count: int) -> str:
