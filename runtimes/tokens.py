@@ -106,7 +106,8 @@ class Kept:
         forward: of those that took the rows of a computed one.
         age: new frames since all tokens were computed.
         number: of the newest frame.
-        shared, bound: what ``renew`` has bound to the arrays, and arrays that it shares.
+        bound: what ``renew`` has bound to the arrays, by how many rows each of its inputs has.
+        shared: arrays that all of these have, by name: pixels, and what is made for all tokens.
     """
 
     pixels: Array
@@ -117,8 +118,8 @@ class Kept:
     forward: Array
     age: int = 0
     number: int = 0
-    shared: dict[str, Array] = field(default_factory=dict)
     bound: dict[tuple[int, ...], Any] = field(default_factory=dict)
+    shared: dict[str, Array] = field(default_factory=dict)
 
 
 class TokenTower:
@@ -214,7 +215,7 @@ class TokenTower:
         for. They are at most as many as are computed: those that gain most.
         """
         fixed, computed = self._record.fixed, index[self._record.fixed :] - self._record.fixed
-        others = np.setdiff1d(off.nonzero()[0], computed, True) if len(index) < self.tokens else index[:0]
+        others = np.setdiff1d(off.nonzero()[0], computed, assume_unique=True) if len(index) < self.tokens else index[:0]
         if not others.size:
             return others, others
         one, known = self._of(new, others), self._of(new, computed)

@@ -309,8 +309,8 @@ def renew_piece(sessions: Mapping[str, Any], name: str, inputs: Mapping[str, Arr
             own = {key: np.empty_like(array) for key, array in inputs.items()}
             own[kinds.PIXELS] = share(kinds.PIXELS, own[kinds.PIXELS])
             into = {kinds.renewed_name(key): array for key, array in kept.arrays.items()}
-            outputs = session.get_outputs()[: -len(into)]
-            made = {one.name: share(one.name, np.zeros(one.shape, np.float32)) for one in outputs}
+            others = [one for one in session.get_outputs() if one.name not in into]
+            made = {one.name: share(one.name, np.zeros(one.shape, np.float32)) for one in others}
             kept.bound[size] = own, made, Bound(session, {**own, **kept.arrays}, {**made, **into})
     except Exception as error:  # onnxruntime's own classes, and what it raises itself
         raise _failed(error) from error
