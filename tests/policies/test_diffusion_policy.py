@@ -274,7 +274,7 @@ def test_checkpoint_of_something_else(payload: Build, save: Save, part: str) -> 
         (
             "noise_scheduler",
             {"_target_": "diffusers.PNDMScheduler"},
-            "noise_scheduler is PNDMScheduler.* convert --sampler ddpm or ddim or dpm.*, and calibrate --learn loops",
+            "noise_scheduler is PNDMScheduler.* convert --sampler ddpm or ddim or dpm.*; then calibrate --learn loops",
         ),
         ("noise_scheduler", {"karras": True}, "does not know: karras"),
         ("noise_scheduler", {"predict_epsilon": False}, "predict_epsilon contradicts prediction_type = 'epsilon'"),

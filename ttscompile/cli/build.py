@@ -8,10 +8,17 @@ import click
 import ttscompile
 from ttscompile.artifact.load import load_artifact
 from ttscompile.artifact.write import require_replaceable
-from ttscompile.cli import sections
 from ttscompile.cli.options import json_option, lerobot_options, number_option, policy_hz_option, threads_option
 from ttscompile.cli.output import only_results_on_stdout, print_json, progress, results, say, warn_if_busy
-from ttscompile.cli.sections import LEROBOT, Recordings, Section, SectionedCommand, Sources, require_recordings
+from ttscompile.cli.sections import (
+    LEROBOT,
+    Recordings,
+    Section,
+    SectionedCommand,
+    Sources,
+    require_recordings,
+    trajectories_options,
+)
 from ttscompile.cli.summary import print_frontier
 from ttscompile.cli.types import ERROR, MILLISECONDS, MINUTES, PATH, PATH_OR_HUB, RATE
 from ttscompile.core.paths import on_hub, require_path
@@ -24,7 +31,7 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 
 @click.command(cls=SectionedCommand, sections=SECTIONS)
 @click.argument("checkpoint", type=PATH_OR_HUB)
-@sections.trajectories_options(
+@trajectories_options(
     required=False,
     what="Learn from these recorded episodes; without any, from those of its training, if CHECKPOINT says which.",
 )

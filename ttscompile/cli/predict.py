@@ -159,9 +159,12 @@ def _vectors(specs: Mapping[str, ObservationSpec]) -> list[str]:
 
 def _option(key: str, spec: PolicySpec) -> str:
     """The option that gives this observation."""
-    told, state = spec.instruction, _vectors(spec.observations) == [key]
-    others = _TASK if told is not None and key in (told.tokens, told.mask) else "--observation FILE.npz"
-    return f"--image {key}=FILE" if spec.observations[key].image else "--state NUMBER,.." if state else others
+    told = spec.instruction
+    if spec.observations[key].image:
+        return f"--image {key}=FILE"
+    if told is not None and key in (told.tokens, told.mask):
+        return _TASK
+    return "--state NUMBER,.." if _vectors(spec.observations) == [key] else "--observation FILE.npz"
 
 
 def _camera(name: str, specs: Mapping[str, ObservationSpec]) -> str:

@@ -81,8 +81,9 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     name = sampler or own_name
     if name is None:
         raise CheckpointError(
-            f"{where} is {own or 'of no class'}; expected one of {', '.join(NAMES)}. To run on its betas in"
-            f" another: convert --sampler {' or '.join(DIFFUSION_SAMPLERS)}, and calibrate --learn loops,precision."
+            f"{where} is {own or 'of no class'}; expected one of {', '.join(NAMES)}. To run on its betas with"
+            f" another sampler, give convert --sampler {' or '.join(DIFFUSION_SAMPLERS)}; then calibrate --learn"
+            " loops,precision does what build would do."
         )
     given = {key: value for key, value in settings.items() if not key.startswith("_")}  # as diffusers does
     old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
