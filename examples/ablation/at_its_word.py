@@ -111,7 +111,6 @@ def train(training: Training, updates: int, minutes: float, tell: Callable[[Mapp
 @click.option("--detached", is_flag=True, help="Ours: gates have no part of what later cells read of the caches.")
 @click.option("--rate", default=1.0, help="The paper's: times their learning rate.")
 @click.option("--sparse-stream", is_flag=True, help="Compute what cells would have computed, as they do; slower.")
-@click.option("--dropout/--no-dropout", default=True, help="The paper's: theirs, while their layer is trained.")
 @click.option("--updates", default=3000)
 @click.option("--minutes", default=600.0, help="Of the training, at most.")
 @click.option("--learned", default=512, help="Calls to learn from, at most.")
@@ -129,7 +128,6 @@ def main(
     detached: bool,
     rate: float,
     sparse_stream: bool,
-    dropout: bool,
     updates: int,
     minutes: float,
     learned: int,
@@ -161,10 +159,9 @@ def main(
             corrected,
             updates,
             begin,
-            detached,
-            rate,
-            sparse_stream,
-            dropout,
+            detached=detached,
+            rate=rate,
+            sparse_stream=sparse_stream,
         )
         one = Training(task, recipe)
         seconds = train(one, updates, minutes, progress.print)

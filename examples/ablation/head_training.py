@@ -73,7 +73,6 @@ class Recipe:
         detached: ours: whether gates have no part of what later cells read of the caches, as theirs.
         rate: the paper's: times their rates.
         sparse_stream: whether what a cell would have computed is computed where the sparse call was, as theirs is.
-        dropout: the paper's: whether a tenth of the numbers is left out while their layer is trained.
     """
 
     sources: tuple[Source, ...]
@@ -84,7 +83,6 @@ class Recipe:
     detached: bool = False
     rate: float = 1.0
     sparse_stream: bool = False
-    dropout: bool = True
 
 
 class Training:
@@ -104,7 +102,7 @@ class Training:
         sources, beside = recipe.sources, recipe.sparse_stream
         self._practice = GateGradients(task.runner, self._fitted, sources, through_caches, beside)
         self._head: DroppedHead | None = None
-        if recipe.paper and recipe.dropout and not has_head(task.pruner):
+        if recipe.paper and not has_head(task.pruner):
             self._head = DroppedHead(task.runner)
         self._cells = task.runner.model.steps * task.runner.model.blocks
         values = _first_values(task, recipe)
