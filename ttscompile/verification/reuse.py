@@ -95,6 +95,8 @@ def check_episodes(artifact: Artifact, policy: CompiledPolicy, episodes: Sequenc
     shown = f"{calls} call{'s' * (calls != 1)} of {len(episodes)} episode{'s' * (len(episodes) != 1)}: {shown}"
     if reasons:
         shown += f". This is surely {'; and '.join(reasons)}"
+    elif found > min(most.values()):
+        shown += f". {min(most.values()):.3g} is allowed, which so few calls do not tell from that"
     remedy = "These episodes are unlike those of the calibration, or the plan is too sparse: calibrate with such"
     remedy += " episodes, or with a lower --target-sparsity."
     status, remedy = (FAILED, remedy) if reasons else (PASSED, "")
