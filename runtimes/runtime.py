@@ -40,6 +40,21 @@ HELPER = "ttscompile-pruner"
 
 
 @dataclass(frozen=True, eq=False)
+class _Entries:
+    """Entries of the rollout cache in the episode under way, bool ``[B, K, blocks]`` each."""
+
+    written: BoolArray  # kept, so that a plan may read them
+    dropped: BoolArray  # computed, and not kept
+
+    @classmethod
+    def none(cls, streams: int, steps: int, blocks: int) -> "_Entries":
+        return cls(*np.zeros((2, streams, steps, blocks), np.bool_))
+
+    def after(self, computed: BoolArray, keep: BoolArray) -> "_Entries":
+        return _Entries(np.where(computed, keep, self.written), np.where(computed, ~keep, self.dropped))
+
+
+@dataclass(frozen=True, eq=False)
 class _Settled:
     """The plan that a call executes, and what it took to have it."""
 
@@ -54,8 +69,7 @@ class _Made:
     sample: FloatArray
     settled: _Settled
     outside: FloatArray  # ``CallReport.outside``
-    waited: float  # ms, for the pruner
-    prologue: float  # reading of ``time.perf_counter`` after it
+    timings: Timings
     frames: FrameWork
     mixed: bool  # whether some streams were far outside, and others not: then no residual can be reused
 
@@ -104,8 +118,7 @@ class Runtime:
         self._reading = any(one.cells is None or Source.ROLLOUT in one.cells for one in plans)  # of earlier calls
         self._helper = Helper(HELPER) if any(one.pruned for one in plans) else None  # there before the first call
         self._given = False  # whether a plan that is not the artifact's ever was
-        self._written: BoolArray | None = None
-        self._dropped: BoolArray | None = None  # computed in this episode, and not kept
+        self._entries: _Entries | None = None  # None before the first call of an episode
         self.streams: int | None = None
         self._chunk: FloatArray | None = None  # denoised sample of the last call of the episode
         self._reference: FloatArray | None = None  # what its actions are relative to
@@ -155,7 +168,7 @@ class Runtime:
             self._chunk = None
 
     def _end_episode(self) -> None:
-        self._written = self._dropped = self._chunk = self.streams = self._executed = None
+        self._entries = self._chunk = self.streams = self._executed = None
 
     def require_streams(self, streams: int) -> None:
         """Raise ObservationError if the episode under way has another number of streams."""
@@ -186,69 +199,67 @@ class Runtime:
         self.require_streams(streams)
         if plan.otherwise is not None and self._chunk is None:
             plan = plan.otherwise
-        name, told = self._artifact.name_of(plan), self._artifact.told(plan)
         opened = self._opened_for(plan)
-        view, backend = opened.view, opened.backend
-        spec, manifest = view.manifest.spec, view.manifest
-        noise = check_noise(noise, streams, self.noise_spec(plan))
+        self._require_executable(plan, opened.view)
+        name, told = self._artifact.name_of(plan), self._artifact.told(plan)
+        given = self._given or (name is None and (told is None or self._reading))
+        keep = np.ones_like(opened.backend.keeps) if given or name == DENSE else opened.backend.keeps
+        entries = self._entries if opened is self._used else None  # else what earlier calls kept is of another variant
+        entries = entries or _Entries.none(streams, *keep.shape)
+        spec = opened.view.manifest.spec
         reference = spec.reference(obs)
-        if view.start is not None and self._chunk is not None:
-            change = None if reference is None or self._reference is None else (self._reference, reference)
-            noise = view.start.noise_from(self._chunk, spec.chunk, noise, self._executed, change)
+        noise = self._noise(plan, opened.view, noise, streams, reference)
         known = None if prefix is None else known_samples(spec, prefix, noise.initial)
         committed = 0 if known is None else known.values.shape[2]
         correction = plan.correction and plan.correction.of(committed)
         obs = {**obs, **spec.committed(streams, committed)}
-        cells = (streams, manifest.steps, len(manifest.groups))
-        same = opened is self._used  # else what earlier calls kept is of another variant
-        written = self._written if same and self._written is not None else np.zeros(cells, dtype=np.bool_)
-        dropped = self._dropped if same and self._dropped is not None else np.zeros(cells, dtype=np.bool_)
-        if name is None and plan.correction is not None:
-            require_fit(plan.correction, self._artifact.manifest, plan.loop)
-        if plan.cells is None and PRUNER not in manifest.pieces:
-            remedy = "Give a plan with cells: plan='dense', or the name of another one"
-            raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
-        settled = None if plan.cells is None else self._settle(opened, plan.cells, written, dropped, plan.repair)
-        self._given |= name is None and (told is None or self._reading)
-        keep = np.ones_like(backend.keeps) if self._given or name == DENSE else backend.keeps
-        self._used = opened
+        call = Call(obs, noise, correction, known, keep, entries.written)
+        settled = None if plan.cells is None else self._settle(opened, plan.cells, entries, plan.repair)
+        self._given, self._used = given, opened
         self._end_episode()  # a call that fails ends the episode: its residuals stand beside those of earlier ones
-        backend.prepare(streams, None if settled is None else settled.lowered)
-
-        start = time.perf_counter()
-        made = self._denoised(opened, plan, Call(obs, noise, correction, known, keep, written), settled)
-        stop, settled = time.perf_counter(), made.settled
-        computed = settled.plans == Source.COMPUTE.value
-        self._written, self._dropped = np.where(computed, keep, written), np.where(computed, ~keep, dropped)
-        if made.mixed:  # no cell has residuals of all streams: as if none had been computed
-            self._written, self._dropped = np.zeros_like(computed), np.zeros_like(computed)
+        opened.backend.prepare(streams, None if settled is None else settled.lowered)
+        made = self._denoised(opened, plan, call, settled)
+        computed = made.settled.plans == Source.COMPUTE.value
+        # Of streams with different plans no cell has residuals of all: as if none had been computed.
+        self._entries = _Entries.none(*computed.shape) if made.mixed else entries.after(computed, keep)
         self.streams, self._chunk, self._reference = streams, made.sample, reference
-        executed = settled.plans.copy()  # the caller's plan is the caller's
+        executed = made.settled.plans.copy()  # the caller's plan is the caller's
         executed.flags.writeable = False
+        flops = opened.view.manifest.flops
         report = CallReport(
             plan=executed,
             plan_name=told or GIVEN,
             loop=plan.loop,
             computed=tuple(int(n) for n in np.count_nonzero(computed, axis=(1, 2))),
-            legalised=settled.legalised,
-            flops=tuple(manifest.flops.call(one, plan.pruned, correction) for one in settled.plans),
+            legalised=made.settled.legalised,
+            flops=tuple(flops.call(one, plan.pruned, correction) for one in executed),
             frames=made.frames,
             outside=tuple(made.outside.tolist()),
             unfitted=correction is not None and committed > correction.prefixes,
-            timings=Timings(
-                prologue=_milliseconds(start, made.prologue),
-                pruner=settled.pruner,
-                wait_pruner=made.waited,
-                decode=_milliseconds(made.prologue, stop) - made.waited,
-                total=_milliseconds(start, stop),
-                frames=made.frames.waited,
-            ),
+            timings=made.timings,
         )
         return made.sample, report
+
+    def _require_executable(self, plan: Plan, view: View) -> None:
+        """Raise IllegalPlanError if a plan that somebody made has a correction or a pruner that does not fit."""
+        if plan.correction is not None and self._artifact.name_of(plan) is None:
+            require_fit(plan.correction, self._artifact.manifest, plan.loop)
+        if plan.cells is None and PRUNER not in view.manifest.pieces:
+            remedy = "Give a plan with cells: plan='dense', or the name of another one"
+            raise IllegalPlanError(f"a plan without cells needs a pruner, and loop {plan.loop!r} has none. {remedy}.")
+
+    def _noise(self, plan: Plan, view: View, noise: Noise, streams: int, reference: FloatArray | None) -> Noise:
+        """That of a call, checked; made of the chunk of the call before where the plan begins with it."""
+        noise = check_noise(noise, streams, self.noise_spec(plan))
+        if view.start is None or self._chunk is None:
+            return noise
+        change = None if reference is None or self._reference is None else (self._reference, reference)
+        return view.start.noise_from(self._chunk, view.manifest.spec.chunk, noise, self._executed, change)
 
     def _denoised(self, opened: _Opened, plan: Plan, call: Call, settled: _Settled | None) -> _Made:
         """The sample of a call. Streams that are far outside of what was recorded have ``plain_cells``, uncorrected."""
         backend, envelope, waited, mixed = opened.backend, self._artifact.envelope, 0.0, False
+        start = time.perf_counter()
         backend.start(call)
         prologue, frames, outside = time.perf_counter(), opened.frames.work, np.zeros(0, np.float32)
         if plan.correction is None or envelope is None:
@@ -266,7 +277,7 @@ class Runtime:
                 sample = with_prefix(bounded(opened.view.manifest.spec.sampler, sample), call.known)
         if plan.correction is not None and far.any():
             cells = plain_cells(plan.correction, call.written.shape[2])
-            plain = self._settle(opened, cells, call.written, np.zeros_like(call.written), True)
+            plain = self._settle(opened, cells, _Entries(call.written, np.zeros_like(call.written)), True)
             backend.start(replace(call, obs={}, correction=None))
             backend.first_step()
             own, mixed = backend.other_steps(plain.lowered), not far.all()
@@ -278,7 +289,16 @@ class Runtime:
                 plain = replace(settled, plans=plans, legalised=legalised)
             settled, sample = plain, own
         assert settled is not None
-        return _Made(sample, settled, outside, waited, prologue, frames, mixed)
+        stop = time.perf_counter()
+        timings = Timings(
+            prologue=_milliseconds(start, prologue),
+            pruner=settled.pruner,
+            wait_pruner=waited,
+            decode=_milliseconds(prologue, stop) - waited,
+            total=_milliseconds(start, stop),
+            frames=frames.waited,
+        )
+        return _Made(sample, settled, outside, timings, frames, mixed)
 
     def noise_spec(self, plan: Plan) -> PolicySpec:
         """What noise has to fit: of the loop whose last steps these are, where the plan begins with a chunk."""
@@ -301,26 +321,24 @@ class Runtime:
         finally:
             wait([pruning])  # it reads the backend's memory: nobody may go on before it is done, not even with an error
 
-    def _settle(
-        self, opened: _Opened, plan: PlanArray, written: BoolArray, dropped: BoolArray, repair: bool
-    ) -> _Settled:
+    def _settle(self, opened: _Opened, plan: PlanArray, entries: _Entries, repair: bool) -> _Settled:
         """Cells that were given.
 
         Whether a plan that was lowered before is legal depends on its ROLLOUT reads alone, which is quickly checked.
         """
-        streams, steps, blocks = written.shape
+        streams, steps, blocks = entries.written.shape
         wanted = check_plan(plan, steps, blocks, streams)
-        plans = without_illegal_reads(wanted, written) if repair else wanted
+        plans = without_illegal_reads(wanted, entries.written) if repair else wanted
         rollout = wanted == Source.ROLLOUT.value
-        if (rollout & dropped).any():
-            _, k, b = np.argwhere(rollout & dropped)[0].tolist()
+        if (rollout & entries.dropped).any():
+            _, k, b = np.argwhere(rollout & entries.dropped)[0].tolist()
             raise IllegalPlanError(
                 f"the plan reads the ROLLOUT residual of step {k}, block {b}, which an earlier call of this episode"
                 " computed with a plan of the artifact, and did not keep. Begin the episode with a matrix (one of zeros"
                 " computes all, as plan='dense' does): from a first matrix on every call keeps what it computes."
             )
-        check = partial(require_legal, plans, opened.view.manifest.groups, written)
-        if not repair and (rollout & ~written).any():
+        check = partial(require_legal, plans, opened.view.manifest.groups, entries.written)
+        if not repair and (rollout & ~entries.written).any():
             check()
         legalised = tuple(np.count_nonzero(plans != wanted, axis=(1, 2)).tolist())
         return _Settled(plans, tuple(opened.lowering.lower(one, check) for one in plans), legalised)
