@@ -48,7 +48,7 @@ def configured_loops(settings: Mapping[str, Any], own_steps: int | None, options
     return loops_of(lambda each: configured_sampler(settings, own_steps, each, **more), options, own or "no scheduler")
 
 
-def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in its own way
+def configured_sampler(
     settings: Mapping[str, Any],
     own_steps: int | None,
     options: LoadOptions,
@@ -64,34 +64,16 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
         step_arguments: what the policy hands to every ``step`` of its own scheduler (``eta``).
         where: the settings stand, for messages.
     """
-    sampler, spacing = options.sampler, options.spacing
-    steps = own_steps if options.steps is None else options.steps
-    own = _own_class(settings)
-    own_name = NAMES.get(own)
-    if sampler is not None and sampler not in DIFFUSION_SAMPLERS:
-        raise SpecError(
-            f"sampler {sampler!r} is none of a policy that was trained with diffusion; expected one of"
-            f" {', '.join(DIFFUSION_SAMPLERS)}. {' and '.join(METHODS)} are for policies trained with flow matching."
-        )
-    if spacing is not None and spacing not in SPACINGS:
-        raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
-    if steps is not None and (type(steps) is not int or not 1 <= steps <= MOST_STEPS):
-        raise SpecError(f"{steps!r:.80} denoising steps are not possible; expected a whole number, 1 to {MOST_STEPS}.")
-
-    name = sampler or own_name
+    own, steps = _own_class(settings), own_steps if options.steps is None else options.steps
+    _check_asked(options, steps)
+    name, own_name = options.sampler or NAMES.get(own), NAMES.get(own)
     if name is None:
         raise CheckpointError(
             f"{where} is {own or 'of no class'}; expected one of {', '.join(NAMES)}. To run on its betas with"
             f" another sampler, give convert --sampler {' or '.join(DIFFUSION_SAMPLERS)}; then calibrate --learn"
             " loops,precision does what build would do."
         )
-    given = {key: value for key, value in settings.items() if not key.startswith("_")}  # as diffusers does
-    old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
-    if old is not None:
-        predicts = "epsilon" if old else "sample"
-        if given.setdefault("prediction_type", predicts) != predicts:
-            found = f"prediction_type = {given['prediction_type']!r}"
-            raise CheckpointError(f"{where}: predict_epsilon contradicts {found}.")
+    given = _renamed(settings, where)
     unknown = sorted(set(given).difference(*_SETTINGS.values()))
     if unknown and name == own_name:
         told = f"{', '.join(unknown)}. Remove them from the configuration if they are not needed, and save it again"
@@ -100,8 +82,8 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
         bounded = not own or own.startswith(("DDPM", "DDIM"))
         given["clip_sample"] = own_name != DPM and given.get("clip_sample", bounded)
         given = _for_dpm_solver(given, where) if name == DPM else given
-    if spacing is not None:
-        given["timestep_spacing"] = spacing
+    if options.spacing is not None:
+        given["timestep_spacing"] = options.spacing
     trained = given.get("num_train_timesteps", 1000)
     if type(trained) is not int or not 1 <= trained <= MOST_TIMESTEPS:
         raise CheckpointError(f"{where}: num_train_timesteps is {trained!r:.80}; expected 1 to {MOST_TIMESTEPS}.")
@@ -120,6 +102,32 @@ def configured_sampler(  # noqa: C901, PLR0912  # each setting can be wrong in i
     except Exception as error:  # settings of a wrong type fail wherever diffusers first uses them
         refused = f"{given!s:.300}: {type(error).__name__}: {error!s:.200}"
         raise CheckpointError(f"{where}: diffusers refuses the settings {refused}") from error
+
+
+def _check_asked(options: LoadOptions, steps: int | None) -> None:
+    """Raise SpecError unless there is such a sampler, such a spacing and such a number of steps."""
+    sampler, spacing = options.sampler, options.spacing
+    if sampler is not None and sampler not in DIFFUSION_SAMPLERS:
+        raise SpecError(
+            f"sampler {sampler!r} is none of a policy that was trained with diffusion; expected one of"
+            f" {', '.join(DIFFUSION_SAMPLERS)}. {' and '.join(METHODS)} are for policies trained with flow matching."
+        )
+    if spacing is not None and spacing not in SPACINGS:
+        raise SpecError(f"timestep spacing {spacing!r} is not known; expected one of {', '.join(SPACINGS)}.")
+    if steps is not None and (type(steps) is not int or not 1 <= steps <= MOST_STEPS):
+        raise SpecError(f"{steps!r:.80} denoising steps are not possible; expected a whole number, 1 to {MOST_STEPS}.")
+
+
+def _renamed(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Settings by the names of today, without those that diffusers does not read: they begin with ``_``."""
+    given = {key: value for key, value in settings.items() if not key.startswith("_")}
+    old = given.pop("predict_epsilon", None)  # what diffusers before 0.11 called it
+    if old is not None:
+        predicts = "epsilon" if old else "sample"
+        if given.setdefault("prediction_type", predicts) != predicts:
+            found = f"prediction_type = {given['prediction_type']!r}"
+            raise CheckpointError(f"{where}: predict_epsilon contradicts {found}.")
+    return given
 
 
 def _own_class(settings: Mapping[str, Any]) -> str:
