@@ -138,6 +138,7 @@ class Searching:
 
     Attributes:
         plans: those that took part, by ``STRATEGY-SHARE``, or ``STRATEGY-corrected-SHARE``.
+        shares: of its pace that each of them takes, by the same names; empty where they keep none.
 
     Args:
         path: the artifact; what is done is kept in its directory until ``forget``.
@@ -177,6 +178,7 @@ class Searching:
         self._learned, self._minutes, self._how = learned, max_minutes, (intervals, 60 * max_minutes, correct)
         self._state: ComparisonState | None = None
         self.plans: dict[str, Plan] = {}
+        self.shares: dict[str, float] = {}
 
     def forget(self) -> None:
         """Keep nothing any more: the comparison is done."""
@@ -217,7 +219,9 @@ class Searching:
             found = [(series, name, one) for wish, name in wished for series, one in searches.known_of(wish).items()]
             for pace in self._paces(trials):
                 for strategy in self._strategies:
-                    found += _at_pace(pace, strategy, searches, search)
+                    for series, one, share in _at_pace(pace, strategy, searches, search):
+                        found.append((series, pace.name, one))
+                        self.shares |= {} if share is None else {_plan_name(series, pace.name): share}
         entrants, skipped, cut = list[Entrant](), dict[str, str](), list[str]()
         for series, name, one in found:
             if isinstance(one, str):
@@ -226,7 +230,7 @@ class Searching:
             plan, short = one
             made = replace(trials.base, cells=plan.schedule, correction=plan.correction)
             entrants.append(Entrant(series, name, trials, made))
-            self.plans[f"{series.replace(', ', '-')}-{name}"] = made
+            self.plans[_plan_name(series, name)] = made
             cut += [f"{series} {name}"] * short
         warnings = [f"nothing was kept for --resume: {state.warning}."] if found and state.warning else []
         if cut:
@@ -289,12 +293,16 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
     return found, stopped == "time limit"
 
 
+def _plan_name(series: str, wish: str) -> str:
+    return f"{series.replace(', ', '-')}-{wish}"
+
+
 def _at_pace(
     pace: Pace, strategy: Strategy, searches: Searches, search: Callable[[Mapping[Wish, str]], None]
-) -> list[tuple[str, str, tuple[Found, bool] | str]]:
-    """Of each series of a strategy what keeps the pace with the largest budget, or why there is nothing."""
+) -> list[tuple[str, tuple[Found, bool] | str, float | None]]:
+    """Of each series of a strategy what keeps the pace with the largest budget, and its share; or why there is none."""
     model, base = pace.trials.runner.model, pace.trials.base
-    kept: list[tuple[str, str, tuple[Found, bool] | str]] = []
+    kept: list[tuple[str, tuple[Found, bool] | str, float | None]] = []
 
     def found(series: str, cells: int) -> tuple[Found, bool] | str:
         search({(strategy.name, cells): f"of {cells} cells"})
@@ -313,14 +321,17 @@ def _at_pace(
     search({(strategy.name, pace.cells): f"of {pace.cells} cells"})
     for series, most in searches.known_of((strategy.name, pace.cells)).items():
         if isinstance(most, str):  # nor is there anything for fewer cells
-            kept.append((series, pace.name, most))
+            kept.append((series, most, None))
             continue
         least = strategy.least(model.steps, model.blocks)
         near = model.blocks // (1 if strategy.fits_correction else 2)  # it computes whole steps alone
         budget, tried = largest(partial(share, series), least, pace.cells, near)
-        fewest = min(tried)
-        told = f"with {fewest} cells a call takes {tried[fewest]:.3g} times as long as it may."
-        kept.append((series, pace.name, told if budget is None else found(series, budget)))
+        if budget is None:
+            fewest = min(tried)
+            told = f"with {fewest} cells a call takes {tried[fewest]:.3g} times as long as it may."
+            kept.append((series, told, None))
+        else:
+            kept.append((series, found(series, budget), tried[budget]))
     return kept
 
 

@@ -166,8 +166,8 @@ def main(
     found = compare(directory, artifacts, others, trajectories, joining=joining, **how)
     if as_json:
         compared = [{"path": str(path), "identity": artifacts[str(path)].manifest.identity} for path in others]
-        machine = fingerprint()
-        print_json({"identity": of.identity, "with": compared, "machine": machine, "comparison": found.to_json()})
+        about = {"identity": of.identity, "with": compared, "machine": fingerprint()}
+        print_json({**about, "comparison": found.to_json(), "shares": joining.shares})
     else:
         output = results()
         print_comparison(found, output)

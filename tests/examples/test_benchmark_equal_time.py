@@ -65,7 +65,10 @@ def test_a_strategy_gets_the_cells_with_which_it_keeps_the_pace(
     asked = [*arguments, "--strategies", "bac,l2c", "--even-steps", "3", "--correct", "--learned-calls", "32"]
     result = CliRunner().invoke(main, [*asked, "--json", "--into", str(tmp_path / "found")])
     assert result.exit_code == 0, result.stderr
-    told = json.loads(result.stdout)["comparison"]
+    document = json.loads(result.stdout)
+    told, shares = document["comparison"], document["shares"]
+    assert set(shares) == {"bac-as-3", "bac-corrected-as-3"}
+    assert all(0.8 <= share <= 1 + SLACK for share in shares.values())
     assert [(one["series"], one["name"]) for one in told["points"][1:]] == [("bac", "as-3"), ("bac, corrected", "as-3")]
     assert "computes at least 30 of the 10 x 6 cells" in told["skipped"]["l2c as-3"]
     cells = load_artifact(tmp_path / "found").plans["bac-as-3"].cells
