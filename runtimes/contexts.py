@@ -32,8 +32,12 @@ class ContextValues:
         zeros: Callable[[tuple[int, ...], str], Any],
         tables: Mapping[str, Any],
     ) -> None:
-        self._manifest, self._module, self.streams = manifest, module, streams
-        self._tables_of_streams: dict[str, Any] = {}  # as the step piece reads them
+        self._manifest, self._module, self._zeros, self.streams = manifest, module, zeros, streams
+        self._of_all_steps: dict[str, Any] = {}  # as the step piece reads them
+        # Views of values, and of those: a small network's call takes a tenth longer if each makes them anew.
+        self._repeated: dict[str, tuple[Any, Any]] = {}
+        self._by_step: dict[str, Any] = {}
+        self._rows: list[Any] = []
         self.values: dict[str, Any] = {}
         for name, context in manifest.contexts.items():
             steps = (manifest.steps,) if self.is_stepwise(name) else ()
@@ -47,9 +51,11 @@ class ContextValues:
 
     def features(self) -> Any:
         """What a correction reads of the condition, one row of numbers a stream, ``[B, N]``."""
-        contexts, move = self._manifest.contexts, self._module.moveaxis
-        rows = [move(self.values[name], contexts[name].type.batch_axis or 0, 0) for name in self._manifest.features]
-        return self._module.concatenate([row.reshape(self.streams, -1) for row in rows], 1)
+        if not self._rows:
+            contexts, move = self._manifest.contexts, self._module.moveaxis
+            names = self._manifest.features
+            self._rows = [move(self.values[name], contexts[name].type.batch_axis or 0, 0) for name in names]
+        return self._module.concatenate([row.reshape(self.streams, -1) for row in self._rows], 1)
 
     def keep(self, made: Iterable[tuple[str, Any]]) -> None:
         """Keep what the condition piece gave."""
@@ -58,26 +64,33 @@ class ContextValues:
                 self.values[name][...] = value
 
     def for_step_piece(self, names: Iterable[str]) -> list[Any]:
-        """What the step piece reads for all steps in one batch of K * B, step-major."""
-        found, steps, together = list[Any](), self._manifest.steps, self._module.concatenate
-        for name in names:
-            value, axis = self.values[name], self._manifest.contexts[name].type.batch_axis
-            if not self.is_stepwise(name):
-                found.append(value if axis is None else together([value] * steps, axis))
-                continue
-            if name not in self._tables_of_streams:
-                self._tables_of_streams[name] = together(list(value), self._axis(name))
-            found.append(self._tables_of_streams[name])
-        return found
+        """What the step piece reads for all steps in one batch of K * B, step-major; the next call writes over it."""
+        return [self._for_all_steps(name) for name in names]
+
+    def _for_all_steps(self, name: str) -> Any:
+        value, axis, steps = self.values[name], self._manifest.contexts[name].type.batch_axis, self._manifest.steps
+        if self.is_stepwise(name):
+            if name not in self._of_all_steps:
+                self._of_all_steps[name] = self._module.concatenate(list(value), self._axis(name))
+            return self._of_all_steps[name]
+        if axis is None:
+            return value
+        if name not in self._of_all_steps:
+            before, after = tuple(value.shape[:axis]), tuple(value.shape[axis + 1 :])
+            whole = self._zeros((*before, steps * self.streams, *after), self._manifest.contexts[name].type.dtype)
+            each = value[(*(slice(None),) * axis, None)]  # [..., 1, B, ...]
+            self._repeated[name] = whole.reshape(*before, steps, self.streams, *after), each
+            self._of_all_steps[name] = whole
+        by_step, each = self._repeated[name]
+        by_step[...] = each
+        return self._of_all_steps[name]
 
     def keep_steps(self, made: Iterable[tuple[str, Any]]) -> None:
         """Keep what the step piece gave for that batch. Raises ArtifactError: it has no axis for the streams."""
-        move = self._module.moveaxis
         for name, value in made:
-            axis = self._axis(name)
-            front = move(value, axis, 0)  # from [..., K * B, ...] to [K, ..., B, ...]
-            split = front.reshape(self._manifest.steps, self.streams, *front.shape[1:])
-            self.values[name][...] = move(split, 1, axis + 1)
+            if name not in self._by_step:  # [..., K, B, ...] of what is [K, ..., B, ...]
+                self._by_step[name] = self._module.moveaxis(self.values[name], 0, self._axis(name))
+            self._by_step[name][...] = value.reshape(self._by_step[name].shape)
 
     def take(self, whole: ContextValues, index: Any) -> None:
         """The values of some streams of a batch."""
