@@ -3,7 +3,6 @@
 import os
 import platform
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,8 @@ def fingerprint() -> dict[str, Any]:
 
     Nothing that names the machine or its user. Packages that are not installed are left out.
     """
+    from importlib.metadata import PackageNotFoundError, version  # which imports sockets and mail: 10 ms of each load
+
     fields = cpuinfo()
     flags = fields.get("flags", fields.get("Features", "")).split()
     versions = {}
