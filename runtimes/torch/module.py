@@ -172,7 +172,9 @@ class PrunedCall(CallModule):
         """One call.
 
         Args:
-            obs, initial, steps: see ``SparseCall.forward``.
+            obs: see ``SparseCall.forward``, as ``initial`` and ``steps``.
+            initial: its noise.
+            steps: that of its steps.
             rollout: what the call before gave, or ``empty_rollout`` in the first call of an episode. Without it no
                 residual of an earlier call is there, and cells that want one have TIMESTEP.
 
