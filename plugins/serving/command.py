@@ -78,8 +78,8 @@ server_options = shared.together(
         multiple=True,
         metavar="CERTIFICATE [KEY]...",
         callback=_papers,
-        help="Certificate of the server in PEM format, with those between it and its authority's in the same file; then"
-        " its private key, if that is in a file of its own. Clients use wss:// then.",
+        help="Show clients this certificate, in PEM format, with those between it and its authority's in the same file;"
+        " then its private key, if that is in a file of its own. Clients use wss:// then.",
     ),
     click.option(
         "--insecure",
@@ -196,7 +196,7 @@ SECTIONS = (
     " slowest plan to the fastest: a faster one is run when calls are late. With --copies it is the plan of requests"
     " that name none, with --openpi that of all.",
 )
-@shared.threads_option("Threads that the policy, or each copy of it, computes with.")
+@shared.threads_option("Compute with so many threads, in each copy of the policy.")
 @shared.loop_options
 @click.option(
     "--tokenizer",

@@ -192,3 +192,19 @@ def test_all_commands_together_have_at_most_a_hundred_options() -> None:
     """What only authors of a method need is in the Python interface."""
     options = [one for command in main.commands.values() for one in command.params if isinstance(one, click.Option)]
     assert len(options) <= 100
+    assert len(main.commands) <= 10
+
+
+def test_help_begins_with_what_an_option_does() -> None:
+    begun = {
+        (one.help or "").split()[0].rstrip(",")
+        for command in main.commands.values()
+        for one in command.params
+        if isinstance(one, click.Option)
+    }
+    assert begun == {
+        *("Answer", "Be", "Check", "Choose", "Compile", "Compute", "Count", "Draw", "Drive", "Execute", "Find", "Give"),
+        *("Go", "Have", "Hold", "Keep", "Learn", "Leave", "Let", "Listen", "Look", "Make", "Merge", "Name", "Play"),
+        *("Predict", "Print", "Put", "Read", "Replace", "Reuse", "Run", "Save", "Say", "See", "Show", "Take", "Time"),
+        *("Work", "Write"),
+    }

@@ -75,14 +75,14 @@ SECTIONS = (
 )
 @options.names_option(
     "--runtime",
-    ("onnxruntime", "torch"),
+    options.FAST,
     default="onnxruntime",
     help="Execute the plans with onnxruntime, or with torch, which needs the extra 'compile'; or with each of them:"
     " onnxruntime,torch.",
 )
 @click.option("--device", type=TEXT, help="Have torch, and the original, compute on this device: cpu, cuda.")
 @options.several_threads_option(
-    "Threads that each plan computes with. Of several, as in 1,2,4, each plan is timed with each of these, and the rest"
+    "Compute with so many threads. Of several, as in 1,2,4, each plan is timed with each of these, and the rest"
     " is done with the first."
 )
 @options.count_option("--calls", "Count so many calls of each plan.", default=20, most=MOST_CALLS)

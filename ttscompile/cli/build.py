@@ -51,11 +51,11 @@ SECTIONS = (Section("In a control loop", ("control_hz", "policy_hz")), LEROBOT)
 @number_option(
     "--error",
     ERROR,
-    "Largest distance from the original that a plan may have, in units of what other noise changes; with 95 %"
-    " confidence at most a quarter more. Without this option it is 0.1 for the default plan, and 0.25 for others. If"
+    "Take no plan that is further from the original, in units of what other noise changes; with 95 % confidence at"
+    " most a quarter further. Without this option it is 0.1 for the default plan, and 0.25 for others. If"
     " no plan is surely within 0.1, the original stays the default.",
 )
-@threads_option("Threads that the policy will have on the robot.")
+@threads_option("Time calls with so many threads: those that the policy will have on the robot.")
 @number_option("--minutes", MINUTES, "Be done in so many minutes, about, once it is compiled.", default=30.0)
 @click.option("--resume", is_flag=True, help="Go on where the same build was interrupted.")
 @lerobot_options

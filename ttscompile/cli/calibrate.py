@@ -56,14 +56,14 @@ from ttscompile.core.plan import SCHEDULE
     " noise changes; without this option it is what each that learns allows. With --learn loops: distance from the"
     " original that the default plan may have.",
 )
-@options.threads_option("Threads of the calls that --latency-ms is about.")
+@options.threads_option("Time the calls of --latency-ms with so many threads.")
 @click.option(
     "--strategy",
     type=click.Choice(NAMES),
     default=DEFAULT,
     help=f"Find the schedule by this strategy. {'; '.join(f'{one.name}: {one.source}' for one in STRATEGIES)}.",
 )
-@options.seed_option("Seed of the split, the noise and the training.")
+@options.seed_option("Draw the split, the noise and the training with this seed.")
 @options.number_option(
     "--max-minutes",
     MINUTES,

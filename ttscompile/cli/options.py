@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from ttscompile.cli.types import ANY_TEXT, FOLDER, PATH, PATH_OR_HUB, RATE, TEXT, NumberOption
+from ttscompile.runtimes.open import RUNTIMES
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -16,6 +17,9 @@ MOST_THREADS = 1024
 """onnxruntime makes as many as it is told."""
 MOST_SEED = 2**63 - 1
 """torch takes no larger one."""
+
+FAST = tuple(name for name, kind in RUNTIMES.items() if kind.held or kind.made)
+"""Runtimes that a command offers: the reference, whose arithmetic is that of fp32 alone, is slow."""
 
 artifact_argument = click.argument("directory", type=PATH)
 json_option = click.option(
@@ -86,9 +90,9 @@ lerobot_options = together(
 runtime_options = together(
     click.option(
         "--runtime",
-        type=click.Choice(["onnxruntime", "torch"]),
+        type=click.Choice(FAST),
         default="onnxruntime",
-        help="Runtime that executes the policy; torch needs the extra 'compile'.",
+        help="Execute the policy with this runtime; torch needs the extra 'compile'.",
     ),
     click.option(
         "--device", type=TEXT, help="Have --runtime torch compute on this device, as torch calls it: cpu, cuda."
@@ -125,8 +129,8 @@ def names_option(name: str, known: Sequence[str], *, default: str, help: str) ->
 policy_hz_option = number_option(
     "--policy-hz",
     RATE,
-    "Rate in Hz of the frames and actions that the policy was trained with. Without this option it is what the"
-    " recordings say, or that of --control-hz.",
+    "Play actions at this rate in Hz, that of the frames and actions of the training. Without this option it is what"
+    " the recordings say, or that of --control-hz.",
 )
 loop_options = together(
     policy_hz_option,

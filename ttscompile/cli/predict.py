@@ -66,7 +66,7 @@ def _numbers(_: click.Context, __: click.Parameter, value: str | None) -> Any:
 )
 @click.option("--plan", type=TEXT, help="Compute this plan. Without this option it is the default plan.")
 @click.option("--plot", "picture", type=PICTURE, help="Draw the chunk into this file (.png, .svg or .pdf).")
-@seed_option("Seed of the noise that the actions are made of.")
+@seed_option("Draw the noise that the actions are made of with this seed.")
 @json_option
 def predict(
     directory: Path,
