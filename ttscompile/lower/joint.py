@@ -24,11 +24,11 @@ def _join_blocks(blocks: Sequence[names.LoopPiece], own: Sequence[ModelProto]) -
     """
     joint = join([tuple(piece.contexts.values()) for piece in blocks])
     # Runtimes refuse a stream that changes its type; the sizes that are declared here then are those of every block.
-    stream = blocks[0].type
+    hidden = blocks[0].type
 
     def branch(first: int, stop: int, depth: int) -> GraphProto:
         name = f"{names.RESIDUAL}.{first}.{stop}" if depth else names.RESIDUAL
-        output = value_info(name, stream)
+        output = value_info(name, hidden)
         if stop - first == 1:
             places = dict(zip(blocks[first].contexts, joint.places[first], strict=True))
             return _leaf(own[first], {blocks[first].stream: names.STREAM, **places}, output, f"b{first}")
@@ -41,13 +41,13 @@ def _join_blocks(blocks: Sequence[names.LoopPiece], own: Sequence[ModelProto]) -
 
     root = branch(0, len(own), 0)
     inputs = [value_info(name, TensorType((), "bool")) for name in joint.switches]
-    inputs += [value_info(name, type_) for name, type_ in ((names.STREAM, stream), *joint.slots)]
+    inputs += [value_info(name, type_) for name, type_ in ((names.STREAM, hidden), *joint.slots)]
     graph = GraphProto(name=names.JOINT, node=root.node, input=inputs, output=root.output, initializer=root.initializer)
     return own_model(graph, opsets(own))
 
 
 def _chain_blocks(blocks: Sequence[names.LoopPiece], own: Sequence[ModelProto]) -> ModelProto:
-    stream = blocks[0].type
+    hidden = blocks[0].type
     contexts = {name: type_ for piece in blocks for name, type_ in piece.contexts.items()}
     nodes: list[NodeProto] = []
     weights: dict[str, TensorProto] = {}
@@ -55,7 +55,7 @@ def _chain_blocks(blocks: Sequence[names.LoopPiece], own: Sequence[ModelProto]) 
     last, *residuals = names.dense_step_outputs(len(blocks))
     for b, (block, model, residual) in enumerate(zip(blocks, own, residuals, strict=True)):
         inputs = {block.stream: before, **{name: names.CONTEXT + name for name in block.contexts}}
-        leaf = _leaf(model, inputs, value_info(residual, stream), f"b{b}")
+        leaf = _leaf(model, inputs, value_info(residual, hidden), f"b{b}")
         small = {tensor.name: f"b{b}.{tensor.name}" for tensor in leaf.initializer if tensor.raw_data}
         for tensor in leaf.initializer:
             tensor.name = small.get(tensor.name, tensor.name)
@@ -65,9 +65,9 @@ def _chain_blocks(blocks: Sequence[names.LoopPiece], own: Sequence[ModelProto]) 
         after = last if b == len(blocks) - 1 else f"{names.STREAM}.{b}"
         nodes += [*leaf.node, helper.make_node("Add", [before, residual], [after], name=f"add.{b}")]
         before = after
-    types = {names.STREAM: stream, **{names.CONTEXT + name: type_ for name, type_ in contexts.items()}}
+    types = {names.STREAM: hidden, **{names.CONTEXT + name: type_ for name, type_ in contexts.items()}}
     given = [value_info(name, type_) for name, type_ in types.items()]
-    made = [value_info(name, stream) for name in (last, *residuals)]
+    made = [value_info(name, hidden) for name in (last, *residuals)]
     graph = GraphProto(name=names.DENSE_STEP, node=nodes, input=given, output=made, initializer=weights.values())
     return own_model(graph, opsets(own))
 

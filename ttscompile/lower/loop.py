@@ -4,10 +4,10 @@
         sums = coefficients @ residuals, one row a gap between computed blocks
         for each group of blocks, if any of it is computed:                  If
             for each block, if it is computed:                               If
-                stream += its gap's sum;  stream += block(stream)
-        stream += the last gap's sum;  advance
+                hidden += its gap's sum;  hidden += block(hidden)
+        hidden += the last gap's sum;  advance
         for each step that follows without a computed block:                 Loop
-            stream += the step's sum, made again if it is another;  advance
+            hidden += the step's sum, made again if it is another;  advance
 
 Each block is in the model once, as the branch ``block_07`` beside the branch ``block_07_reused``. Weights lie in the
 branch that reads them, where onnxruntime packs them. The loop is written anew here on purpose: the file runs without
@@ -70,13 +70,13 @@ class _State:
     """What a step hands to the next; the sample as ``[D, B, T]``; ``memory`` is empty or the sampler's memories."""
 
     sample: str
-    stream: str
+    hidden: str
     history: str
     memory: tuple[str, ...]
 
     @property
     def values(self) -> tuple[str, ...]:
-        return (self.sample, self.stream, self.history, *self.memory)
+        return (self.sample, self.hidden, self.history, *self.memory)
 
 
 @dataclass(frozen=True)
@@ -113,14 +113,14 @@ class DenoisingLoop:
         columns = {name: getattr(self._sampler, name)[:, None] for name in names.X0_COLUMNS}
         self._x0_columns = {name: main.constant(column, np.float32) for name, column in columns.items()}
         stem = self._feeds(main, self._pieces.stem, inputs.initial, main.constant(0))
-        (stream,) = main.inline(self._models[names.STEM], stem, self._weights)
-        self._shape = main.op("Shape", stream)
+        (hidden,) = main.inline(self._models[names.STEM], stem, self._weights)
+        self._shape = main.op("Shape", hidden)
         width = main.op("ReduceProd", self._shape, keepdims=1)
         self._none = main.op("ConstantOfShape", main.op("Concat", main.constant([0]), width, axis=0))
         count = main.constant([len(self._groups)])
         table = main.op("ConstantOfShape", main.op("Concat", count, width, axis=0))
         memory = (inputs.memory,) if inputs.memory is not None else ()
-        first = _State(main.op("Transpose", inputs.initial, perm=[2, 0, 1]), stream, inputs.history, memory)
+        first = _State(main.op("Transpose", inputs.initial, perm=[2, 0, 1]), hidden, inputs.history, memory)
         carried = [*first.values, table, main.op("SequenceEmpty")]
         body = self._computed_step()
         state = main.ops("Loop", [plan.computed_steps, "", *carried], len(carried), body=body)
@@ -136,7 +136,7 @@ class DenoisingLoop:
         rows = (plan.computed, plan.position, plan.in_step, plan.first_row)
         computed, position, in_step, first_row = (w.op("Gather", row, k) for row in rows)
         step = _Step(k, computed, position, in_step, first_row, self._sums(w, k, table))
-        value, made = state.stream, list[str]()
+        value, made = state.hidden, list[str]()
         starts = range(0, len(self._groups), GROUP)
         flags = _flags(w, w.op("Gather", plan.any_of_group, k), range(len(starts)))
         for start, flag in zip(starts, flags, strict=True):
@@ -148,7 +148,7 @@ class DenoisingLoop:
         value = w.op("Add", value, w.op("Reshape", last, self._shape))
         value = self._add_in_step(w, step, value, made, len(self._groups))
         arrays = [tensor(name, np.float32) for name in (*state.values, table)]
-        state = self._advance(w, replace(state, stream=value), k)
+        state = self._advance(w, replace(state, hidden=value), k)
         fresh = w.op("Concat", *made, axis=0)
         renewed = w.op("ScatterND", table, w.op("Transpose", w.op("NonZero", step.computed), perm=[1, 0]), fresh)
         idle = self._idle_step(w, k, renewed)
@@ -172,8 +172,8 @@ class DenoisingLoop:
         same = again.op("Identity", last)
         made = anew.op("Reshape", self._sums(anew, k, table), anew.constant([-1]))
         (total,) = w.choose(w.op("Gather", plan.same, k), again.body("again", same), anew.body("anew", made))
-        value = w.op("Add", state.stream, w.op("Reshape", total, self._shape))
-        state = self._advance(w, replace(state, stream=value), k)
+        value = w.op("Add", state.hidden, w.op("Reshape", total, self._shape))
+        state = self._advance(w, replace(state, hidden=value), k)
         out = [w.op("Identity", on), *state.values, total]
         return w.graph(
             "idle_step",
@@ -196,49 +196,49 @@ class DenoisingLoop:
         any_rollout = w.op("Gather", plan.any_rollout, k)
         return w.choose(any_rollout, mixed.body("mixed", both), plain.body("plain", total))[0]
 
-    def _group(self, step: _Step, stream: str, before: Sequence[str], members: range) -> GraphProto:
+    def _group(self, step: _Step, hidden: str, before: Sequence[str], members: range) -> GraphProto:
         """Neighbouring blocks of which some are computed; gives the residual stream and the computed residuals."""
         w = self._main.inner()
-        value, made = stream, list[str]()
+        value, made = hidden, list[str]()
         for b, flag in zip(members, _flags(w, step.computed, members), strict=True):
             block, reused = self._block(step, value, [*before, *made], b), self._reused(w, value, names.block_name(b))
             value, residual = w.choose(flag, block, reused)
             made.append(residual)
         return w.body(f"group_{members.start}", value, w.op("Concat", *made, axis=0))
 
-    def _block(self, step: _Step, stream: str, before: Sequence[str], b: int) -> GraphProto:
+    def _block(self, step: _Step, hidden: str, before: Sequence[str], b: int) -> GraphProto:
         """The gap before a computed block, and the block; gives the residual stream and the residual as a row."""
         w = self._main.inner()
         gap = w.op("Gather", step.sums, w.op("Gather", step.position, w.constant(b)))
-        value = w.op("Add", stream, w.op("Reshape", gap, self._shape))
+        value = w.op("Add", hidden, w.op("Reshape", gap, self._shape))
         value = self._add_in_step(w, step, value, before, b)
         name, piece = names.block_name(b), self._pieces.blocks[b]
         (residual,) = w.inline(self._models[name], self._feeds(w, piece, value, step.k), self._weights)
         value = w.op("Add", value, residual)
         return w.body(name, value, w.op("Reshape", residual, w.constant([1, -1])))
 
-    def _reused(self, w: GraphWriter, stream: str, name: str) -> GraphProto:
+    def _reused(self, w: GraphWriter, hidden: str, name: str) -> GraphProto:
         """The other branch: the residual stream as it is, and no residuals. What is reused is in the gaps' sums."""
         inner = w.inner()
-        return inner.body(f"{name}_reused", inner.op("Identity", stream), inner.op("Identity", self._none))
+        return inner.body(f"{name}_reused", inner.op("Identity", hidden), inner.op("Identity", self._none))
 
-    def _add_in_step(self, w: GraphWriter, step: _Step, stream: str, before: Sequence[str], b: int) -> str:
+    def _add_in_step(self, w: GraphWriter, step: _Step, hidden: str, before: Sequence[str], b: int) -> str:
         """Add, in the gap before block b, FORWARD reads of residuals that the step itself has computed.
 
         The residuals of the blocks ``before`` b are rows of those that were computed; b is the number of blocks for the
         step's last gap.
         """
         if not any(group in self._groups[:c] for c, group in enumerate(self._groups[:b])):
-            return stream  # no block before b has one of its group before it
+            return hidden  # no block before b has one of its group before it
         plain, reads = w.inner(), w.inner()
-        same = plain.op("Identity", stream)
+        same = plain.op("Identity", hidden)
         gap = reads.op("Add", step.first_row, reads.op("Gather", step.position, reads.constant(b)))
         bounds = reads.constant([0]), reads.constant([b])
         row = reads.op("Slice", reads.op("Gather", self._plan.from_step, gap), *bounds)
         share = reads.op("Compress", row, reads.op("Slice", step.computed, *bounds))
         row = reads.op("Unsqueeze", share, reads.constant([0]))
         total = reads.op("MatMul", row, reads.op("Concat", *before, axis=0))
-        added = reads.op("Add", stream, reads.op("Reshape", total, self._shape))
+        added = reads.op("Add", hidden, reads.op("Reshape", total, self._shape))
         in_step = w.op("Gather", step.in_step, w.constant(b))
         return w.choose(in_step, reads.body("in_step", added), plain.body("plain", same))[0]
 
@@ -248,7 +248,7 @@ class DenoisingLoop:
 
     def _advance(self, w: GraphWriter, state: _State, k: str) -> _State:
         by_step = {names.OFFSET: self._inputs.offset, names.UPDATE: self._inputs.update, **self._x0_columns}
-        feeds = {names.STREAM: state.stream, names.SAMPLE: state.sample, names.HISTORY: state.history}
+        feeds = {names.STREAM: state.hidden, names.SAMPLE: state.sample, names.HISTORY: state.history}
         feeds |= zip([names.MEMORY] * len(state.memory), state.memory, strict=True)
         feeds |= {name: w.op("Gather", values, k) for name, values in by_step.items()}
         if self._inputs.jumps is not None:
@@ -258,10 +258,10 @@ class DenoisingLoop:
         for name, piece, at in ((names.TAIL, self._pieces.tail, k), (names.STEM, self._pieces.stem, following)):
             for context, type_ in piece.contexts.items():
                 feeds[names.advance_context(name, context)] = self._contexts.value(w, context, at, type_)
-        sample, stream, prediction, *memory = w.inline(self._models[names.ADVANCE], feeds, self._weights)
+        sample, hidden, prediction, *memory = w.inline(self._models[names.ADVANCE], feeds, self._weights)
         is_anchor = w.op("Gather", self._inputs.anchors, k)
         history = self._remembered(w, is_anchor, state.sample, prediction, state.history)
-        return _State(sample, stream, history, tuple(memory))
+        return _State(sample, hidden, history, tuple(memory))
 
     def _jumped(self, w: GraphWriter, jumps: str, offset: str, history: str, k: str) -> str:
         """The offset of step k with the jump that ends there, if one does: ``Correction.jump`` in ONNX."""
@@ -295,10 +295,10 @@ class DenoisingLoop:
         same = other.op("Identity", history)
         return w.choose(is_anchor, anchor.body("anchor", longer), other.body("other", same))[0]
 
-    def _feeds(self, w: GraphWriter, piece: names.LoopPiece, stream: str, k: str) -> dict[str, str]:
+    def _feeds(self, w: GraphWriter, piece: names.LoopPiece, hidden: str, k: str) -> dict[str, str]:
         """A value for each input of the stem or a block: the sample or stream, then contexts."""
         contexts = {name: self._contexts.value(w, name, k, type_) for name, type_ in piece.contexts.items()}
-        return {piece.stream: stream, **contexts}
+        return {piece.stream: hidden, **contexts}
 
 
 def _flags(w: GraphWriter, vector: str, which: range) -> list[str]:

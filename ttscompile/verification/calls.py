@@ -100,9 +100,9 @@ def _reference_blocks(reference: Any, obs: Mapping[str, npt.NDArray[Any]]) -> An
     with torch.no_grad():
         contexts = reference.model.prologue({key: torch.from_numpy(value) for key, value in obs.items()})
 
-    def residual(b: int, k: int, stream: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def residual(b: int, k: int, hidden: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         with torch.no_grad():
-            made: npt.NDArray[np.float32] = reference.model.block(b, k, torch.from_numpy(stream), contexts).numpy()
+            made: npt.NDArray[np.float32] = reference.model.block(b, k, torch.from_numpy(hidden), contexts).numpy()
         return made
 
     return residual

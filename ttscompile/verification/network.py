@@ -55,20 +55,20 @@ class Probe:
 
     def evaluate(self, sample: FloatArray, k: int) -> FloatArray:
         """The network's prediction at step k, ``[B, T, D]`` of ``[B, T, D]``."""
-        stream = self.stem(sample, k)
+        hidden = self.stem(sample, k)
         for b in range(len(self._manifest.blocks)):
-            stream = stream + self.block(b, k, stream)
-        return self.tail(stream, k)
+            hidden = hidden + self.block(b, k, hidden)
+        return self.tail(hidden, k)
 
     def stem(self, sample: FloatArray, k: int) -> FloatArray:
         """The residual stream of step k."""
         return self._run(STEM, np.ascontiguousarray(sample), k)
 
-    def block(self, b: int, k: int, stream: FloatArray) -> FloatArray:
+    def block(self, b: int, k: int, hidden: FloatArray) -> FloatArray:
         """The residual of block b at step k."""
-        return self._run(block_name(b), stream, k)
+        return self._run(block_name(b), hidden, k)
 
-    def layers(self, k: int, stream: FloatArray) -> dict[str, FloatArray]:
+    def layers(self, k: int, hidden: FloatArray) -> dict[str, FloatArray]:
         """What each layer of the one block gives at step k, by the layer's name, in the order of execution.
 
         Empty where the artifact has no such piece.
@@ -78,12 +78,12 @@ class Probe:
             return {}
         if LAYERS not in self._sessions:
             self._sessions |= self._pool.of_layers(self._view)
-        feed = {name: stream if name == record.stream else self._contexts.at(name, k) for name in record.inputs}
+        feed = {name: hidden if name == record.stream else self._contexts.at(name, k) for name in record.inputs}
         return run_named(self._sessions[LAYERS], record.outputs, feed)
 
-    def tail(self, stream: FloatArray, k: int) -> FloatArray:
+    def tail(self, hidden: FloatArray, k: int) -> FloatArray:
         """The prediction at step k, ``[B, T, D]``; what else ``advance`` computes is left aside."""
-        feed = {**self._tail_blanks, STREAM: stream}
+        feed = {**self._tail_blanks, STREAM: hidden}
         own = {name: advance_context(TAIL, name) for name in self._manifest.pieces[ADVANCE].contexts}
         feed |= {own[name]: self._contexts.at(name, k) for name in own if own[name] in feed}
         return run_named(self._sessions[ADVANCE], [PREDICTION], feed)[PREDICTION].transpose(1, 2, 0)
@@ -107,22 +107,22 @@ class Probe:
         memory = np.zeros((dimensions, self.streams, sampler.memories * horizon), np.float32)
         samples, predictions = [], []
         for k in range(sampler.steps):
-            stream = self.stem(sample.transpose(1, 2, 0), k)
+            hidden = self.stem(sample.transpose(1, 2, 0), k)
             for b, block in enumerate(blocks):
                 sources, axis, group = plan[:, k, b], block.type.batch_axis, groups[b]
-                mask_shape = [1] * stream.ndim
+                mask_shape = [1] * hidden.ndim
                 if axis is not None:
                     mask_shape[axis] = self.streams
                 computing, forwarding = (
                     (sources == source).reshape(mask_shape) if axis is not None else sources[0] == source
                     for source in (Source.COMPUTE, Source.FORWARD)
                 )
-                computed = self.block(b, k, stream) if np.any(computing) else np.zeros_like(stream)
+                computed = self.block(b, k, hidden) if np.any(computing) else np.zeros_like(hidden)
                 own_last, shared_last = own.get(b, computed), shared.get(group, computed)
                 residual = np.where(computing, computed, np.where(forwarding, shared_last, own_last))
                 own[b], shared[group] = (np.where(computing, computed, old) for old in (own_last, shared_last))
-                stream = stream + residual
-            prediction = self.tail(stream, k).transpose(2, 0, 1)
+                hidden = hidden + residual
+            prediction = self.tail(hidden, k).transpose(2, 0, 1)
             parts = [sample, prediction, history]
             if (clip := clip_of(sampler)) is not None:
                 denoised = sampler.sample_to_x0[k] * sample + sampler.out_to_x0[k] * prediction
@@ -211,11 +211,11 @@ def block_errors(
     norms = np.linalg.norm(golden.residuals.astype(np.float64), axis=(2, 3))
     errors = np.zeros((len(rows), len(manifest.blocks)))
     for b, block in enumerate(manifest.blocks):
-        stream = probe_stream(b, block.type, golden.streams, float(golden.scales[b]))
+        hidden = probe_stream(b, block.type, golden.streams, float(golden.scales[b]))
         # A block may give nothing at some step, or at all: then what counts is the residual stream that it is added to.
-        floor = max(1e-3 * float(norms[:, b].max()), 1e-6 * float(np.linalg.norm(stream)))
+        floor = max(1e-3 * float(norms[:, b].max()), 1e-6 * float(np.linalg.norm(hidden)))
         for i, row in enumerate(rows.tolist()):
-            found = project(function(b, int(golden.steps[row]), stream), block.type.batch_axis)
+            found = project(function(b, int(golden.steps[row]), hidden), block.type.batch_axis)
             difference = float(np.linalg.norm(found.astype(np.float64) - golden.residuals[row, b]))
             errors[i, b] = difference / max(float(norms[row, b]), floor) if np.isfinite(difference) else np.inf
     return errors
@@ -259,9 +259,9 @@ def _first_layer(manifest: Manifest, golden: Golden, probe: Probe) -> tuple[str 
     """The first layer inside the one block whose result differs, by name and in words; None where none can be named."""
     if golden.layers is None:
         return None, ""
-    stream = probe_stream(0, manifest.blocks[0].type, golden.streams, float(golden.scales[0]))
+    hidden = probe_stream(0, manifest.blocks[0].type, golden.streams, float(golden.scales[0]))
     for k, expected in zip(golden.evaluated.tolist(), golden.layers, strict=True):
-        for (name, result), one in zip(probe.layers(k, stream).items(), expected, strict=True):
+        for (name, result), one in zip(probe.layers(k, hidden).items(), expected, strict=True):
             if not relative(project(result, None)[0], one) <= RESIDUAL:
                 return name, f". Inside it {name!r} is the first layer that differs, at step {k}"
     shown = ", ".join(map(str, golden.evaluated.tolist()))
