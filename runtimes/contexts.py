@@ -34,10 +34,7 @@ class ContextValues:
     ) -> None:
         self._manifest, self._module, self._zeros, self.streams = manifest, module, zeros, streams
         self._of_all_steps: dict[str, Any] = {}  # as the step piece reads them
-        # Views of values, and of those: a small network's call takes a tenth longer if each makes them anew.
-        self._repeated: dict[str, tuple[Any, Any]] = {}
-        self._by_step: dict[str, Any] = {}
-        self._rows: list[Any] = []
+        self._by_step: dict[str, Any] = {}  # views of values, as it gives them: made anew, a tenth of a small call
         self.values: dict[str, Any] = {}
         for name, context in manifest.contexts.items():
             steps = (manifest.steps,) if self.is_stepwise(name) else ()
@@ -51,11 +48,9 @@ class ContextValues:
 
     def features(self) -> Any:
         """What a correction reads of the condition, one row of numbers a stream, ``[B, N]``."""
-        if not self._rows:
-            contexts, move = self._manifest.contexts, self._module.moveaxis
-            names = self._manifest.features
-            self._rows = [move(self.values[name], contexts[name].type.batch_axis or 0, 0) for name in names]
-        return self._module.concatenate([row.reshape(self.streams, -1) for row in self._rows], 1)
+        contexts, move = self._manifest.contexts, self._module.moveaxis
+        rows = [move(self.values[name], contexts[name].type.batch_axis or 0, 0) for name in self._manifest.features]
+        return self._module.concatenate([row.reshape(self.streams, -1) for row in rows], 1)
 
     def keep(self, made: Iterable[tuple[str, Any]]) -> None:
         """Keep what the condition piece gave."""
@@ -75,14 +70,12 @@ class ContextValues:
             return self._of_all_steps[name]
         if axis is None:
             return value
+        before, after = tuple(value.shape[:axis]), tuple(value.shape[axis + 1 :])
         if name not in self._of_all_steps:
-            before, after = tuple(value.shape[:axis]), tuple(value.shape[axis + 1 :])
-            whole = self._zeros((*before, steps * self.streams, *after), self._manifest.contexts[name].type.dtype)
-            each = value[(*(slice(None),) * axis, None)]  # [..., 1, B, ...]
-            self._repeated[name] = whole.reshape(*before, steps, self.streams, *after), each
-            self._of_all_steps[name] = whole
-        by_step, each = self._repeated[name]
-        by_step[...] = each
+            whole = (*before, steps * self.streams, *after)
+            self._of_all_steps[name] = self._zeros(whole, self._manifest.contexts[name].type.dtype)
+        by_step = self._of_all_steps[name].reshape(*before, steps, self.streams, *after)
+        by_step[...] = value[(*(slice(None),) * axis, None)]  # [..., 1, B, ...]
         return self._of_all_steps[name]
 
     def keep_steps(self, made: Iterable[tuple[str, Any]]) -> None:

@@ -60,10 +60,10 @@ def build(
     other plans take at most a fifth longer than the fastest, the nearest of them is chosen.
 
     All is done in a folder beside ``directory``. It stays until the next build where there is a state to go on from.
+    ``checkpoint``, ``directory`` and ``explain`` are those of ``convert``; ``observation``, ``progress`` and ``ray``
+    those of ``calibrate``.
 
     Args:
-        checkpoint: see ``convert``.
-        directory: see ``convert``.
         trajectories: recorded episodes; see ``calibrate``. Without any those are taken that the policy was trained on
             (``frontends.recordings_of``).
         control_hz: rate of a control loop that the policy has to keep up with, in the executor's own settings. The
@@ -77,10 +77,6 @@ def build(
         max_minutes: by the clock, for all but the conversion.
         seed: of everything random.
         resume: go on where the same build was interrupted.
-        observation: see ``calibrate``.
-        progress: see ``calibrate``.
-        ray: see ``calibrate``.
-        explain: see ``convert``.
         of_checkpoint: ``format``, ``task``, ``encoders``, ``without_cameras`` and ``base`` of ``convert``.
 
     Raises:

@@ -169,12 +169,9 @@ class PrunedCall(CallModule):
     def forward(
         self, obs: Mapping[str, Tensor], initial: Tensor, steps: Tensor | None = None, rollout: Rollout | None = None
     ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Rollout]:
-        """One call.
+        """One call. ``obs``, ``initial`` and ``steps`` are those of ``SparseCall.forward``.
 
         Args:
-            obs: see ``SparseCall.forward``, as ``initial`` and ``steps``.
-            initial: its noise.
-            steps: that of its steps.
             rollout: what the call before gave, or ``empty_rollout`` in the first call of an episode. Without it no
                 residual of an earlier call is there, and cells that want one have TIMESTEP.
 
