@@ -17,6 +17,8 @@ NOISE = 0.05
 """Standard deviation of every channel of every pixel, of 0..1."""
 SHAKE = 0.01
 """Metres, standard deviation of the place of both cameras, anew in each frame."""
+SWAY, PERIOD = 0.02, 25
+"""Metres that both cameras sway to each side, and steps that they take there and back: 1 s."""
 LATE = 2
 """Steps by which pictures are behind the state: 0.08 s."""
 CHANGES, MOVES, LONGER = 16, 12, 100
@@ -111,12 +113,26 @@ class Shaken(Seeded):
     def observe(self) -> Frame:
         """From cameras that are not where they were."""
         places = self._model.cam_pos.copy()
-        self._model.cam_pos += self._random().normal(0, SHAKE, places.shape)
+        self._model.cam_pos += self._moved(places.shape)
         mujoco.mj_forward(self._model, self._data)
         frame = super().observe()
         self._model.cam_pos[:] = places
         mujoco.mj_forward(self._model, self._data)
         return frame
+
+    def _moved(self, shape: tuple[int, ...]) -> Array:
+        return self._random().normal(0, SHAKE, shape)
+
+
+class Swaying(Shaken):
+    """Both cameras sway, as on a torso that does not stand still: along each axis with a phase of the seed."""
+
+    title = "Fetch with blocks, cameras that sway"
+
+    def _moved(self, shape: tuple[int, ...]) -> Array:
+        seed, step = self._now
+        phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, shape)
+        return SWAY * np.sin(2 * np.pi * step / PERIOD + phases)
 
 
 class Late(FetchBlocks):
@@ -225,6 +241,7 @@ DISTURBED: dict[str, type[FetchBlocks]] = {
     "dark": Dark,
     "noisy": Noisy,
     "shaken": Shaken,
+    "swaying": Swaying,
     "late": Late,
     "long": Long,
     "changed": Changed,
