@@ -22,8 +22,8 @@ from ttscompile.report.build import figure
 def verify(context: click.Context, directory: Path, trajectories: Recordings, sources: Sources, as_json: bool) -> None:
     """Check the artifact DIRECTORY against the answers of the original network that it holds.
 
-    Neither the checkpoint nor PyTorch is needed. Without --trajectories the error of the plans is shown, and not
-    judged. The exit status is 1 if a check failed; the output says where, and what to do.
+    Neither the checkpoint nor PyTorch is needed. How far plans are from the original is told with --trajectories alone.
+    The exit status is 1 if a check failed; the output says where, and what to do.
     """
     console = progress()
     with only_results_on_stdout(), console.status("verifying") as status:
