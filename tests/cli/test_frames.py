@@ -45,6 +45,7 @@ def test_bench_says_how_much_of_a_call_is_frames(seeing: Path, toy_compiled: Pat
     assert told not in run("bench", toy_compiled, "--calls", 1)
 
 
+@pytest.mark.slow
 def test_bench_says_that_plans_which_reuse_tokens_compute_all_of_them(once: Once, tmp_path: Path) -> None:
     folder = shutil.copytree(cameras.compiled_tokens(once) / "artifact", tmp_path / "own")
     artifact = load_artifact(folder)

@@ -27,6 +27,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return policies.record(tmp_path_factory.mktemp("calls") / "calls.npz", 8)
 
 
+@pytest.mark.slow
 def test_it_prints_a_row_for_each_number_of_episodes(once: Once, recorded: Path) -> None:
     words = [str(policies.compiled(once)), "-t", str(recorded), "--step", "3", "--episodes", "2", "--episodes", "50"]
     words += ["--calls", "8", "--judged", "8", "--draws", "2"]

@@ -64,6 +64,7 @@ def test_another_plan_is_seen(calibrated: Path, four_steps: Path, monkeypatch: p
     assert rows[0].difference == 0 < rows[1].difference
 
 
+@pytest.mark.slow
 def test_what_was_not_calibrated_is_refused(four_steps: Path) -> None:
     with pytest.raises(click.ClickException, match="its default plan is 'full'. Calibrate it first"):
         beside(sys.executable, four_steps, four_steps, rounds=1)

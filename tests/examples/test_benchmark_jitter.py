@@ -14,6 +14,7 @@ from tests.once import Once
 from tests.runtimes.toys import toy_program, written_artifact
 
 
+@pytest.mark.slow
 def test_the_loop_is_measured_alone_and_beside_the_plan(once: Once) -> None:
     compiled: Path = once.folder("toy", lambda directory: written_artifact(toy_program(), directory))
     words = [str(compiled), "--policy-hz", "10", "--seconds", "0.2"]

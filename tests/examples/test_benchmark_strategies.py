@@ -79,6 +79,7 @@ def test_bad_lists_are_refused(arguments: list[str], option: str, value: str, me
     assert message in result.stderr
 
 
+@pytest.mark.slow
 def test_calls_in_a_row_are_timed_and_told(tiny_artifact: Path) -> None:
     result = CliRunner().invoke(in_a_row.main, [str(tiny_artifact), "--calls", "1", "--in-a-row", "2"])
     assert result.exit_code == 0, result.stderr

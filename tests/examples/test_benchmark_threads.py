@@ -52,6 +52,7 @@ def test_what_was_timed_alone_is_known_by_its_threads(tmp_path: Path) -> None:
     assert found()[1] == [3.0, 0.5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [False, True])
 def test_all_contestants_are_in_one_table(
     once: Once, tmp_path: Path, capsys: pytest.CaptureFixture[str], before: bool

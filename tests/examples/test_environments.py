@@ -124,6 +124,7 @@ def test_an_episode_of_rest_ends_at_its_limit(environment: Environment) -> None:
     assert environment.hz > 0
 
 
+@pytest.mark.slow
 def test_the_picture_is_of_now(environment: Environment) -> None:
     pictures = []
     for seed, steps in ((0, STEPS), (1, STEPS), (0, STEPS), (0, 1)):
@@ -215,6 +216,7 @@ class Arm(nn.Module):
         return self.head(x)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(missing("fetch") is not None, reason="NO TESTS OF FETCH: gymnasium_robotics is not installed")
 def test_a_policy_of_several_tasks_is_recorded_calibrated_and_evaluated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -72,6 +72,7 @@ def demonstrations() -> ModuleType:
     return script(FOLDER, "demonstrations")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Constant.s. may be too high")
 def test_the_experts_succeed_although_they_are_pushed(demonstrations: ModuleType) -> None:
     environment = demonstrations.MetaWorld()

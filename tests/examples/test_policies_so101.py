@@ -52,6 +52,7 @@ def demonstrations() -> ModuleType:
     return script(FOLDER, "demonstrations")
 
 
+@pytest.mark.slow
 def test_the_script_succeeds_although_it_is_pushed(demonstrations: ModuleType) -> None:
     world, first = demonstrations.SO101(), demonstrations.FIRST_SEED
     episodes = [demonstrations.demonstrate(world, first + number) for number in range(6)]

@@ -37,6 +37,7 @@ def test_a_head_computes_what_the_original_computes(name: str) -> None:
     assert_equal_but_for_rounding(made, arrays[family.prediction], counted.terms, counted.angle)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", first_quick(name for name in FAMILIES if name not in LOWERED))
 def test_its_blocks_are_found(name: str) -> None:
     family = FAMILIES[name]()

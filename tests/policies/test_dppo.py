@@ -88,6 +88,7 @@ def test_one_network_is_enough_where_all_steps_or_none_are_tuned(tmp_path: Path)
             assert torch.equal(value, saved[variant][f"{name}.{key}"])
 
 
+@pytest.mark.slow
 def test_noise_has_the_deviation_of_the_evaluation(tmp_path: Path) -> None:
     """Not that with which training explores; and never the least one, 0.001, with as many timesteps as there may be."""
     model = dppos.configuration("mlp")["model"] | {"denoising_steps": 1000}

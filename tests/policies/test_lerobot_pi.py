@@ -74,6 +74,7 @@ def test_pi05_is_told_its_state_in_words_as_lerobot_tells_it(
     assert lines == golden[f"pi05.prompts.{mode}"].tolist()
 
 
+@pytest.mark.slow
 def test_convert_says_where_a_policy_takes_no_text(tmp_path: Path) -> None:
     directory = pis.save("pi0", tmp_path / "policy")
     told = CliRunner().invoke(
@@ -83,6 +84,7 @@ def test_convert_says_where_a_policy_takes_no_text(tmp_path: Path) -> None:
     assert "--encoders DIR" in told.stderr
 
 
+@pytest.mark.slow
 def test_pi05_takes_its_task_as_text(tmp_path: Path) -> None:
     """What it answers is what it answers to the tokens of the whole line; in LeRobot's commands, too."""
     directory = pis.save("pi05", tmp_path / "policy", prompt=True)

@@ -144,6 +144,7 @@ def test_the_change_is_added_as_peft_scales_it(
     assert_same(found, network(by_hand(base, change)), network(base), 2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:normaliser of observation.state")
 def test_the_artifact_is_that_of_the_merged_policy(base: Path, tmp_path: Path) -> None:
     """Its identity is; and of the base another."""

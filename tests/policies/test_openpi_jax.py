@@ -62,6 +62,7 @@ def test_a_camera_that_the_robot_lacks_is_masked(tmp_path: Path, kind: str) -> N
     assert np.abs(found - golden[f"{kind}.0"][..., : openpis.ACTION_DIM]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_what_is_merged_is_said_and_matters(tmp_path: Path) -> None:
     checkpoint, words = unpack("pi0", tmp_path), openpis.save_tokenizer(tmp_path)
     with pytest.warns(UserWarning, match=r"Adapters .LoRA. are merged with the scale 1, alpha = rank"):

@@ -75,6 +75,7 @@ def counts(policy: CompiledPolicy) -> tuple[int, int]:
     return policy.last_report.frames.scenes, policy.last_report.frames.scenes_remembered
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pi0", "smolvla", "evo1", "groot", "vla_jepa", "xvla"])
 def test_another_state_computes_no_language_model(make: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = make(name)
@@ -106,6 +107,7 @@ def test_another_state_computes_no_language_model(make: Any, name: str, monkeypa
         np.testing.assert_allclose(act(other, obs), found, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_words_of_pi05_tell_its_state(make: Any) -> None:
     """So its scene stands as long as they do."""
     seen = make("pi05")
@@ -120,6 +122,7 @@ def test_the_words_of_pi05_tell_its_state(make: Any) -> None:
         np.testing.assert_allclose(act(other, {**obs, TOKENS: obs[TOKENS] ^ 1}), found, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_where_the_language_model_reads_the_state_it_is_told(make: Any) -> None:
     seen = make("eo1")
     assert seen.told[-1].endswith(f" MFLOP in every call, since they read %{STATE}")

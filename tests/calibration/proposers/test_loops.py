@@ -177,6 +177,7 @@ def score_of(distance: float) -> Score:
     return Score(distance, (distance, distance), None, None, 0.0, 0.0, 0.0, 1)
 
 
+@pytest.mark.slow
 def test_a_slow_original_is_left_out_where_the_fastest_plan_is_near(
     directory: Path, recording: Path, timed: None
 ) -> None:
