@@ -169,6 +169,7 @@ def test_tokens_are_given_by_the_task_where_a_text_gives_them() -> None:
     assert _option("mask", replace(spec, instruction=Instruction("tokens", "mask", new_line=False))) == "--task TEXT"
 
 
+@pytest.mark.slow
 def test_pictures_state_and_an_archive_together(once: Once, tmp_path: Path) -> None:
     artifact = once.folder("seeing", cameras.compile_seeing) / "artifact"
     shown = picture(tmp_path / "a.png", cameras.SIDE, cameras.SIDE)

@@ -26,6 +26,7 @@ def test_what_is_linear_is_fitted() -> None:
     np.testing.assert_allclose(first_actions._fitted(known, known @ matrix + 3, asked), asked @ matrix + 3, atol=0.02)
 
 
+@pytest.mark.slow
 def test_both_loops_are_told_of_and_the_last_evaluation_knows_all(planned: Path, calls: Path) -> None:
     asked = [str(planned), "--trajectories", str(calls), "--fitted", "24", "--judged", "8"]
     result = CliRunner().invoke(first_actions.main, [*asked, "--json"], catch_exceptions=False)

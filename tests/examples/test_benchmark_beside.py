@@ -46,6 +46,7 @@ class Late:
         return self._policy.predict_action(obs, noise=noise)["action_pred"][0], [1.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fp32", [True, False])
 def test_everybody_sees_new_pictures_and_is_told_beside_the_first(
     once: Once, tmp_path: Path, capsys: pytest.CaptureFixture[str], fp32: bool

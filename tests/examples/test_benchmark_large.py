@@ -84,6 +84,7 @@ def test_what_is_written_is_read(tmp_path: Path, name: str, shape: tuple[int, ..
     assert large.saved(tmp_path, name) == (directory, task)
 
 
+@pytest.mark.slow
 def test_of_vla_jepa_the_language_model_alone_is_in_bf16(tmp_path: Path) -> None:
     directory, _ = large.saved(tmp_path, "vla_jepa")
     halved = {name: value.dtype == torch.bfloat16 for name, value in load_file(directory / "model.safetensors").items()}

@@ -159,6 +159,7 @@ class Cluster:
             yield run(part)
 
 
+@pytest.mark.slow
 def test_a_cluster_runs_the_episodes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tiny_artifact: Path) -> None:
     def evaluated(make: Any, opened: Any, seeds: Any, batch: Any, finished: Any, caches: Any) -> None:
         raise click.ClickException(f"kept: {[cache.read(seed).seed for cache in caches for seed in seeds]}")

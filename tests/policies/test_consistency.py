@@ -138,6 +138,7 @@ def student(tmp_path_factory: pytest.TempPathFactory) -> tuple[Program, Path]:
 # Settings
 
 
+@pytest.mark.slow
 def test_another_method_in_its_place(build: Build) -> None:
     """Euler, and the fourth order, of as many steps as the bins leave, or of fewer."""
     own = build("heun")[1].sampler

@@ -95,6 +95,7 @@ def test_the_state_in_every_token_and_one_token_an_image(tmp_path: Path) -> None
     assert_equal_but_for_rounding(made, arrays["padded_tokens"], counted.terms, counted.angle)
 
 
+@pytest.mark.slow
 def test_the_sampler_is_the_configurations_or_the_one_that_is_asked_for(tmp_path: Path) -> None:
     path = save(tmp_path, weights(), train_diffusion_steps=50, eval_diffusion_steps=5)
     assert_loops(path, ("ddim", 5, 40), ("dpmsolver++", 3), "dit_policy")

@@ -132,6 +132,7 @@ def test_where_the_language_model_reads_the_state_it_is_told(make: Any) -> None:
     assert "scene" not in rows
 
 
+@pytest.mark.slow
 def test_what_is_known_of_a_scene_is_told(make: Any) -> None:
     (table,) = hoisting(load_artifact(make("smolvla").path)).tables
     rows = {row[0]: row for row in table.rows}
