@@ -110,7 +110,9 @@ def with_plan_of(other: Path, artifact: Path, into: Path) -> str:
     arrays = {key: array for stored in other.glob("plans-*.safetensors") for key, array in load_file(stored).items()}
     if name not in arrays:
         raise click.ClickException(f"{other}: its default plan is {name!r}. Calibrate it first.")
-    parts = {key.rpartition("/")[2]: arrays[key] for key in arrays if key.startswith(f"correction/{name}/")}
+    parts: dict[str, Any] = {
+        key.rpartition("/")[2]: arrays[key] for key in arrays if key.startswith(f"correction/{name}/")
+    }
     shutil.copytree(artifact, into)
     plans = load_artifact(into).plans
     correction = Correction(**parts) if parts else None
@@ -126,7 +128,8 @@ def beside(python: str, other: Path, artifact: Path, rounds: int) -> tuple[list[
         others = with_plan_of(other, artifact, folder / "now")
         loaded = load_artifact(folder / "now")
         given = [obs for obs, _ in random_calls(loaded.manifest.spec, CALLS, seed=0)]
-        np.savez(folder / "calls.npz", **{key: np.concatenate([obs[key] for obs in given]) for key in given[0]})
+        calls: dict[str, Any] = {key: np.concatenate([obs[key] for obs in given]) for key in given[0]}
+        np.savez(folder / "calls.npz", **calls)
         full = FULL if FULL in loaded.plans else DENSE
         opened = [(python, other), (sys.executable, folder / "now")]
         loads: list[list[list[float]]] = [[], []]

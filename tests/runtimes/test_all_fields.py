@@ -136,8 +136,8 @@ class Compared:
         if executed.cells is None or executed.repair:
             return False
         runtime, cells = self.policy._runtime, np.broadcast_to(executed.cells, (streams, *executed.cells.shape[-2:]))
-        written = runtime._written if runtime._used.view.variant == executed.variant else None
-        return bool(((cells == Source.ROLLOUT) & (True if written is None else ~written)).any())
+        entries = runtime._entries if runtime._used.view.variant == executed.variant else None
+        return bool(((cells == Source.ROLLOUT) & (True if entries is None else ~entries.written)).any())
 
     def call(self, obs: Arrays, noise: Noise, plan: Plan, prefix: Array | None) -> None:
         """One call of both, which are alike."""
