@@ -100,7 +100,7 @@ class OnTensors:
 
 def placed(array: npt.NDArray[np.generic], device: torch.device) -> Tensor:
     """A copy of an array as a tensor of a device."""
-    return torch.tensor(array).to(device)
+    return torch.from_numpy(np.array(array)).to(device)
 
 
 def narrow_type(precision: str, device: torch.device) -> torch.dtype | None:

@@ -229,7 +229,7 @@ def test_loading_forty_megabytes(tmp_path: Path, benchmark: Any) -> None:
     pieces = program.pieces
     constants = {**pieces.condition.constants, "large": TensorType((10_000_000,), "float32")}
     condition = replace(pieces.condition, constants=constants)
-    weights = {**program.weights, "large": np.zeros(10_000_000, np.float32)}
+    weights = {**program.weights, "large": np.full(10_000_000, 1 / 3, np.float32)}
     program = replace(program, weights=weights, pieces=replace(pieces, condition=condition))
     write_artifact(program, tiny_models(tiny_program()), tmp_path / "a")
     artifact = benchmark.pedantic(load_artifact, args=(tmp_path / "a",), rounds=5)

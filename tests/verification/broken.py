@@ -15,6 +15,7 @@ from ttscompile.artifact.codec import encode, identities
 from ttscompile.artifact.files import describe
 from ttscompile.artifact.load import read_manifest
 from ttscompile.artifact.manifest import MANIFEST
+from ttscompile.artifact.short import SHORT, parts
 
 
 def edit_manifest(directory: Path, **changes: Any) -> None:
@@ -30,11 +31,17 @@ def edit_manifest(directory: Path, **changes: Any) -> None:
 def edited(directory: Path, store: str) -> Iterator[dict[str, npt.NDArray[Any]]]:
     """The arrays of one of the artifact's stores, to be changed in the block; every tensor stays where it lies."""
     path = directory / getattr(read_manifest(directory).stores, store)
-    places = tensors.offsets(path)
-    arrays = {name: np.array(array) for name, array in tensors.read(path).items()}
+    places = tensors.entries_of(path)
+    arrays = {name: np.array(array) for name, array in tensors.read(path, short=True).items()}
     yield arrays
-    path.write_bytes(tensors.serialize(arrays))
-    assert tensors.offsets(path) == places, "the ONNX graphs would read other weights"
+    content = bytearray(path.read_bytes())
+    for name, place in places.items():
+        array = arrays[name]
+        short = (short.tobytes() for _, short in parts(array, place.code))
+        stored = b"".join(short) if place.code in SHORT else array.tobytes()
+        assert len(stored) == place.length, "the ONNX graphs would read other weights"
+        content[place.offset : place.offset + place.length] = stored
+    path.write_bytes(content)
     edit_manifest(directory)
 
 

@@ -6,7 +6,6 @@ Nothing but numpy is needed to read one.
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -17,7 +16,6 @@ from ..ir import pieces as names
 from . import typed_json
 from .manifest import FORMAT, MANIFEST, SCHEMA_VERSION, Manifest, PlanRecord, PrecisionRecord, WeightsRecord
 from .strict_json import REMEDY, Value, dump, dump_compact, parse
-from .upgrade import upgraded
 
 MAX_MANIFEST_BYTES, MAX_MANIFEST_VALUES = 32 * 2**20, 100_000
 """Of Push-T it has 41 KB and 2,000 values."""
@@ -39,12 +37,10 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
         )
     found, writer = document.get("schema_version"), document.get("ttscompile_version")
     if found not in (SCHEMA_VERSION, SCHEMA_VERSION - 1) or type(found) is not int:
-        install = (
-            f"ttscompile=={writer:.40}, which wrote it" if isinstance(writer, str) else "the ttscompile that wrote it"
-        )
+        install = f"ttscompile=={writer:.40}, which" if isinstance(writer, str) else "the ttscompile that"
         raise ArtifactError(
             f"{where}: schema_version: expected {SCHEMA_VERSION} or the one before, which this ttscompile reads; found"
-            f" {found!r:.40}. Convert the checkpoint again with this version, or install {install}."
+            f" {found!r:.40}. Convert the checkpoint again with this version, or install {install} wrote it."
         )
     checksum = document.pop("checksum", None)
     if checksum != _checksum(document):
@@ -52,11 +48,8 @@ def decode(content: bytes, where: str = MANIFEST) -> Manifest:
             f"{where}: expected the checksum of its content; found {'none' if checksum is None else 'another'}."
             f" {REMEDY}"
         )
-    if found == SCHEMA_VERSION:
-        return from_json(Value(document, where))
-    manifest = from_json(Value(upgraded(document, where), where))
-    identity, model_identity = identities(manifest)  # the new ones: what they cover is another
-    return replace(manifest, identity=identity, model_identity=model_identity)
+    # The schema before says the same: no weight of its files is in 16 bits.
+    return from_json(Value({**document, "schema_version": SCHEMA_VERSION}, where))
 
 
 def _document(content: bytes, where: str) -> dict[str, Any]:

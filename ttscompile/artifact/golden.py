@@ -220,12 +220,10 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
         return {}
     with artifact.reading(manifest.stores.golden_plans):
         arrays = tensors.read(artifact.files / manifest.stores.golden_plans)
-    wanted, names = dict[str, tuple[str, tuple[int, ...]]](), set[str]()
-    for name, plan in manifest.plans.items():
-        if f"{name}/plan" not in arrays and (not is_sparse(plan) or plan.otherwise is not None):
-            continue  # it computes all cells; or the schema before had it, which recorded none that begins with a chunk
-        names.add(name)
-        steps = manifest.steps_of(plan.loop)
+    wanted = dict[str, tuple[str, tuple[int, ...]]]()
+    names = {name for name, plan in manifest.plans.items() if f"{name}/plan" in arrays or is_sparse(plan)}
+    for name in names:
+        steps = manifest.steps_of(manifest.plans[name].loop)
         wanted[f"{name}/plan"] = "int8", (2, streams, steps, len(manifest.blocks))
         wanted[f"{name}/path"] = "float32", (2, steps, streams, DIGITS)
         wanted[f"{name}/sample"] = "float32", (2, streams, *manifest.spec.sample)

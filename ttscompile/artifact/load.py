@@ -298,10 +298,10 @@ def _open(path: Path, folder: Folder, stamps: Mapping[str, Stamp], manifest: Man
     stores = manifest.stores
     others = sorted(stamps.keys() - manifest.models - {stores.program, stores.tokenizer, MANIFEST})
     tensors.require_few((directory / name for name in others), directory)
-    stored = tensors.read(directory / manifest.stores.weights)
+    stored = tensors.read(directory / manifest.stores.weights, short=True)
     apart = None if manifest.precision is None else manifest.precision.fp32
     if apart in stamps:
-        stored = MappingProxyType({**stored, **tensors.read(directory / str(apart))})
+        stored = MappingProxyType({**stored, **tensors.read(directory / str(apart), short=True)})
     tables = {loop: _tables(stored, manifest, loop, directory) for loop in (ORIGINAL, *manifest.spec.loops)}
     block_weights = {}
     for name, record in manifest.weights.items():

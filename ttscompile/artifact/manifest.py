@@ -20,7 +20,7 @@ from ..ir.program import Binding
 from .towers import TokensRecord
 
 FORMAT = "ttscompile artifact"
-SCHEMA_VERSION = 11
+SCHEMA_VERSION = 12
 MANIFEST = "manifest.json"
 _SHOWN = 12
 

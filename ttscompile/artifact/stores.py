@@ -13,7 +13,7 @@ from ..core.plan import ORIGINAL, Plan
 from ..errors import ArtifactError
 from ..ir.pieces import OF_ALL_BLOCKS, PRUNER, block_name, of_loop
 from . import tensors
-from .bind import Place, bind, places_of
+from .bind import Place, bind, places_of, unbound
 from .corrections import correction_arrays, envelope_arrays, require_fit
 from .files import content_hash, describe, replace_file
 from .load import Artifact
@@ -76,7 +76,7 @@ def store_pruner(
     files = {name: one for name, one in manifest.files.items() if name not in (old, record.file)}
     content = tensors.serialize(values)
     path = _put(artifact.path, f"{pruner_name(piece, content)}.safetensors", content, files)
-    bound = _bound_again(artifact, piece, record.file, places_of(path, values))
+    bound = bind(unbound(artifact.path / record.file, values), places_of(path, values), piece)
     model = _put(artifact.path, path.with_suffix(".onnx").name, bound, files)
     manifest = replace(manifest, files=files, pieces={**manifest.pieces, piece: replace(record, file=model.name)})
     if loop == ORIGINAL:
@@ -111,7 +111,7 @@ def store_weights(artifact: Artifact, manifest: Manifest, name: str, own: BlockW
         """The models of these files by piece, bound to the places; names of the new files."""
         made = dict[str, str]()
         for piece, file in models.items():
-            model = _bound_again(artifact, piece, file, places)
+            model = bind(unbound(artifact.path / file, places), places, piece)
             made[piece] = _put(artifact.path, f"{prefix}{piece}{suffix}.onnx", model, files).name
         return made
 
@@ -135,9 +135,3 @@ def _put(directory: Path, name: str, content: bytes, files: dict[str, FileRecord
     replace_file(path, content)
     files[name] = describe(path)
     return path
-
-
-def _bound_again(artifact: Artifact, piece: str, file: str, places: Mapping[str, Place]) -> bytes:
-    import onnx
-
-    return bind(onnx.load(artifact.path / file, load_external_data=False), places, piece, again=True)

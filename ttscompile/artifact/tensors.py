@@ -1,7 +1,7 @@
 """safetensors files: read and written with numpy alone, an array at a time.
 
 Layout of a file: length of the header (8 bytes, little-endian); header (JSON: name -> dtype, shape, offsets into the
-data); data.
+data); data. Files of weights have float32 in 16 bits where that changes no number (``short``).
 Source: the format's description, https://github.com/huggingface/safetensors#format.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from ..core.rules import MAX_RANK
 from ..core.untrusted_json import MAX_VALUES, most_values
 from ..errors import ArtifactChangedError, ArtifactError
 from .files import opened, write_synced
+from .short import SHORT, ShortArray, parts, short_code
 from .strict_json import REMEDY, Value, parse
 
 Array = npt.NDArray[Any]
@@ -40,18 +41,18 @@ _DTYPES: Mapping[str, np.dtype[Any]] = MappingProxyType(
         "I16": np.dtype("<i2"),
         "I32": np.dtype("<i4"),
         "I64": np.dtype("<i8"),
-        "F16": np.dtype("<f2"),
         "F32": np.dtype("<f4"),
         "F64": np.dtype("<f8"),
     }
 )
-_WIDEST_FIRST = ("I64", "F64", "F32", "I32", "F16", "I16", "I8", "U8", "BOOL")
+_WIDEST_FIRST = ("I64", "F64", "F32", "I32", "BF16", "F16", "I16", "I8", "U8", "BOOL")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Where one tensor lies: its first byte from the start of the file, and how many there are."""
+    """Where one tensor of type ``code`` lies: its first byte from the start of the file, and how many there are."""
 
+    code: str
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     offset: int
@@ -79,7 +80,7 @@ def _content(file: BufferedReader, path: Path) -> bytes:
     return file.read(length)
 
 
-def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
+def _header(file: BufferedReader, path: Path, short: bool) -> dict[str, Entry]:
     """The entries in the order of their data.
 
     Refused are dtypes that numpy lacks, sizes that contradict each other, and data that overlap, have gaps, are not
@@ -92,8 +93,9 @@ def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
         for value in members.pop("__metadata__").members().values():
             value.text()
     start = _PREFIX + len(content)
+    known = {**_DTYPES, **SHORT} if short else _DTYPES
     entries = sorted(
-        ((name, _entry(value, start)) for name, value in members.items()),
+        ((name, _entry(value, start, known)) for name, value in members.items()),
         key=lambda item: (item[1].offset, item[1].length),
     )
     end = start
@@ -106,23 +108,24 @@ def _header(file: BufferedReader, path: Path) -> dict[str, Entry]:
     return dict(entries)
 
 
-def offsets(path: Path) -> dict[str, tuple[int, int]]:
-    """Byte offset in the file, and length in bytes, of each tensor."""
+def entries_of(path: Path) -> dict[str, Entry]:
+    """Where each tensor of a file lies."""
     with opened(path) as file:
-        return {name: (entry.offset, entry.length) for name, entry in _header(file, path).items()}
+        return _header(file, path, short=True)
 
 
-def read(path: Path) -> Mapping[str, Array]:
+def read(path: Path, short: bool = False) -> Mapping[str, Array]:
     """Read a safetensors file, or map it into memory if it is large.
 
     Returns:
-        Read-only arrays. Of a file of ``MAPPED`` bytes or more they are views: nothing is read before it is used.
+        Read-only arrays. Of a file of ``MAPPED`` bytes or more they are views: nothing is read before it is used. With
+        ``short`` the file may have float32 in 16 bits; each of these is a ``ShortArray``.
 
     Raises:
         ArtifactChangedError: the file has become shorter meanwhile.
     """
     with opened(path) as file:
-        size, entries = os.fstat(file.fileno()).st_size, _header(file, path)
+        size, entries = os.fstat(file.fileno()).st_size, _header(file, path, short)
         if size < MAPPED:
             file.seek(0)
             data: Array = np.frombuffer(file.read(), np.uint8)
@@ -130,12 +133,11 @@ def read(path: Path) -> Mapping[str, Array]:
             data = np.memmap(file, dtype=np.uint8, mode="r").view(np.ndarray)
     if len(data) < size:
         raise ArtifactChangedError(f"{path.name}: the file was changed while it was being read. Load it again.")
-    return MappingProxyType(
-        {
-            name: data[entry.offset : entry.offset + entry.length].view(entry.dtype).reshape(entry.shape)
-            for name, entry in entries.items()
-        }
-    )
+    found = dict[str, Array]()
+    for name, entry in entries.items():
+        own = data[entry.offset : entry.offset + entry.length].view(entry.dtype).reshape(entry.shape)
+        found[name] = cast(Array, ShortArray(own)) if entry.code in SHORT else own
+    return MappingProxyType(found)
 
 
 def check_arrays(
@@ -160,12 +162,12 @@ def serialize(arrays: Mapping[str, Array]) -> bytes:
     return b"".join(_chunks(arrays))
 
 
-def write(path: Path, arrays: Mapping[str, Array]) -> None:
+def write(path: Path, arrays: Mapping[str, Array], short: bool = False) -> None:
     """Write a new safetensors file, one array after the other: all of them together may be half of the memory."""
-    write_synced(path, _chunks(arrays))
+    write_synced(path, _chunks(arrays, short))
 
 
-def _chunks(arrays: Mapping[str, Array]) -> Iterator[bytes | memoryview]:
+def _chunks(arrays: Mapping[str, Array], short: bool = False) -> Iterator[bytes | memoryview]:
     """A file in parts: its header, and each array. Their order is that of the safetensors library."""
     kinds = {dtype: code for code, dtype in _DTYPES.items()}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
@@ -175,30 +177,34 @@ def _chunks(arrays: Mapping[str, Array]) -> Iterator[bytes | memoryview]:
                 f"tensor {name!r} has dtype {array.dtype}; an artifact can hold"
                 f" {', '.join(str(d) for d in _DTYPES.values())}. Convert the weight before compiling."
             )
-    codes = {name: kinds[array.dtype.newbyteorder("<")] for name, array in arrays.items()}
+    codes = {n: (short and short_code(a)) or kinds[a.dtype.newbyteorder("<")] for n, a in arrays.items()}
     order = sorted(codes, key=lambda name: (_WIDEST_FIRST.index(codes[name]), name))
     header, end = dict[str, Any](), 0
     for name in order:
         array = arrays[name]
-        header[name] = {"dtype": codes[name], "shape": array.shape, "data_offsets": (end, end + array.nbytes)}
-        end += array.nbytes
+        size = array.nbytes // (2 if codes[name] in SHORT else 1)
+        header[name] = {"dtype": codes[name], "shape": array.shape, "data_offsets": (end, end + size)}
+        end += size
     text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % _PREFIX)
     yield len(text).to_bytes(_PREFIX, "little") + text
     for name in order:
+        if codes[name] in SHORT:
+            yield from (short.view(np.uint8).data for _, short in parts(arrays[name], codes[name]))
+            continue
         plain = np.asarray(arrays[name], dtype=arrays[name].dtype.newbyteorder("<"), order="C")
         yield plain.reshape(-1).view(np.uint8).data
 
 
-def _entry(value: Value, start: int) -> Entry:
+def _entry(value: Value, start: int, known: Mapping[str, np.dtype[Any]]) -> Entry:
     fields = value.keys("dtype", "shape", "data_offsets")
-    dtype = _DTYPES[fields["dtype"].text(*_DTYPES)]
+    code = fields["dtype"].text(*known)
     shape = tuple(item.integer() for item in fields["shape"].items(MAX_RANK))
     span = [item.integer() for item in fields["data_offsets"].items()]
-    length = math.prod(shape) * dtype.itemsize  # Python's integers do not overflow
+    dtype, length = known[code], math.prod(shape) * known[code].itemsize  # Python's integers do not overflow
     if len(span) != 2 or span[1] - span[0] != length:
         fields["data_offsets"].fail(f"[begin, begin + {length}] for {dtype}{list(shape)}")
-    return Entry(dtype=dtype, shape=shape, offset=start + span[0], length=length)
+    return Entry(code, dtype, shape, start + span[0], length)
 
 
 def _error(path: Path, expected: str, found: str) -> ArtifactError:

@@ -274,10 +274,10 @@ def _fill(
     tables = {table_prefix(of) + name: rows[name] for of, rows in loops.items() for name in own_rows}
     apart = {} if lowered is None else read_in_fp32(stored, models, lowered)
     common = {name: value for name, value in stored.items() if name not in apart}
-    tensors.write(folder / WEIGHTS, {**common, **tables})
+    tensors.write(folder / WEIGHTS, {**common, **tables}, short=True)
     places = places_of(folder / WEIGHTS, common)
     if apart:
-        tensors.write(folder / WEIGHTS_FP32, apart)
+        tensors.write(folder / WEIGHTS_FP32, apart, short=True)
         places |= places_of(folder / WEIGHTS_FP32, apart)
     pruner_files, pruner_places = dict[str, str](), dict[str, dict[str, Place]]()
     own = {PRUNER: pruner} if PRUNER in graphs else {}

@@ -188,7 +188,7 @@ def quantize_model(
         float32 ``[columns]``; of a table int8 and float32 ``[rows, 1]``; in four bits what ``four_bits.pack`` gives. No
         constants if there was nothing to replace.
     """
-    known = {t.name: weights[t.name] for t in model.graph.initializer if t.name in weights}
+    known = {t.name: np.asarray(weights[t.name]) for t in model.graph.initializer if t.name in weights}
     matrices, shapes = _matrices(model, known), shapes_of(model, size)
     constants: dict[str, Array] = {}
     w, store = GraphWriter(), partial(_integers, constants)

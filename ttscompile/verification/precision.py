@@ -120,7 +120,7 @@ def _apart(artifact: Artifact, file: str, weights: Mapping[str, npt.NDArray[Any]
                 continue
             four, scale = integers.dtype == np.uint8, stored[f"{name}{_SCALE}"]
             constant = name[: name.rindex(_FOUR if four else _SUFFIX)]
-            weight = weights.get(constant, np.zeros(0, np.float32))
+            weight = np.asarray(weights.get(constant, np.zeros(0, np.float32)))
             if weight.size != integers.size if not four else not _packs(integers, weight):
                 found = f"{name!r}, {integers.size} integers that stand for no constant of as many numbers"
                 raise ArtifactError(f"{artifact.path}: {file}: {found}. Convert the checkpoint again.")

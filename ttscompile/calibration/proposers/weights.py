@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...artifact.bind import unbound
 from ...artifact.load import Artifact
 from ...artifact.stores import BlockWeights
 from ...artifact.view import view_of
@@ -302,10 +303,8 @@ def _require_whole_steps(trials: Trials, plan: Plan) -> None:
 
 def _in_precision(artifact: Artifact, weights: Mapping[str, Any]) -> dict[str, Any]:
     """The constants that the artifact's other precision makes of these weights, by name; none where it has none."""
-    import onnx
-
     record, known, made = artifact.manifest.precision, {**artifact.weights, **weights}, dict[str, Any]()
     for name in filter(is_block, () if record is None else record.models):
-        model = onnx.load(artifact.files / artifact.manifest.pieces[name].file, load_external_data=False)
+        model = unbound(artifact.files / artifact.manifest.pieces[name].file, known)
         made |= quantize_model(model, known, precision=artifact.manifest.precision_name)[1]
     return made
