@@ -1,5 +1,7 @@
 """From the name of an artifact to a policy that can be called: ``load``. ``docs/design.md`` section 8."""
 
+import ctypes
+from contextlib import suppress
 from pathlib import Path
 
 from ttscompile.artifact.files import check_file
@@ -99,4 +101,6 @@ def open_policy(
     """The policy of an artifact that is loaded; see ``load`` and ``CompiledPolicy``."""
     wanted = plan_of(artifact, plan)  # refused before the sessions are opened
     opened = open_runtime(artifact, runtime, threads, device, wanted)
+    with suppress(AttributeError, OSError, TypeError):  # glibc alone keeps what loading needed, and has this call
+        ctypes.CDLL(None).malloc_trim(0)
     return CompiledPolicy(artifact, opened, seed, wanted, origin, instruct_of(artifact, tokenizer))
