@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from functools import partial
@@ -14,7 +15,7 @@ import pytest
 
 from tests.calibration import policies, tasks
 from tests.once import Once
-from tests.pages import EXTENDING, examples, load
+from tests.pages import EXTENDING, ROOT, examples, load
 from ttscompile.calibration import proposer, sparse_loop, strategies
 from ttscompile.calibration.pipeline import calibrate
 from ttscompile.frontends import families
@@ -159,3 +160,19 @@ def test_the_runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for streams in agrees.pytestmark[0].args[1]:
         agrees(tmp_path / str(streams), streams)
     test.test_the_pruners_plan_and_reuse_over_calls(tmp_path / "pruned")
+
+
+MOST_FILES = {"pass": 2, "family": 3, "proposer": 2, "strategy": 2, "loop": 2, "term": 3, "runtime": 3}
+"""That a contributor changes beside tests and docs, where no package of its own is needed."""
+
+
+def test_few_files_change_and_the_pages_name_them() -> None:
+    rows = re.findall(r"^\| \[[^]]+\]\((\w+)\.md\) \| [^|]+ \| ([^|]+) \|$", (EXTENDING / "index.md").read_text(), re.M)
+    assert {name for name, _ in rows} == MOST_FILES.keys()
+    for name, files in rows:
+        without, _, _ = files.partition("; with")  # a package of its own is told in further files
+        named = [file for file in re.findall(r"`([^`]+)`", without) if file.endswith(".py")]
+        assert all((ROOT / file).is_file() for file in named)
+        assert 1 + len(named) <= MOST_FILES[name], "its module, and these"
+        page = (EXTENDING / f"{name}.md").read_text()
+        assert all(file in page for file in named), f"{name}.md says where its row goes"
