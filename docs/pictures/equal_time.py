@@ -18,11 +18,14 @@ from typing import Any
 
 from ttscompile.calibration.strategies import CORRECTING, NAMES
 from ttscompile.plots.figure import plain_powers, with_grid
-from ttscompile.plots.frontier import COLOURS, MARKERS, ROUNDING
+from ttscompile.plots.frontier import COLOURS, MARKERS
 
 SHADES = (*COLOURS, "#8c564b")
 
 TABLE = Path(__file__).resolve().parents[1] / "evidence" / "equal_time.json"
+
+NEAREST = 0.02
+"""What is nearer is drawn here: intervals of these distances are wider, and estimates may be below 0."""
 
 PANELS = {"as published": False, "with our correction": True}
 
@@ -68,7 +71,7 @@ def panel(axes: Any, rows: Rows, names: Sequence[str], corrected: bool) -> None:
     for number, strategy in enumerate(names):
         wanted = corrected and strategy not in CORRECTING
         own = sorted(
-            (row["ms"], max(row["distance"], ROUNDING))
+            (row["ms"], max(row["distance"], NEAREST))
             for row in rows
             if (row["strategy"], row["corrected"]) == (strategy, wanted)
         )
