@@ -1,7 +1,6 @@
 """From the name of an artifact to a policy that can be called: ``load``. ``docs/design.md`` section 8."""
 
 import ctypes
-from contextlib import suppress
 from pathlib import Path
 
 from ttscompile.artifact.files import check_file
@@ -19,6 +18,8 @@ from .policy import CompiledPolicy, plan_of
 
 TRIES = 3
 """Times that ``load`` begins before it gives up on an artifact that is replaced while it is loaded."""
+
+_TRIM = getattr(ctypes.pythonapi, "malloc_trim", None)  # glibc's, which keeps what a load needed for a while
 
 
 def load(
@@ -101,6 +102,6 @@ def open_policy(
     """The policy of an artifact that is loaded; see ``load`` and ``CompiledPolicy``."""
     wanted = plan_of(artifact, plan)  # refused before the sessions are opened
     opened = open_runtime(artifact, runtime, threads, device, wanted)
-    with suppress(AttributeError, OSError, TypeError):  # glibc alone keeps what loading needed, and has this call
-        ctypes.CDLL(None).malloc_trim(0)
+    if _TRIM is not None:
+        _TRIM(0)
     return CompiledPolicy(artifact, opened, seed, wanted, origin, instruct_of(artifact, tokenizer))
