@@ -37,6 +37,7 @@ class Kind:
         made: the precisions of any part that it makes of the weights in fp32.
         tokens: whether it can compute some of the tokens of an image encoder.
         devices: whether it computes anywhere else than on the CPU.
+        slow: whether it is there for checks alone.
     """
 
     make: Callable[[int, str], Open]
@@ -45,6 +46,7 @@ class Kind:
     made: tuple[str, ...] = ()
     tokens: bool = False
     devices: bool = False
+    slow: bool = False
 
 
 def _onnxruntime(threads: int, device: str) -> Open:
@@ -71,7 +73,7 @@ def _torch(threads: int, device: str) -> Open:
 RUNTIMES = {
     "onnxruntime": Kind(_onnxruntime, install="onnxruntime", held=(INT8, INT4), tokens=True),
     "torch": Kind(_torch, install="ttscompile[compile]", made=(BF16, FP16), devices=True),
-    "reference": Kind(_reference, install="ttscompile[compile]"),
+    "reference": Kind(_reference, install="ttscompile[compile]", slow=True),
 }
 
 

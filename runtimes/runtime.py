@@ -200,8 +200,9 @@ class Runtime:
         if plan.otherwise is not None and self._chunk is None:
             plan = plan.otherwise
         opened = self._opened_for(plan)
-        self._require_executable(plan, opened.view)
         name, told = self._artifact.name_of(plan), self._artifact.told(plan)
+        if name is None:
+            self._require_executable(plan, opened.view)
         given = self._given or (name is None and (told is None or self._reading))
         keep = np.ones_like(opened.backend.keeps) if given or name == DENSE else opened.backend.keeps
         entries = self._entries if opened is self._used else None  # else what earlier calls kept is of another variant
@@ -241,8 +242,8 @@ class Runtime:
         return made.sample, report
 
     def _require_executable(self, plan: Plan, view: View) -> None:
-        """Raise IllegalPlanError if a plan that somebody made has a correction or a pruner that does not fit."""
-        if plan.correction is not None and self._artifact.name_of(plan) is None:
+        """Raise IllegalPlanError if a plan that somebody made has a correction that does not fit, or lacks a pruner."""
+        if plan.correction is not None:
             require_fit(plan.correction, self._artifact.manifest, plan.loop)
         if plan.cells is None and PRUNER not in view.manifest.pieces:
             remedy = "Give a plan with cells: plan='dense', or the name of another one"

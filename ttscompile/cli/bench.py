@@ -75,7 +75,7 @@ SECTIONS = (
 )
 @options.names_option(
     "--runtime",
-    options.FAST,
+    options.OFFERED,
     default="onnxruntime",
     help="Execute the plans with onnxruntime, or with torch, which needs the extra 'compile'; or with each of them:"
     " onnxruntime,torch.",

@@ -18,8 +18,8 @@ MOST_THREADS = 1024
 MOST_SEED = 2**63 - 1
 """torch takes no larger one."""
 
-FAST = tuple(name for name, kind in RUNTIMES.items() if kind.held or kind.made)
-"""Runtimes that a command offers: the reference, whose arithmetic is that of fp32 alone, is slow."""
+OFFERED = tuple(name for name, kind in RUNTIMES.items() if not kind.slow)
+"""Runtimes that a command offers."""
 
 artifact_argument = click.argument("directory", type=PATH)
 json_option = click.option(
@@ -90,7 +90,7 @@ lerobot_options = together(
 runtime_options = together(
     click.option(
         "--runtime",
-        type=click.Choice(FAST),
+        type=click.Choice(OFFERED),
         default="onnxruntime",
         help="Execute the policy with this runtime; torch needs the extra 'compile'.",
     ),
