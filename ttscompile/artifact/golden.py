@@ -221,7 +221,7 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
     with artifact.reading(manifest.stores.golden_plans):
         arrays = tensors.read(artifact.files / manifest.stores.golden_plans)
     wanted = dict[str, tuple[str, tuple[int, ...]]]()
-    names = {name for name, plan in manifest.plans.items() if f"{name}/plan" in arrays or is_sparse(plan)}
+    names = sorted(name for name, plan in manifest.plans.items() if f"{name}/plan" in arrays or is_sparse(plan))
     for name in names:
         steps = manifest.steps_of(manifest.plans[name].loop)
         wanted[f"{name}/plan"] = "int8", (2, streams, steps, len(manifest.blocks))
@@ -229,7 +229,7 @@ def load_golden_plans(artifact: Artifact, streams: int) -> dict[str, GoldenPlan]
         wanted[f"{name}/sample"] = "float32", (2, streams, *manifest.spec.sample)
     tensors.check_arrays("array", arrays, wanted, f"{artifact.path}: golden record of plans")
     own = [each.name for each in fields(GoldenPlan)]
-    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in own}) for name in sorted(names)}
+    return {name: GoldenPlan(**{field: arrays[f"{name}/{field}"] for field in own}) for name in names}
 
 
 def is_sparse(plan: PlanRecord) -> bool:
