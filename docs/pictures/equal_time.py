@@ -39,7 +39,7 @@ def rows_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
         name, _, pace = point["name"].partition("-as-")  # of plans that a run before had written
         series = point["series"] if point["series"] != "this artifact" else name.replace("-corrected", ", corrected")
         strategy, _, corrected = series.partition(", ")
-        wished = f"{series.replace(', ', '-')}-{point['name']}"
+        share = document["shares"].get(point["series"], {}).get(point["name"])  # None of what was not held to a pace
         made.append(
             {
                 "strategy": strategy,
@@ -47,7 +47,7 @@ def rows_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "as": pace or name.removeprefix("as-"),
                 "reused": round(point["sparsity"], 4),
                 "ms": round(point["latency_ms"], 2),
-                "share": round(document["shares"][wished], 3) if wished in document["shares"] else None,
+                "share": share and round(share, 3),
                 "distance": round(point["distance"], 3),
                 "interval": [round(end, 3) for end in point["interval"]],
             }

@@ -96,17 +96,19 @@ class Side:
         self._process.communicate()
 
 
-def with_plan_of(other: Path, artifact: Path, into: Path) -> str:
-    """Copy an artifact, with the default plan of another one's as its own, executed by its loop of as many steps.
+def manifest_of(artifact: Path) -> dict[str, Any]:
+    """As it stands in the file: this version does not read that of each other one."""
+    manifest: dict[str, Any] = json.loads((artifact / "manifest.json").read_text())
+    return manifest
 
-    Returns:
-        The other one's plan that computes all of that loop. In 0.1.0 it was called dense, whatever the loop.
+
+def with_plan_of(other: Path, artifact: Path, into: Path) -> None:
+    """Copy an artifact, with the default plan of another one's as its own, executed by its loop of as many steps.
 
     Raises:
         click.ClickException: the other one was not calibrated.
     """
-    manifest = json.loads((other / "manifest.json").read_text())
-    name = manifest["default_plan"]
+    name = manifest_of(other)["default_plan"]
     arrays = {key: array for stored in other.glob("plans-*.safetensors") for key, array in load_file(stored).items()}
     if name not in arrays:
         raise click.ClickException(f"{other}: its default plan is {name!r}. Calibrate it first.")
@@ -118,19 +120,19 @@ def with_plan_of(other: Path, artifact: Path, into: Path) -> str:
     correction = Correction(**parts) if parts else None
     plan = replace(plans.get(FULL, plans[DENSE]), cells=arrays[name], correction=correction, repair=True)
     update_plans(into, {**plans, SCHEDULE: plan}, SCHEDULE)
-    return FULL if FULL in manifest["plans"] else DENSE
 
 
 def beside(python: str, other: Path, artifact: Path, rounds: int) -> tuple[list[Row], dict[str, list[float]]]:
     """Both plans in both versions, and by side the median seconds and MiB of a load."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        others = with_plan_of(other, artifact, folder / "now")
+        with_plan_of(other, artifact, folder / "now")
         loaded = load_artifact(folder / "now")
         given = [obs for obs, _ in random_calls(loaded.manifest.spec, CALLS, seed=0)]
         calls: dict[str, Any] = {key: np.concatenate([obs[key] for obs in given]) for key in given[0]}
         np.savez(folder / "calls.npz", **calls)
-        full = FULL if FULL in loaded.plans else DENSE
+        # What computes all of the loop. In 0.1.0 it was called dense, whatever the loop.
+        full = tuple(FULL if FULL in manifest_of(one)["plans"] else DENSE for one in (other, artifact))
         opened = [(python, other), (sys.executable, folder / "now")]
         loads: list[list[list[float]]] = [[], []]
         for _ in range(LOADS):
@@ -140,7 +142,7 @@ def beside(python: str, other: Path, artifact: Path, rounds: int) -> tuple[list[
                 loads[number].append([side.loaded["seconds"], side.loaded["mib"]])
         sides = [Side(with_python, path, folder / "calls.npz") for with_python, path in opened]
         rows = [
-            compared(sides, (others, full), DENSE, rounds, folder),
+            compared(sides, full, DENSE, rounds, folder),
             compared(sides, (SCHEDULE, SCHEDULE), SCHEDULE, rounds, folder),
         ]
         for side in sides:
@@ -149,7 +151,7 @@ def beside(python: str, other: Path, artifact: Path, rounds: int) -> tuple[list[
     return rows, took
 
 
-def compared(sides: Sequence[Side], names: tuple[str, str], plan: str, rounds: int, folder: Path) -> Row:
+def compared(sides: Sequence[Side], names: Sequence[str], plan: str, rounds: int, folder: Path) -> Row:
     """One plan, by its name on each side."""
     actions = []
     for number, (side, name) in enumerate(zip(sides, names, strict=True)):

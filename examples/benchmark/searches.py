@@ -138,7 +138,7 @@ class Searching:
 
     Attributes:
         plans: those that took part, by ``STRATEGY-SHARE``, or ``STRATEGY-corrected-SHARE``.
-        shares: of its pace that each of them takes, by the same names; empty where they keep none.
+        shares: of its pace that each of them takes, by series and pace; empty where they keep none.
 
     Args:
         path: the artifact; what is done is kept in its directory until ``forget``.
@@ -178,7 +178,7 @@ class Searching:
         self._learned, self._minutes, self._how = learned, max_minutes, (intervals, 60 * max_minutes, correct)
         self._state: ComparisonState | None = None
         self.plans: dict[str, Plan] = {}
-        self.shares: dict[str, float] = {}
+        self.shares: dict[str, dict[str, float]] = {}
 
     def forget(self) -> None:
         """Keep nothing any more: the comparison is done."""
@@ -221,7 +221,8 @@ class Searching:
                 for strategy in self._strategies:
                     for series, one, share in _at_pace(pace, strategy, searches, search):
                         found.append((series, pace.name, one))
-                        self.shares |= {} if share is None else {_plan_name(series, pace.name): share}
+                        if share is not None:
+                            self.shares.setdefault(series, {})[pace.name] = share
         entrants, skipped, cut = list[Entrant](), dict[str, str](), list[str]()
         for series, name, one in found:
             if isinstance(one, str):
@@ -230,7 +231,7 @@ class Searching:
             plan, short = one
             made = replace(trials.base, cells=plan.schedule, correction=plan.correction)
             entrants.append(Entrant(series, name, trials, made))
-            self.plans[_plan_name(series, name)] = made
+            self.plans[f"{series.replace(', ', '-')}-{name}"] = made
             cut += [f"{series} {name}"] * short
         warnings = [f"nothing was kept for --resume: {state.warning}."] if found and state.warning else []
         if cut:
@@ -291,10 +292,6 @@ def plan_of(name: str, task: Task, intervals: int | None = None, seconds: float 
     clock = Clock(seconds)
     found, _, stopped = search_plan(open_search(name, replace(task, clock=clock)), clock, intervals)
     return found, stopped == "time limit"
-
-
-def _plan_name(series: str, wish: str) -> str:
-    return f"{series.replace(', ', '-')}-{wish}"
 
 
 def _at_pace(

@@ -51,11 +51,10 @@ def test_another_plan_is_seen(calibrated: Path, four_steps: Path, monkeypatch: p
 
     made = beside_release.with_plan_of
 
-    def uncorrected(other: Path, artifact: Path, into: Path) -> str:
-        name = made(other, artifact, into)
+    def uncorrected(other: Path, artifact: Path, into: Path) -> None:
+        made(other, artifact, into)
         plans = load_artifact(into).plans
         update_plans(into, {**plans, "schedule": replace(plans["schedule"], correction=None)}, "schedule")
-        return name
 
     monkeypatch.setattr(beside_release, "with_plan_of", uncorrected)
     rows, _ = beside(sys.executable, calibrated, four_steps, rounds=1)

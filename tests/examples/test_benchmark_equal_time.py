@@ -67,8 +67,8 @@ def test_a_strategy_gets_the_cells_with_which_it_keeps_the_pace(
     assert result.exit_code == 0, result.stderr
     document = json.loads(result.stdout)
     told, shares = document["comparison"], document["shares"]
-    assert set(shares) == {"bac-as-3", "bac-corrected-as-3"}
-    assert all(0.8 <= share <= 1 + SLACK for share in shares.values())
+    assert set(shares) == {"bac", "bac, corrected"}
+    assert all(0.8 <= shares[series]["as-3"] <= 1 + SLACK for series in shares)
     assert [(one["series"], one["name"]) for one in told["points"][1:]] == [("bac", "as-3"), ("bac, corrected", "as-3")]
     assert "computes at least 30 of the 10 x 6 cells" in told["skipped"]["l2c as-3"]
     cells = load_artifact(tmp_path / "found").plans["bac-as-3"].cells
